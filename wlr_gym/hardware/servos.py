@@ -35,11 +35,6 @@ _STATE = ("present_position", "present_velocity")
 _REGISTERS = ("torque_enable", "hardware_error_status", "bus_watchdog", "goal_pwm", "present_pwm")
 #: ... and now and then.
 _HEALTH = ("present_input_voltage", "present_temperature")
-#: Items in RAM that set how a motor moves: profiles, of which the default is none, and gains.
-_TUNING = (
-    *("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain"),
-    *("position_i_gain", "position_d_gain", "feedforward_1st_gain", "feedforward_2nd_gain"),
-)
 #: Times that a single item is asked for again.
 RETRIES = 2
 
@@ -291,13 +286,6 @@ class Servos:
     def set(self, joint: str, item: str, count: int) -> None:
         """Write a count into a joint's control table item; see :meth:`BusGroup.write`. A lost answer is asked for again."""
         _persist(self._group(joint).write, self._id(joint), item, count)
-
-    def reset_tuning(self, joint: str) -> None:
-        """Set a joint's gains and profiles to their defaults, as after a reboot: no profile."""
-        for item in _TUNING:
-            default = self.table(joint)[item].default
-            assert isinstance(default, int)
-            self.set(joint, item, default)
 
     def get_all(self, item: str) -> dict[str, int]:
         """Return joint -> count of an item, of the joints that answered; the buses work at the same time.

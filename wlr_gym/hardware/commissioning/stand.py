@@ -24,6 +24,7 @@ from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.safety.limiter import CALM_PATIENCE, WATCHDOG_UNIT, watchdog_count
+from wlr_gym.hardware.safety.registers import reset_tuning
 from wlr_gym.hardware.servos import JointReadings
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
@@ -189,7 +190,7 @@ class Stand:
     def prepare(self, joints: Iterable[str]) -> None:
         """Set what a test depends on: gains and profiles at their defaults, legs slow, all of the PWM, setpoints at rest."""
         for joint in joints:
-            self.servos.reset_tuning(joint)
+            reset_tuning(self.servos, joint)
             self.servos.set(joint, "goal_pwm", self.servos.get(joint, "pwm_limit"))
             if joint in LEGS:
                 speed = max(1, round(LEAN_SPEED / self.servos.table(joint).per_count("profile_velocity")))

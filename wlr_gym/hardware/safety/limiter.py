@@ -186,7 +186,7 @@ class CommandLimiter:
         for k, joint in enumerate(JOINTS):
             goal_pwm[k] = servos.get(joint, "pwm_limit")
             servos.set(joint, "goal_pwm", int(goal_pwm[k]))
-            servos.reset_tuning(joint)
+            registers.reset_tuning(servos, joint)
             for item, value in self._profile_of(joint).items():
                 count = round(value / servos.table(joint).per_count(item))
                 servos.set(joint, item, count if value == 0.0 else max(1, count))  # 0 would be no profile at all

@@ -39,10 +39,23 @@ IGNORED = ("id", "baud_rate", "protocol_type", "moving_threshold", *(f"external_
 REQUIRED = ("operating_mode", *FIXED_REGISTERS)
 #: Items that are only slow or inconvenient when they are wrong.
 _WARNINGS = ("return_delay_time",)
+#: Items in RAM that set how a motor moves: profiles, of which the default is none, and gains.
+_TUNING = (
+    *("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain"),
+    *("position_i_gain", "position_d_gain", "feedforward_1st_gain", "feedforward_2nd_gain"),
+)
 #: How to write it, for remedies.
 REPAIR = "wlr doctor --mend writes it, and asks first"
 #: Answers to everything.
 _ANSWER_ALL = 2
+
+
+def reset_tuning(servos: Servos, joint: str) -> None:
+    """Set a joint's gains and profiles to their defaults, as after a reboot: no profile."""
+    for item in _TUNING:
+        default = servos.table(joint)[item].default
+        assert isinstance(default, int)
+        servos.set(joint, item, default)
 
 
 def expected_count(bus: Bus, item: str) -> int:
