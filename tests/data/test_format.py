@@ -302,7 +302,7 @@ def test_missing_values(table):
         ("profile: {leg_velocity: -1}", ["profile.leg_velocity", "-1"]),
         ("marker_offset: [0, 0]", ["marker_offset"]),
         ("marker_offset: [0, 0, 85]", ["marker_offset", "millimetres"]),
-        ("robot: [}", ["broken YAML", "line 1"]),
+        ("robot: [", ["broken YAML", "line 1"]),
         ("just text", ["expected a mapping"]),
     ],
 )

@@ -177,7 +177,8 @@ def _sensor_rows(run: Run) -> list[Sensors]:
     values[:, SENSOR_LAYOUT.slices["supply_voltage"]] = run["volt"][:, None]
     if "flow_age" in run:
         _fill_held(values, run, ("flow_x", "flow_y", "flow_age"), ("flow", "flow_age", "flow_is_new"))
-        values[:, SENSOR_LAYOUT.slices["flow_quality"]] = np.nan_to_num(run["flow_quality"])[:, None]  # not held
+        quality = np.where(np.isfinite(run["flow_x"]), run["flow_quality"], 0.0)  # not held
+        values[:, SENSOR_LAYOUT.slices["flow_quality"]] = quality[:, None]
     if "cam_age" in run:
         of_camera = ("camera_pose", "camera_age", "camera_is_new")
         _fill_held(values, run, ("cam_x", "cam_y", "cam_yaw", "cam_age"), of_camera)

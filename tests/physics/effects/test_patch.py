@@ -154,7 +154,7 @@ def test_saved_patch_reads_back_the_same(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("effects: [}", ["broken YAML", "line 1"]),
+        ("effects: [", ["broken YAML", "line 1"]),
         ("just text", ["expected a mapping"]),
         ("effect: []", ["unknown key 'effect'", "did you mean 'effects'"]),
         ("effects: {name: payload}", ["must be a list"]),
