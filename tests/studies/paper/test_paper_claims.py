@@ -110,7 +110,8 @@ def test_every_equation_has_its_verdict_and_functions():
     for number, equation in EQUATIONS.items():
         assert equation.verdicts
         assert set(equation.verdicts) <= words
-        assert callable(equation.printed)
+        printed = getattr(equation.printed, "func", equation.printed)  # of several wheels: one function
+        assert f"({number})" in (printed.__doc__ or "")
         assert callable(equation.corrected)
         assert (equation.repaired is not None) == (MISPRINT in equation.verdicts and number not in range(21, 25))
         if CORRECT in equation.verdicts:

@@ -47,7 +47,7 @@ def wheel_vector(c: PaperConstants, s: State, wheel: str) -> tuple[Vector, Vecto
 
 
 def _wheel_velocity(c: PaperConstants, s: State, wheel: str) -> Vector:
-    """(3)-(6): (x' - x_s' - a theta') i + (y' - y_s') j + (z' - z_s') k + theta' k x r + r'."""
+    """(3), (4), (5), (6): (x' - x_s' - a theta') i + (y' - y_s') j + (z' - z_s') k + theta' k x r + r'."""
     v = (s.x_d - s.x_s_d[wheel] - c.a * s.theta_d[wheel], s.y_d - s.y_s_d[wheel], s.z_d - s.z_s_d[wheel])
     return eq1_velocity_of_a_wheel_centre(v, s.yaw_d, *wheel_vector(c, s, wheel))
 
@@ -200,7 +200,7 @@ eq20_torque_of_the_rear_legs = partial(_leg_torque, right="rr", left="lr")
 
 
 def _wheel_torque(c: PaperConstants, s: State, wheel: str) -> Value:
-    """(21)-(24), their last bracket closed at the end: I_o theta'' - m_l a (x'' - ...), N m."""
+    """(21), (22), (23), (24), their last bracket closed at the end: I_o theta'' - m_l a (x'' - ...), N m."""
     return c.I_o * s.theta_dd[wheel] - c.m_l * c.a * leg_acceleration(c, s, wheel)[0]
 
 
