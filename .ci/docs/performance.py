@@ -133,18 +133,16 @@ def made() -> dict[str, list[str]]:
 
 def write_readme(text: str, rows: list[Row]) -> str:
     """Return README with the engine's ratios; as it is before they were measured at equal error."""
-    parts = [(*row["what"].partition(": "), row) for row in rows if row["name"] == "engine"]
-    ratios = {what: row["ratio"]["median"] for what, _, _, row in parts}
-    settings = {what: f"{ours} against {row['peer_name']}" for what, _, ours, row in parts}
+    engine = [row for row in rows if row["name"] == "engine"]
+    ratios = {row["what"].partition(":")[0]: row["ratio"]["median"] for row in engine}
     cells = []
     for what in README_RATIOS:
         if f"float64, {what}" not in ratios:
             return text
         wide, narrow = (f"{ratios[f'{precision}, {what}']:.0f}{TIMES}" for precision in ("float64", "float32"))
-        cells.append(f"{what}: {wide} as fast (float64), {narrow} (float32), {settings[f'float64, {what}']}")
+        cells.append(f"{what}: {wide} as fast (float64), {narrow} (float32)")
     command = "`wlr bench --only engine` ([performance](docs/performance.md))"
-    head = f"engine against MuJoCo (float64 only), ten motions, one core of an {parts[0][-1]['measured']['processor']};"
-    head += " errors: rms distance from our contact model"
+    head = f"engine against MuJoCo (float64), ten motions, one core of an {engine[0]['measured']['processor']}"
     row = f"| {head} | {'; '.join(cells)} | {command} |"
     return re.sub(r"^\| engine against .*$", lambda _: row, text, flags=re.MULTILINE)
 
