@@ -40,7 +40,6 @@ from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.studies.bench.adapt_study import read_lines
 from wlr_gym.studies.bench.adapt_table import markdown as markdown_of_cases
-from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED
 from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
 from wlr_gym.studies.bench.gap_score_table import markdown
 from wlr_gym.studies.paper.verdicts import verdict_table
@@ -121,14 +120,11 @@ def acceptance_table() -> list[str]:
     return _table(("policy", "robot has", "episodes", *header), rows)
 
 
-def blind_test_table(path: Path = ANSWERS) -> list[str]:
-    """Return the score of stored answers of the blind test; its data are not needed."""
-    answers = read_answers(path)
-    first = min(int(name.removeprefix("set_")) for name in answers)
-    runs = tuple(range(8)) if first < FIRST_SCORED_SEED else ()  # before, all sets had eight runs
+def blind_test_table() -> list[str]:
+    """Return the score of the stored answers of the blind test; its data are not needed."""
     with tempfile.TemporaryDirectory() as folder:
-        plan = Plan(Path(folder), sets=len(answers), first_seed=first, runs=runs)
-        return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, path)).splitlines()
+        plan = Plan(Path(folder), sets=len(read_answers(ANSWERS)))
+        return markdown(run_blind_test(plan, "no_module:nothing_is_analysed", lambda _: None, ANSWERS)).splitlines()
 
 
 def ablation_table() -> list[str]:
@@ -300,7 +296,6 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "ablations": ablation_table,
     "scripts": script_table,
     "blind_test": blind_test_table,
-    "next_blind_test": partial(blind_test_table, DATA / "gap_answers_new.json"),
     "acceptance": acceptance_table,
     "limits": limit_table,
 }
