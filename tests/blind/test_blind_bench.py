@@ -63,7 +63,7 @@ def test_sets_are_spread_on_ray(finished, tmp_path, monkeypatch):
     said: list[str] = []
     plan = dataclasses.replace(plan, out=tmp_path)
     report = gap.run_blind_test(plan, "test_blind_bench:answers_nothing", said.append, ray="local")
-    assert [line.partition(":")[0] for line in said if "to go" in line] == ["1/2  set_5000", "2/2  set_5001"]
+    assert [line.partition(":")[0] for line in said if "to go" in line] == ["1/2  set_6000", "2/2  set_6001"]
     timed = {"median_seconds", "seconds", "wall_seconds"}
     assert {k: v for k, v in report.items() if k not in timed} == {k: v for k, v in alone.items() if k not in timed}
 
@@ -73,15 +73,15 @@ def test_truths_are_sealed_away_from_the_data(finished):
     sealed = list((plan.out / "sealed").iterdir())
     assert len(sealed) == 1
     truths = yaml.safe_load(sealed[0].read_text())
-    assert truths["set_5000"]["effects"][0]["name"] == case(0).effects[0]["name"]
+    assert truths["set_6000"]["effects"][0]["name"] == case(0).effects[0]["name"]
     assert any("sha256" in line for line in said)
     text = "".join(file.read_text() for file in (plan.out / "data").rglob("*.yaml"))
-    assert truths["set_5000"]["effects"][0]["name"] not in text
+    assert truths["set_6000"]["effects"][0]["name"] not in text
 
 
 def test_data_are_valid_measured_runs(finished):
     plan, _, _ = finished
-    runs = read_dataset(plan.out / "data" / "set_5001").runs
+    runs = read_dataset(plan.out / "data" / "set_6001").runs
     assert len(runs) == 1
     assert {finding.kind for finding in runs[0].findings} <= {"gap"}
 
@@ -106,13 +106,13 @@ def test_results_hold_the_hash_of_their_data(finished, tmp_path):
 def test_results_of_other_data_are_refused(finished, tmp_path):
     plan = dataclasses.replace(finished[0], out=tmp_path)
     shutil.copytree(finished[0].out, tmp_path, dirs_exist_ok=True)
-    with pytest.raises(InputError, match=r"set_5000\.json: is about other runs \(\[6\]\)"):
+    with pytest.raises(InputError, match=r"set_6000\.json: is about other runs \(\[6\]\)"):
         _again(dataclasses.replace(plan, runs=(5, 6)))
     file = plan.result_file(case(1))
     result = gap.read_result(file)
     result["blind_test"]["truth_sha256"] = "0" * 64
     file.write_text(json.dumps(result))
-    with pytest.raises(InputError, match=r"set_5001\.json: is about another hidden truth"):
+    with pytest.raises(InputError, match=r"set_6001\.json: is about another hidden truth"):
         _again(plan)
 
 
@@ -146,7 +146,7 @@ def test_goes_on_from_the_answers_of_another_folder(finished, tmp_path):
     assert gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, answers) == report
     assert (plan.out / "answers.json").read_text() == answers.read_text()
     longer = dataclasses.replace(plan, out=tmp_path / "longer", sets=3)
-    assert gap.run_blind_test(longer, "no_such_module:analyse", lambda line: None, answers)["failed"] == ["set_5002"]
+    assert gap.run_blind_test(longer, "no_such_module:analyse", lambda line: None, answers)["failed"] == ["set_6002"]
     one_more = dataclasses.replace(longer, out=tmp_path / "one_more")
     failed = longer.out / "answers.json"  # not taken over: the reason may be the other machine's
     assert gap.run_blind_test(one_more, "test_blind_bench:answers_nothing", lambda line: None, failed)["failed"] == []
@@ -160,7 +160,7 @@ def test_a_result_that_is_there_is_not_replaced_by_an_answer(finished, tmp_path)
     other = tmp_path / "other.json"
     other.write_text(json.dumps(answers))
     gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, other)
-    assert gap.read_answers(tmp_path / "answers.json")["set_5000"]["verdict"] == "not_excited"
+    assert gap.read_answers(tmp_path / "answers.json")["set_6000"]["verdict"] == "not_excited"
 
 
 def test_answers_hold_all_that_the_score_reads(tmp_path):
@@ -176,7 +176,7 @@ def test_answers_hold_all_that_the_score_reads(tmp_path):
         plan.result_file(one).write_text(json.dumps(result | {"wall_seconds": 7.0, "evidence": [1], "blind_test": made}))
     gap.write_answers(tmp_path)
     answers = gap.read_answers(tmp_path / "answers.json")
-    assert "evidence" not in answers["set_5000"]
+    assert "evidence" not in answers["set_6000"]
     assert score(answers, truths) == score(
         {name: gap.read_result(tmp_path / "results" / f"{name}.json") for name in truths}, truths
     )
@@ -185,10 +185,10 @@ def test_answers_hold_all_that_the_score_reads(tmp_path):
 def test_answers_to_other_sets_are_refused_whole(finished, tmp_path):
     plan = dataclasses.replace(finished[0], out=tmp_path / "out")
     answers = gap.read_answers(finished[0].out / "answers.json")
-    answers["set_5001"]["blind_test"]["runs"] = [5, 6]
+    answers["set_6001"]["blind_test"]["runs"] = [5, 6]
     file = tmp_path / "answers.json"
     file.write_text(json.dumps(answers))
-    with pytest.raises(InputError, match=r"answers\.json: is about other runs \(\[5, 6\]\) than set set_5001"):
+    with pytest.raises(InputError, match=r"answers\.json: is about other runs \(\[5, 6\]\) than set set_6001"):
         gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, file)
     assert not plan.out.exists()
 
@@ -199,9 +199,9 @@ def test_answers_to_other_sets_are_refused_whole(finished, tmp_path):
         (None, "cannot be read as answers"),
         ("{", "cannot be read as answers"),
         ("[]", "expected a mapping of sets to answers"),
-        ('{"set_5000": {"effects": []}}', "set_5000: expected a mapping with a verdict"),
-        ('{"set_5000": {"verdict": "effect_found", "effects": 5}}', "set_5000: effects: expected a list of mappings"),
-        ('{"set_5000": {"verdict": "nothing_missing"}}', "set_5000: blind_test: expected a mapping with truth_sha256"),
+        ('{"set_6000": {"effects": []}}', "set_6000: expected a mapping with a verdict"),
+        ('{"set_6000": {"verdict": "effect_found", "effects": 5}}', "set_6000: effects: expected a list of mappings"),
+        ('{"set_6000": {"verdict": "nothing_missing"}}', "set_6000: blind_test: expected a mapping with truth_sha256"),
     ],
 )
 def test_answers_that_are_none_are_refused(tmp_path, text, message):
@@ -234,8 +234,8 @@ def test_errors_of_the_workflow_are_its_answers(tmp_path, monkeypatch):
 
 def test_a_process_that_dies_has_failed(tmp_path):
     report = gap.run_blind_test(gap.Plan(tmp_path, sets=1, processes=1, runs=(6,)), "no_such_module:analyse", lambda line: None)
-    assert report["failed"] == ["set_5000"]
-    result = gap.read_result(tmp_path / "results" / "set_5000.json")
+    assert report["failed"] == ["set_6000"]
+    result = gap.read_result(tmp_path / "results" / "set_6000.json")
     assert "No module named 'no_such_module'" in result["message"]
     assert result["blind_test"]["runs"] == [6]
 
@@ -269,8 +269,8 @@ def test_impossible_plans_are_refused(tmp_path, numbers):
 def test_a_seal_that_is_none_is_refused(tmp_path, text):
     plan = gap.Plan(tmp_path, sets=1)
     gap.make_output_folder(tmp_path / "sealed")
-    (tmp_path / "sealed" / "truths_5000_1.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"truths_5000_1\.yaml: holds no truths"):
+    (tmp_path / "sealed" / "truths_6000_1.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"truths_6000_1\.yaml: holds no truths"):
         gap.seal(plan, plan.cases())
 
 
@@ -280,11 +280,11 @@ def test_a_test_of_any_length_must_have_the_same_truths(tmp_path, first, second)
     gap.seal(gap.Plan(tmp_path, first), gap.Plan(tmp_path, first).cases())
     plan = gap.Plan(tmp_path, second)
     same = plan.cases()
-    with pytest.raises(InputError, match=rf"truths_5000_{first}\.yaml: holds other truths .*1 sets, first set_5001"):
+    with pytest.raises(InputError, match=rf"truths_6000_{first}\.yaml: holds other truths .*1 sets, first set_6001"):
         gap.seal(plan, [same[0], dataclasses.replace(same[1], severity=9.0), *same[2:]])
     assert len(list((tmp_path / "sealed").iterdir())) == 1
     gap.seal(plan, same)
-    assert (tmp_path / "sealed" / f"truths_5000_{second}.yaml").is_file()
+    assert (tmp_path / "sealed" / f"truths_6000_{second}.yaml").is_file()
 
 
 def test_a_value_without_its_bound_is_not_shown():
