@@ -33,6 +33,7 @@ def robot_candidates(
     parameters: Parameters,
     tolerances: Mapping[str, float],
     measured: Sequence[Array],
+    simulated: Sequence[Array],
     residuals: Sequence[Array],
     drifting: Set[str] = frozenset(),
 ) -> tuple[list[Probe], list[Candidate]]:
@@ -42,10 +43,11 @@ def robot_candidates(
         parameters: (1) of the model.
         tolerances: of the quantities that calibration may move, by name.
         measured: (rows, signals) per run.
+        simulated: the same by the model.
         residuals: of the model, (rows, signals) per run.
         drifting: names of the quantities that drift: no effect hides in their tolerance.
     """
-    library = _Library(observe(parameters, measured, residuals), tolerances, drifting)
+    library = _Library(observe(parameters, measured, simulated, residuals), tolerances, drifting)
     candidates = [found for effect, search, where in _searches() if (found := library.candidate(effect, search, where))]
     return list(library.probes.values()), candidates
 

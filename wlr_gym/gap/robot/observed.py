@@ -23,22 +23,25 @@ PERIODS = 1.5
 LEAST_ROWS = 20
 
 
-def observe(parameters: Parameters, measured: Sequence[Array], residuals: Sequence[Array]) -> Observed:
+def observe(
+    parameters: Parameters, measured: Sequence[Array], simulated: Sequence[Array], residuals: Sequence[Array]
+) -> Observed:
     """Return what a search may read off a model and its runs.
 
     Args:
         parameters: (1) of the model.
         measured: (rows, signals) per run.
+        simulated: the same by the model.
         residuals: of the model, (rows, signals) per run.
     """
     orders = {joint: order for joint in JOINTS if (order := wave_order(joint, measured, residuals)) is not None}
-    return Observed(parameters, orders, _travel(measured))
+    return Observed(parameters, orders, _travel(simulated))
 
 
-def _travel(measured: Sequence[Array]) -> tuple[float, float] | None:
-    x = CHANNELS.index("cam_x")
-    reached = np.concatenate([seen[np.isfinite(seen[:, x]), x] for seen in measured])
-    return (reached.min(), reached.max()) if reached.size else None
+def _travel(simulated: Sequence[Array]) -> tuple[float, float]:
+    """Where the robot has been: by the model, since not all runs have a camera."""
+    reached = np.concatenate([values[:, CHANNELS.index("cam_x")] for values in simulated])
+    return float(reached.min()), float(reached.max())
 
 
 def wave_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]) -> float | None:

@@ -234,8 +234,9 @@ class RobotProblem:
         parameters = self.parameters([setting])
         tolerances = {quantity.name: quantity.sigma for quantity in self.quantities}
         measured = [self._measured[r] for r in runs]
+        simulated = [values[0] for values in self.simulate([setting], runs)]
         drifting = {quantity.name for quantity in self.quantities if quantity.drifts}
-        probes, candidates = robot_candidates(parameters, tolerances, measured, residuals, drifting)
+        probes, candidates = robot_candidates(parameters, tolerances, measured, simulated, residuals, drifting)
         more, formulas = formula_candidates([self.times(r) - self.times(r)[0] for r in runs], residuals)
         possible = [probe for probe in (*probes, *more) if self._possible(setting, probe)]
         keys = {probe.key for probe in possible} | set(tolerances)

@@ -190,7 +190,8 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
 def cross_validated(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, autocorrelation_time: Array) -> bool:
     """Whether the effect passes leave-one-run-out cross-validation: runs improve by a share of what they do when fitted.
 
-    Only the likelihood is compared, not the prior. Two runs are not tested; of :data:`FORGIVING` and more, one is ignored.
+    Only the likelihood is compared, not the prior. Two runs are not tested; of :data:`FORGIVING` and more, one is ignored. Where
+    each run alone improves by what an effect must, the share does not matter: one run may have most of the improvement.
     """
     if len(runs) < LEAST_RUNS:
         return True
@@ -199,6 +200,8 @@ def cross_validated(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit
     )
     pairs = zip(without_each_run(problem, bare), without_each_run(problem, whole), runs, strict=True)
     found = in_threads(problem.threads, lambda pair: problem.residuals([m.setting for m in pair[:2]], [pair[2]])[0], pairs)
+    if min(improvement([one], autocorrelation_time) for one in found) > LEAST_GAIN:
+        return True
     kept = [found[:k] + found[k + 1 :] for k in range(len(found))] if len(runs) >= FORGIVING else [found]
     return max(improvement(some, autocorrelation_time) for some in kept) > max(LEAST_VALIDATED * fitted, 0.0)
 

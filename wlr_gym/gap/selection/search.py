@@ -33,6 +33,8 @@ Tell = Callable[[str], None]
 SHORTLIST = 8
 #: The same per name.
 PER_NAME = 3
+#: The best of so many names that the shortlist lacks are refitted too: where a response has a kink, the first order says little.
+MORE_NAMES = 3
 #: A candidate that explains a group of signals is refitted too if it improves their fit by this many times what is accepted ...
 PROPOSED = 1.5
 #: ... and so many at most.
@@ -96,17 +98,21 @@ class SearchResult:
 def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Score]:
     """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a quarter of the threshold.
 
-    The improvement predicted to first order may be a quarter of the actual one.
+    The improvement predicted to first order may be a quarter of the actual one. The best of :data:`MORE_NAMES` further effects
+    follow.
     """
-    least = 0.25 * threshold
     chosen: list[Score] = []
+    more: dict[str, Score] = {}
     for score in scores:
-        if len(chosen) == SHORTLIST:
+        if score.gain <= 0.25 * threshold:
             break
-        same = [other for other in chosen if other.candidate.name == score.candidate.name]
-        if len(same) < PER_NAME and score.gain > least:
+        name = score.candidate.name
+        same = sum(other.candidate.name == name for other in chosen)
+        if len(chosen) < SHORTLIST and same < PER_NAME:
             chosen.append(score)
-    return chosen
+        elif not same:
+            more.setdefault(name, score)
+    return [*chosen, *list(more.values())[:MORE_NAMES]]
 
 
 def with_proposals(chosen: Sequence[Score], alone: Sequence[Score]) -> list[Score]:

@@ -110,7 +110,7 @@ def _weakening(mu: float, speed: float) -> Guess:
 
 def _reached(observed: Observed) -> tuple[float, float] | None:
     """Least and greatest x, m, of the floor in which an area can lie; None = the robot has hardly moved."""
-    if observed.travel is None or observed.travel[1] - observed.travel[0] < STRIP:
+    if observed.travel[1] - observed.travel[0] < STRIP:
         return None
     return observed.travel[0] - 0.2, observed.travel[1] + 0.2
 

@@ -37,12 +37,12 @@ class Observed:
     Attributes:
         parameters: (1) of the model.
         orders: per joint that has moved, the periods per turn of the wave that explains most of its residuals.
-        travel: m; least and greatest x of the floor that was reached; None = no pose was measured.
+        travel: m; least and greatest x of the floor that was reached.
     """
 
     parameters: Parameters
     orders: Mapping[str, float]
-    travel: tuple[float, float] | None
+    travel: tuple[float, float]
 
     def mean(self, name: str) -> float:
         """Return the mean of a parameter over its elements."""
