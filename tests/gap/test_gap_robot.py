@@ -19,6 +19,7 @@ from wlr_gym.data.record import record_simulation
 from wlr_gym.data.replay import replay
 from wlr_gym.data.write import write_run
 from wlr_gym.gap.analysis import ParameterEstimate
+from wlr_gym.gap.estimation.likelihood import level, mean_squares
 from wlr_gym.gap.estimation.model import FittedModel, nominal_model
 from wlr_gym.gap.problem import Setting, Unknown
 from wlr_gym.gap.report.relations import relation_of
@@ -32,7 +33,7 @@ from wlr_gym.gap.robot.problem import LOST, WORTH_APART, RobotProblem
 from wlr_gym.gap.robot.quantities import knobs, write
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
 from wlr_gym.gap.selection.hypothesis import within_tolerance
-from wlr_gym.gap.validation.held_out import level, mean_squares, noise_floor
+from wlr_gym.gap.validation.held_out import noise_floor
 from wlr_gym.gap.workflow import found_effect
 from wlr_gym.physics.effects import (
     EFFECTS,

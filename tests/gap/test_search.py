@@ -21,6 +21,7 @@ from wlr_gym.gap.selection.cross_validation import (
     cross_validated,
     fit_finalists,
     without_each_run,
+    worth_a_fit,
 )
 from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
 from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
@@ -354,7 +355,7 @@ def test_hypothesis_that_falls_short_of_its_prediction_is_fitted_in_full(predict
         )
 
     hypotheses = [refitted("decoy_1", 60.0, 100.0), refitted("drag", -5.0, predicted, "right")]
-    finals, _ = fit_finalists(problem, RUNS, current, hypotheses, current)
+    finals, _ = fit_finalists(problem, RUNS, current, worth_a_fit(hypotheses), current)
     assert len(finals) == 1 + is_fitted
     assert (finals[0].hypothesis.candidate.label == "drag right") is is_fitted
     assert (finals[0].hypothesis.gain > 100.0) is is_fitted

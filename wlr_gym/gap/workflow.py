@@ -31,6 +31,7 @@ from wlr_gym.gap.analysis import (
     Turning,
 )
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
+from wlr_gym.gap.estimation.likelihood import mean_of_runs, mean_squares
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
 from wlr_gym.gap.opened import open_problem
@@ -44,7 +45,7 @@ from wlr_gym.gap.selection.outcomes import evidence_of, refuted_evidence
 from wlr_gym.gap.selection.search import SearchResult, search_effects
 from wlr_gym.gap.selection.threshold import chance
 from wlr_gym.gap.validation.data_split import informative_split, named_split
-from wlr_gym.gap.validation.held_out import compare_models, confirmed, mean_of_runs, mean_squares, noise_floor
+from wlr_gym.gap.validation.held_out import compare_models, confirmed, noise_floor
 from wlr_gym.gap.validation.localisation import localise
 from wlr_gym.gap.validation.residual_tests import adequacy_of
 from wlr_gym.gap.validation.traces import informative_traces

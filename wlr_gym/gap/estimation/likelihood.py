@@ -158,3 +158,24 @@ def _integrated(series: Any, edges: Any, longest: Any) -> Any:
                 break
             found[c] += 2.0 * rho
     return found
+
+
+def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
+    """Return the mean square (runs, channels) of residuals, one (rows, channels) array per run; NaN where not measured.
+
+    Residuals beyond ``cap`` count as that: one lost wheel must not dominate.
+    """
+    with np.errstate(invalid="ignore"):
+        squares = [np.nansum(np.minimum(r * r, cap**2), axis=0) / np.isfinite(r).sum(axis=0) for r in residuals]
+    return np.stack(squares)
+
+
+def mean_of_runs(squares: Array) -> Array:
+    """Return the mean over runs (channels) of mean squares; NaN where no run measured a channel."""
+    measured = np.isfinite(squares).sum(axis=0)
+    return np.where(measured > 0, np.nansum(squares, axis=0) / np.maximum(measured, 1), np.nan)
+
+
+def level(squares: Array) -> float:
+    """Return the root mean over channels (and runs) of mean squares."""
+    return float(np.sqrt(np.nanmean(squares)))

@@ -33,6 +33,8 @@ MOST_FINALISTS = 3
 NARROWER = 0.4
 #: So many hypotheses of a larger predicted improvement than the best, which their refits fell short of, are fitted in full too.
 STUCK = 1
+#: Where none of these explains what is left, so many other names at most are fitted in full.
+MOST_LEFT = 6
 #: Left out one after the other, the runs must gain together at least this share of what they gain when they are fitted.
 LEAST_VALIDATED = 0.3
 #: Runs that this test needs.
@@ -45,8 +47,8 @@ CONVERGENCE_STEPS = 8
 GRID = (-8.0, -4.0, 0.0, 4.0, 8.0)
 #: An improvement beyond this is not due to how tolerances are counted.
 TOLERANCES_CANNOT = 80.0
-#: What tolerances do instead must fall short by this many times what is asked of an effect: sticking friction makes the cost of
-#: either model rough by some ten units.
+#: What the tolerances of several places do instead must fall short by this many times what is asked of an effect: sticking
+#: friction makes the cost of either model rough by some ten units.
 CLEARLY = 1.5
 #: A named effect is preferred to a formula if it improves the fit by at least this share of what the formula does.
 NAMED_FIRST = 0.9
@@ -64,23 +66,23 @@ def fit_finalists(
     problem: Problem,
     runs: Sequence[int],
     current: Fit,
-    hypotheses: Sequence[Hypothesis],
+    chosen: Sequence[Hypothesis],
     bare: Fit,
     tell: Tell = lambda text: None,
 ) -> tuple[list[Finalist], Fit]:
-    """Fit the best hypotheses in full, with responses simulated anew, and compare all with one model without them.
+    """Fit hypotheses in full, with responses simulated anew, and compare all with one model without them.
 
     Args:
         problem, runs: what is fitted.
         current: the model so far.
-        hypotheses: refitted, best first.
+        chosen: refitted.
         bare: the best model without a further effect so far.
         tell: called with progress.
 
     Returns:
         The finalists, best first; the best model without a further effect, which may be one that a finalist has led to.
     """
-    chosen, wholes = _worth_a_fit(hypotheses), []
+    wholes: list[Fit] = []
     for hypothesis in chosen:
         tell(f"fitting {hypothesis.candidate.label} in full")
         scatter = current.noise.scatter
@@ -113,8 +115,11 @@ def _far_apart(problem: Problem, one: FittedModel, other: FittedModel) -> bool:
     return bool(np.abs(scaled_numbers(problem, one) - scaled_numbers(problem, other)).max(initial=0.0) > 1.0)
 
 
-def _worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best of every name that improves the fit by nearly as much as the best, its best place, and what predicted more."""
+def worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the best of every name that improves the fit nearly as much as the first, its best place, and what predicted more.
+
+    ``hypotheses``: best first.
+    """
     best: dict[str, Hypothesis] = {}
     effects = [hypothesis for hypothesis in hypotheses if not hypothesis.tolerable]
     for hypothesis in effects:
@@ -128,6 +133,16 @@ def _worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     predicted = max([LEAST_GAIN, *(leading.predicted_gain for leading in effects[:1])])
     stuck = [h for h in hypotheses if h.predicted_gain > max(h.gain, predicted) and h not in best.values()]
     return [*best.values(), *sorted(stuck, key=lambda h: -h.predicted_gain)[:STUCK]]
+
+
+def left_to_fit(hypotheses: Sequence[Hypothesis], finals: Sequence[Finalist]) -> list[Hypothesis]:
+    """Return the best of every name that has not been fitted in full, best first, :data:`MOST_LEFT` at most."""
+    had = {final.hypothesis.candidate.name for final in finals}
+    best: dict[str, Hypothesis] = {}
+    for hypothesis in hypotheses:
+        if hypothesis.candidate.name not in had:
+            best.setdefault(hypothesis.candidate.name, hypothesis)
+    return list(best.values())[:MOST_LEFT]
 
 
 def _evaluated(
@@ -190,8 +205,8 @@ def _afresh(problem: Problem, runs: Sequence[int], hypothesis: Hypothesis, near:
 def cross_validated(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit, autocorrelation_time: Array) -> bool:
     """Whether the effect passes leave-one-run-out cross-validation: runs improve by a share of what they do when fitted.
 
-    Only the likelihood is compared, not the prior. Two runs are not tested; of :data:`FORGIVING` and more, one is ignored. Where
-    each run alone improves by what an effect must, the share does not matter: one run may have most of the improvement.
+    Only the likelihood is compared, not the prior. Two runs are not tested; of :data:`FORGIVING` and more, one is ignored.
+    Where each run alone improves by what an effect must, the share does not matter: one run may have most of it.
     """
     if len(runs) < LEAST_RUNS:
         return True
@@ -266,7 +281,8 @@ def _tolerances_do(problem: Problem, runs: Sequence[int], threshold: float, fina
         ).cost
         for found in (bare, final.fit)
     ]
-    return costs[0] - costs[1] < CLEARLY * least_gain(len(final.hypothesis.values), threshold)
+    several = CLEARLY if len(final.hypothesis.candidate.where) > 1 else 1.0
+    return costs[0] - costs[1] < several * least_gain(len(final.hypothesis.values), threshold)
 
 
 def shown_by_some_runs_only(hypothesis: Hypothesis, threshold: float) -> bool:

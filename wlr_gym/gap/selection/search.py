@@ -14,11 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.fit import Fit, cheapest, fit, linearise, widened
-from wlr_gym.gap.estimation.likelihood import estimate_noise
+from wlr_gym.gap.estimation.likelihood import estimate_noise, level, mean_squares
 from wlr_gym.gap.estimation.model import FittedModel, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.alternative import Products, rescored
-from wlr_gym.gap.selection.cross_validation import Finalist, accept, beside, fit_finalists
+from wlr_gym.gap.selection.cross_validation import (
+    Finalist,
+    accept,
+    beside,
+    fit_finalists,
+    left_to_fit,
+    worth_a_fit,
+)
 from wlr_gym.gap.selection.equivalence import equivalents
 from wlr_gym.gap.selection.evidence import credible_names, probabilities
 from wlr_gym.gap.selection.hypothesis import Hypothesis
@@ -33,12 +40,14 @@ Tell = Callable[[str], None]
 SHORTLIST = 8
 #: The same per name.
 PER_NAME = 3
-#: The best of so many names that the shortlist lacks are refitted too: where a response has a kink, the first order says little.
+#: The best of so many names that the shortlist lacks are refitted too: the first order says little where a response has a kink.
 MORE_NAMES = 3
 #: A candidate that explains a group of signals is refitted too if it improves their fit by this many times what is accepted ...
 PROPOSED = 1.5
 #: ... and so many at most.
 MOST_PROPOSED = 3
+#: Error, in units of sensor noise, that seldom remains where nothing is missing.
+MUCH_LEFT = 1.9
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 
@@ -196,9 +205,13 @@ def search_effects(
         finals: list[Finalist] = []
         accepted: Finalist | None = None
         if current is again or not _deeper(problem, current, bare):
-            finals, bare = fit_finalists(problem, runs, current, hypotheses, bare, tell)
+            finals, bare = fit_finalists(problem, runs, current, worth_a_fit(hypotheses), bare, tell)
         if current is again or not _deeper(problem, current, bare):
             accepted, finals, bare = accept(problem, runs, threshold, finals, bare, tell)
+        if accepted is None and _much_is_left(problem, bare) and (current is again or not _deeper(problem, current, bare)):
+            more, bare = fit_finalists(problem, runs, current, left_to_fit(hypotheses, finals), bare, tell)
+            accepted, more, bare = accept(problem, runs, threshold, more, bare, tell)
+            finals = sorted((*finals, *more), key=lambda final: -final.hypothesis.gain)
         if current is not again and _deeper(problem, current, bare):
             tell("calibrated parameters fit better elsewhere: calibrated anew from there")
             anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
@@ -265,6 +278,15 @@ def _deeper(problem: Problem, current: Fit, bare: Fit) -> bool:
         for tau in (current.noise.autocorrelation_time, bare.noise.autocorrelation_time)  # bare may stand under an effect's
     ]
     return min(lower) > LEAST_GAIN
+
+
+def _much_is_left(problem: Problem, found: Fit) -> bool:
+    """Whether so much is left that effects whose refits have told nothing are worth a fit in full.
+
+    Refits keep the calibrated parameters' responses of the model without the effect: where motors reach the voltage of their
+    supply, a descent ends at once.
+    """
+    return not problem.thorough and level(mean_squares(found.residuals, problem.cap)) > MUCH_LEFT
 
 
 def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
+from wlr_gym.gap.estimation.likelihood import level, mean_of_runs, mean_squares
 from wlr_gym.gap.estimation.model import FittedModel
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
@@ -105,27 +106,6 @@ def _beyond_need(problem: Problem, found: Sequence[Array], autocorrelation_time:
     before, after = (level(mean_squares([r[k] for r in found], problem.cap)) for k in (0, 1))
     grows = after > (1.0 + LEAST_GROWTH) * before
     return improvement(found, autocorrelation_time) - (LEAST_GAIN if grows else -LEAST_GAIN)
-
-
-def mean_squares(residuals: Sequence[Array], cap: float) -> Array:
-    """Return the mean square (runs, channels) of residuals, one (rows, channels) array per run; NaN where not measured.
-
-    Residuals beyond ``cap`` count as that: one lost wheel must not dominate.
-    """
-    with np.errstate(invalid="ignore"):
-        squares = [np.nansum(np.minimum(r * r, cap**2), axis=0) / np.isfinite(r).sum(axis=0) for r in residuals]
-    return np.stack(squares)
-
-
-def mean_of_runs(squares: Array) -> Array:
-    """Return the mean over runs (channels) of mean squares; NaN where no run measured a channel."""
-    measured = np.isfinite(squares).sum(axis=0)
-    return np.where(measured > 0, np.nansum(squares, axis=0) / np.maximum(measured, 1), np.nan)
-
-
-def level(squares: Array) -> float:
-    """Return the root mean over channels (and runs) of mean squares."""
-    return float(np.sqrt(np.nanmean(squares)))
 
 
 def noise_floor(problem: Problem, setting: Setting, runs: Sequence[int]) -> float:
