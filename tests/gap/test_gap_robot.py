@@ -166,7 +166,7 @@ def tried():
     measured[:, CHANNELS.index("cam_x")] = np.linspace(0.0, 0.6, 300)
     sigmas = {name: knob.quantity.sigma for name, knob in KNOBS.items()}
     drifting = {name for name, knob in KNOBS.items() if knob.quantity.drifts}
-    return robot_candidates(NOMINAL, sigmas, [measured], [rng.standard_normal(measured.shape)], drifting)
+    return robot_candidates(NOMINAL, sigmas, [measured], [measured], [rng.standard_normal(measured.shape)], drifting)
 
 
 def test_every_effect_of_the_library_is_tried(tried):
@@ -318,10 +318,15 @@ def test_ripple_is_looked_for_at_its_own_order():
 def test_patch_of_floor_needs_a_floor_that_was_driven():
     still = np.zeros((100, len(CHANNELS)))
     sigmas = {name: knob.quantity.sigma for name, knob in KNOBS.items()}
-    _, candidates = robot_candidates(NOMINAL, sigmas, [still], [still])
-    assert "friction_patch" not in {candidate.name for candidate in candidates}
-    blind = np.full_like(still, np.nan)
-    robot_candidates(NOMINAL, sigmas, [blind], [blind])
+
+    def names(measured, simulated):
+        return {candidate.name for candidate in robot_candidates(NOMINAL, sigmas, [measured], [simulated], [still])[1]}
+
+    assert "friction_patch" not in names(still, still)
+    drove, blind = still.copy(), still.copy()
+    drove[:, CHANNELS.index("cam_x")] = np.linspace(0.0, 0.6, 100)
+    blind[:, CHANNELS.index("cam_x")] = np.nan
+    assert "friction_patch" in names(blind, drove)  # without a camera the model says where it was
 
 
 def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, capsys):
@@ -338,7 +343,7 @@ def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, cap
     )
     monkeypatch.setitem(EFFECTS, hot.name, hot)
     moved = np.zeros((100, len(CHANNELS)))
-    probes, candidates = robot_candidates(NOMINAL, {}, [moved], [moved])
+    probes, candidates = robot_candidates(NOMINAL, {}, [moved], [moved], [moved])
     found = [candidate for candidate in candidates if candidate.name == hot.name]
     assert tuple(candidate.where for candidate in found) == WHEEL_SETS
     assert found[0].unknowns == (Unknown("scale", "-", 1.0, 0.6, 1.0, 0.05 * (1.0 - 0.6), least=0.2, most=1.0),)  # its bounds
