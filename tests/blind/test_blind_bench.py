@@ -15,8 +15,10 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.data import read_dataset
 from wlr_gym.studies.bench import gap, gap_score_table
-from wlr_gym.studies.bench.blind.cases import case
+from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, case
 from wlr_gym.studies.bench.blind.score import score
+
+FIRST, SECOND, THIRD = (f"set_{FIRST_SCORED_SEED + k}" for k in range(3))
 
 
 def answers_nothing(folder: Path, out: Path):
@@ -63,7 +65,7 @@ def test_sets_are_spread_on_ray(finished, tmp_path, monkeypatch):
     said: list[str] = []
     plan = dataclasses.replace(plan, out=tmp_path)
     report = gap.run_blind_test(plan, "test_blind_bench:answers_nothing", said.append, ray="local")
-    assert [line.partition(":")[0] for line in said if "to go" in line] == ["1/2  set_6000", "2/2  set_6001"]
+    assert [line.partition(":")[0] for line in said if "to go" in line] == [f"1/2  {FIRST}", f"2/2  {SECOND}"]
     timed = {"median_seconds", "seconds", "wall_seconds"}
     assert {k: v for k, v in report.items() if k not in timed} == {k: v for k, v in alone.items() if k not in timed}
 
@@ -73,15 +75,15 @@ def test_truths_are_sealed_away_from_the_data(finished):
     sealed = list((plan.out / "sealed").iterdir())
     assert len(sealed) == 1
     truths = yaml.safe_load(sealed[0].read_text())
-    assert truths["set_6000"]["effects"][0]["name"] == case(0).effects[0]["name"]
+    assert truths[FIRST]["effects"][0]["name"] == case(0).effects[0]["name"]
     assert any("sha256" in line for line in said)
     text = "".join(file.read_text() for file in (plan.out / "data").rglob("*.yaml"))
-    assert truths["set_6000"]["effects"][0]["name"] not in text
+    assert truths[FIRST]["effects"][0]["name"] not in text
 
 
 def test_data_are_valid_measured_runs(finished):
     plan, _, _ = finished
-    runs = read_dataset(plan.out / "data" / "set_6001").runs
+    runs = read_dataset(plan.out / "data" / SECOND).runs
     assert len(runs) == 1
     assert {finding.kind for finding in runs[0].findings} <= {"gap"}
 
@@ -106,13 +108,13 @@ def test_results_hold_the_hash_of_their_data(finished, tmp_path):
 def test_results_of_other_data_are_refused(finished, tmp_path):
     plan = dataclasses.replace(finished[0], out=tmp_path)
     shutil.copytree(finished[0].out, tmp_path, dirs_exist_ok=True)
-    with pytest.raises(InputError, match=r"set_6000\.json: is about other runs \(\[6\]\)"):
+    with pytest.raises(InputError, match=rf"{FIRST}\.json: is about other runs \(\[6\]\)"):
         _again(dataclasses.replace(plan, runs=(5, 6)))
     file = plan.result_file(case(1))
     result = gap.read_result(file)
     result["blind_test"]["truth_sha256"] = "0" * 64
     file.write_text(json.dumps(result))
-    with pytest.raises(InputError, match=r"set_6001\.json: is about another hidden truth"):
+    with pytest.raises(InputError, match=rf"{SECOND}\.json: is about another hidden truth"):
         _again(plan)
 
 
@@ -146,7 +148,7 @@ def test_goes_on_from_the_answers_of_another_folder(finished, tmp_path):
     assert gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, answers) == report
     assert (plan.out / "answers.json").read_text() == answers.read_text()
     longer = dataclasses.replace(plan, out=tmp_path / "longer", sets=3)
-    assert gap.run_blind_test(longer, "no_such_module:analyse", lambda line: None, answers)["failed"] == ["set_6002"]
+    assert gap.run_blind_test(longer, "no_such_module:analyse", lambda line: None, answers)["failed"] == [THIRD]
     one_more = dataclasses.replace(longer, out=tmp_path / "one_more")
     failed = longer.out / "answers.json"  # not taken over: the reason may be the other machine's
     assert gap.run_blind_test(one_more, "test_blind_bench:answers_nothing", lambda line: None, failed)["failed"] == []
@@ -160,7 +162,7 @@ def test_a_result_that_is_there_is_not_replaced_by_an_answer(finished, tmp_path)
     other = tmp_path / "other.json"
     other.write_text(json.dumps(answers))
     gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, other)
-    assert gap.read_answers(tmp_path / "answers.json")["set_6000"]["verdict"] == "not_excited"
+    assert gap.read_answers(tmp_path / "answers.json")[FIRST]["verdict"] == "not_excited"
 
 
 def test_answers_hold_all_that_the_score_reads(tmp_path):
@@ -176,7 +178,7 @@ def test_answers_hold_all_that_the_score_reads(tmp_path):
         plan.result_file(one).write_text(json.dumps(result | {"wall_seconds": 7.0, "evidence": [1], "blind_test": made}))
     gap.write_answers(tmp_path)
     answers = gap.read_answers(tmp_path / "answers.json")
-    assert "evidence" not in answers["set_6000"]
+    assert "evidence" not in answers[FIRST]
     assert score(answers, truths) == score(
         {name: gap.read_result(tmp_path / "results" / f"{name}.json") for name in truths}, truths
     )
@@ -185,10 +187,10 @@ def test_answers_hold_all_that_the_score_reads(tmp_path):
 def test_answers_to_other_sets_are_refused_whole(finished, tmp_path):
     plan = dataclasses.replace(finished[0], out=tmp_path / "out")
     answers = gap.read_answers(finished[0].out / "answers.json")
-    answers["set_6001"]["blind_test"]["runs"] = [5, 6]
+    answers[SECOND]["blind_test"]["runs"] = [5, 6]
     file = tmp_path / "answers.json"
     file.write_text(json.dumps(answers))
-    with pytest.raises(InputError, match=r"answers\.json: is about other runs \(\[5, 6\]\) than set set_6001"):
+    with pytest.raises(InputError, match=rf"answers\.json: is about other runs \(\[5, 6\]\) than set {SECOND}"):
         gap.run_blind_test(plan, "no_such_module:analyse", lambda line: None, file)
     assert not plan.out.exists()
 
@@ -199,9 +201,9 @@ def test_answers_to_other_sets_are_refused_whole(finished, tmp_path):
         (None, "cannot be read as answers"),
         ("{", "cannot be read as answers"),
         ("[]", "expected a mapping of sets to answers"),
-        ('{"set_6000": {"effects": []}}', "set_6000: expected a mapping with a verdict"),
-        ('{"set_6000": {"verdict": "effect_found", "effects": 5}}', "set_6000: effects: expected a list of mappings"),
-        ('{"set_6000": {"verdict": "nothing_missing"}}', "set_6000: blind_test: expected a mapping with truth_sha256"),
+        (json.dumps({FIRST: {"effects": []}}), f"{FIRST}: expected a mapping with a verdict"),
+        (json.dumps({FIRST: {"verdict": "effect_found", "effects": 5}}), f"{FIRST}: effects: expected a list of mappings"),
+        (json.dumps({FIRST: {"verdict": "nothing_missing"}}), f"{FIRST}: blind_test: expected a mapping with truth_sha256"),
     ],
 )
 def test_answers_that_are_none_are_refused(tmp_path, text, message):
@@ -234,8 +236,8 @@ def test_errors_of_the_workflow_are_its_answers(tmp_path, monkeypatch):
 
 def test_a_process_that_dies_has_failed(tmp_path):
     report = gap.run_blind_test(gap.Plan(tmp_path, sets=1, processes=1, runs=(6,)), "no_such_module:analyse", lambda line: None)
-    assert report["failed"] == ["set_6000"]
-    result = gap.read_result(tmp_path / "results" / "set_6000.json")
+    assert report["failed"] == [FIRST]
+    result = gap.read_result(tmp_path / "results" / f"{FIRST}.json")
     assert "No module named 'no_such_module'" in result["message"]
     assert result["blind_test"]["runs"] == [6]
 
@@ -269,8 +271,8 @@ def test_impossible_plans_are_refused(tmp_path, numbers):
 def test_a_seal_that_is_none_is_refused(tmp_path, text):
     plan = gap.Plan(tmp_path, sets=1)
     gap.make_output_folder(tmp_path / "sealed")
-    (tmp_path / "sealed" / "truths_6000_1.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"truths_6000_1\.yaml: holds no truths"):
+    (tmp_path / "sealed" / f"truths_{FIRST_SCORED_SEED}_1.yaml").write_text(text)
+    with pytest.raises(InputError, match=rf"truths_{FIRST_SCORED_SEED}_1\.yaml: holds no truths"):
         gap.seal(plan, plan.cases())
 
 
@@ -280,11 +282,13 @@ def test_a_test_of_any_length_must_have_the_same_truths(tmp_path, first, second)
     gap.seal(gap.Plan(tmp_path, first), gap.Plan(tmp_path, first).cases())
     plan = gap.Plan(tmp_path, second)
     same = plan.cases()
-    with pytest.raises(InputError, match=rf"truths_6000_{first}\.yaml: holds other truths .*1 sets, first set_6001"):
+    with pytest.raises(
+        InputError, match=rf"truths_{FIRST_SCORED_SEED}_{first}\.yaml: holds other truths .*1 sets, first {SECOND}"
+    ):
         gap.seal(plan, [same[0], dataclasses.replace(same[1], severity=9.0), *same[2:]])
     assert len(list((tmp_path / "sealed").iterdir())) == 1
     gap.seal(plan, same)
-    assert (tmp_path / "sealed" / f"truths_6000_{second}.yaml").is_file()
+    assert (tmp_path / "sealed" / f"truths_{FIRST_SCORED_SEED}_{second}.yaml").is_file()
 
 
 def test_a_value_without_its_bound_is_not_shown():
