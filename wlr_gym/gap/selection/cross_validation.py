@@ -302,13 +302,16 @@ def converge(problem: Problem, runs: Sequence[int], final: Finalist, bare: Fit, 
     """
     tell(f"converging {final.hypothesis.candidate.label}, also from the model as given")
     found = final.fit
-    scatter = found.noise.scatter
-    more = [
-        fit(problem, runs, start, scatter=scatter, near=found, steps=CONVERGENCE_STEPS, tell=tell)
-        for start in (best_on_grid(problem, runs, found), untouched(problem, found.model))
-        if start is not found.model or not found.converged  # else it is where it would end
-    ]
+
+    def descent(start: FittedModel, near: Fit) -> Fit:
+        scatter = near.noise.scatter
+        return fit(problem, runs, start, scatter=scatter, near=near, steps=CONVERGENCE_STEPS, tell=tell)
+
+    starts = (best_on_grid(problem, runs, found), untouched(problem, found.model))
+    more = [descent(start, found) for start in starts if start is not found.model or not found.converged]  # else it ends there
     best = cheapest(problem, (found, *more), found.noise.autocorrelation_time)
+    if best is not found and (start := best_on_grid(problem, runs, best)) is not best.model:  # once more, from where it is now
+        best = cheapest(problem, (best, descent(start, best)), best.noise.autocorrelation_time)
     autocorrelation_time = best.noise.autocorrelation_time
     bare = cheapest(
         problem, [bare, _left(problem, runs, best, final.hypothesis.candidate, autocorrelation_time)], autocorrelation_time

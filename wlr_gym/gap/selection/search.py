@@ -48,6 +48,8 @@ PROPOSED = 1.5
 MOST_PROPOSED = 3
 #: Error, in units of sensor noise, that seldom remains where nothing is missing.
 MUCH_LEFT = 1.9
+#: Beside a formula, which only resembles the law, an effect must improve the fit by this share of what the formula did.
+BESIDE_FORMULA = 0.1
 #: Effects in one analysis.
 MOST_EFFECTS = 4
 
@@ -193,7 +195,7 @@ def search_effects(
         first = screened(problem, runs, current, tell, excluded)
         scores, alone, found, products = first.scores, first.alone, first.found, first.products
         by_chance = np.zeros(0) if problem.thorough else largest_by_chance(problem, runs, current, found, products, scores)
-        threshold = acceptance_threshold(current.cost, by_chance)
+        threshold = max(acceptance_threshold(current.cost, by_chance), BESIDE_FORMULA * _by_formulas(rounds))
         visible = {score.candidate.label for score in first.linear if is_visible(score, threshold)}
         scores = [replace(score, visible=score.candidate.label in visible) for score in scores]
         chosen = scores if problem.thorough else with_proposals(shortlist(scores, threshold), alone)
@@ -233,6 +235,11 @@ def search_effects(
     return SearchResult(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
 
 
+def _by_formulas(rounds: Sequence[Round]) -> float:
+    """The largest improvement by a formula so far."""
+    return max((look.selected.gain for look in rounds if look.selected and look.selected.candidate.formula), default=0.0)
+
+
 def _as_given(
     problem: Problem, runs: Sequence[int], current: Fit, given: Sequence[NDArray[np.float32]] | None
 ) -> Sequence[NDArray[np.float32]] | None:
@@ -243,13 +250,13 @@ def _as_given(
 
 
 def _is_explained(model: FittedModel, candidate: Candidate) -> bool:
-    """Whether the model has the candidate, or an unknown law on every joint where it acts.
+    """Whether the model has the candidate, or an unknown law on a joint where it acts.
 
     An improvement by a name beside a formula at one joint is an error of the formula.
     """
     unknown = {place for other, _ in model.effects if other.formula for place in other.where}
     had = {other.label for other, _ in model.effects}
-    return candidate.label in had or (not candidate.formula and unknown.issuperset(candidate.where))
+    return candidate.label in had or (not candidate.formula and not unknown.isdisjoint(candidate.where))
 
 
 def _without_more(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> Fit:
