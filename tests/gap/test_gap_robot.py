@@ -327,6 +327,7 @@ def test_patch_of_floor_needs_a_floor_that_was_driven():
     drove[:, CHANNELS.index("cam_x")] = np.linspace(0.0, 0.6, 100)
     blind[:, CHANNELS.index("cam_x")] = np.nan
     assert "friction_patch" in names(blind, drove)  # without a camera the model says where it was
+    assert "friction_patch" not in names(blind, np.full_like(still, np.nan))  # a simulation may break down
 
 
 def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, capsys):

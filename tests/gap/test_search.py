@@ -15,11 +15,13 @@ from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.report.text import sentence
 from wlr_gym.gap.selection import cross_validation, search
 from wlr_gym.gap.selection.cross_validation import (
+    MOST_LEFT,
     Finalist,
     best_on_grid,
     converge,
     cross_validated,
     fit_finalists,
+    left_to_fit,
     without_each_run,
     worth_a_fit,
 )
@@ -309,6 +311,7 @@ class Bump(Toy):
 
 
 def test_converging_effect_searches_a_grid_of_places(monkeypatch):
+    """And once more from where it has come to: the first grid may reach half of the way only."""
     unknowns = (Unknown("size", "1", 0.0, -10.0, 10.0, 0.5), Unknown("place", "row", 0.0, 0.0, 200.0, 8.0, is_size=False))
     bump = Candidate("bump", ("body",), unknowns, ())
     problem = Bump({}, [bump.effect((3.0, 100.0))], rows=200)
@@ -319,8 +322,18 @@ def test_converging_effect_searches_a_grid_of_places(monkeypatch):
     found = Hypothesis(bump, lost.model, 1.0, np.ones(5), 1.0, lost.residuals, base.model, base.residuals)
     # with fits that hardly move
     monkeypatch.setattr(cross_validation, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
+    searched = []
+
+    def halfway(problem, runs, found):
+        place = found.model.effects[-1][1][1]
+        searched.append(place)
+        return nominal_model(problem).with_effect(bump, (3.0, 116.0)) if place > 120.0 else best_on_grid(problem, runs, found)
+
     final, _ = converge(problem, RUNS, Finalist(found, lost), base, lambda text: None)
     assert final.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
+    monkeypatch.setattr(cross_validation, "best_on_grid", halfway)
+    converge(problem, RUNS, Finalist(found, lost), base, lambda text: None)
+    assert len(searched) == 2
 
 
 @pytest.mark.parametrize(("converged", "fits"), [(True, 1), (False, 2)])
@@ -429,12 +442,15 @@ def test_effect_of_one_run_fails_cross_validation(seen_in, passes):
     assert cross_validated(problem, RUNS, bare, whole, autocorrelation_time) is passes
 
 
-@pytest.mark.parametrize(("places", "falls_short"), [(["right"], {0.9}), (["left", "right"], {0.9, 1.2})])
-def test_what_tolerances_nearly_do_is_no_effect(monkeypatch, places, falls_short):
-    """An effect must beat those of several places by more than the cost is rough; one place has one tolerance."""
-    problem = Toy({}, [sized("drag", 0.5, *places)], rows=400)
+@pytest.mark.parametrize(
+    ("quantities", "falls_short"), [(("gain",), {0.9}), (("gain", "offset"), {0.9, 1.2}), ((), {0.9, 1.2})]
+)
+def test_what_tolerances_nearly_do_is_no_effect(monkeypatch, quantities, falls_short):
+    """An effect must beat them by more than the cost is rough, but where it adds to one number only."""
+    problem = Toy({}, [sized("drag", 0.5, "right")], rows=400)
     problem.tempering = 3.0
-    own = candidate(problem, "drag", places)
+    meets = (Tolerance(quantities, 1.0, REACH),) if quantities else ()
+    own = replace(candidate(problem, "drag", ["right"]), tolerances=meets)
     bare = fit(problem, RUNS, nominal_model(problem))
     whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)))
     hypothesis = Hypothesis(own, whole.model, 30.0, np.ones(5), 30.0, whole.residuals, bare.model, bare.residuals)
@@ -448,7 +464,7 @@ def test_what_tolerances_nearly_do_is_no_effect(monkeypatch, places, falls_short
 
 
 def test_one_run_may_hold_most_of_what_an_effect_explains(monkeypatch):
-    """Each run alone shows the effect, but far less than the one that dominates the fit."""
+    """Each run alone shows the effect: a share of what the fit improves by is not asked then."""
     problem = Toy({}, [sized("drag", 1.0, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
     bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
@@ -470,9 +486,27 @@ def test_what_refits_miss_is_fitted_in_full_where_much_is_left(monkeypatch):
         return [replace(h, gain=min(h.gain, 1.0), predicted_gain=0.0) for h in found]
 
     monkeypatch.setattr(search, "refit", stuck)
-    for much, names in ((1.0, ["drag right"]), (1e3, [])):
-        monkeypatch.setattr(search, "MUCH_LEFT", much)
-        assert labels(named(problem)) == names
+    assert labels(named(problem)) == []
+    problem.misfit = 1.0
+    assert labels(named(problem)) == ["drag right"]
+
+
+def test_the_second_look_takes_the_most_promising_of_other_names():
+    problem = Toy()
+    current = fit(problem, RUNS, nominal_model(problem))
+
+    def refitted(name, gain, predicted):
+        model = current.model.with_effect(candidate(problem, name), (0.1,))
+        same = current.residuals
+        return Hypothesis(model.effects[0][0], model, gain, np.ones(5), predicted, same, current.model, same)
+
+    had = refitted("decoy_0", 9.0, 9.0)
+    others = [refitted(f"decoy_{k}", 8.0 - k, 1.0) for k in range(1, 3)]
+    late = refitted("twin", -5.0, 30.0)
+    chosen = left_to_fit([had, *others, replace(others[0], gain=0.5), late], [Finalist(had, current)])
+    assert chosen == [late, *others]
+    many = [replace(late, candidate=replace(late.candidate, name=f"name_{k}")) for k in range(2 * MOST_LEFT)]
+    assert len(left_to_fit(many, [])) == MOST_LEFT
 
 
 @pytest.mark.parametrize(("thrown_off", "passes"), [([3], True), ([1, 3], False)])

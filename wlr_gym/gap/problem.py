@@ -290,7 +290,7 @@ class Problem(Protocol):
         Args:
             setting: the calibrated model, with the effects found so far.
             residuals: of it, one (rows, signals) per run of ``runs``: where a candidate's shape is read off the data (period of
-                a ripple, edges of a patch).
+                a ripple).
             runs: which runs those are.
         """
         ...

@@ -40,8 +40,9 @@ def observe(
 
 def _travel(simulated: Sequence[Array]) -> tuple[float, float]:
     """Where the robot has been: by the model, since not all runs have a camera."""
-    reached = np.concatenate([values[:, CHANNELS.index("cam_x")] for values in simulated])
-    return float(reached.min()), float(reached.max())
+    x = np.concatenate([values[:, CHANNELS.index("cam_x")] for values in simulated])
+    reached = x[np.isfinite(x)]  # a simulation may break down
+    return (float(reached.min()), float(reached.max())) if reached.size else (0.0, 0.0)
 
 
 def wave_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]) -> float | None:

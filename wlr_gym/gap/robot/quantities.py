@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 #: Tolerances that move several numbers as one: a floor is one floor, a host's latency one latency.
 SHARED = {"ground.mu": ("ground.mu_x", "ground.mu_y"), "command.delay": ("command.delay",)}
 #: Numbers of the contact spring, of which the robot's file has a guess and no tolerance: one sigma, relative, all wheels alike.
+#: A stiffness held too near to the guess makes the body heavier, and a payload is named.
 GUESSED = {"ground.normal_stiffness": 0.3, "ground.normal_damping": 0.5}
 #: Tolerances by which calibration may move a number; what needs more is a missing effect.
 REACH = 2.5

@@ -47,8 +47,8 @@ CONVERGENCE_STEPS = 8
 GRID = (-8.0, -4.0, 0.0, 4.0, 8.0)
 #: An improvement beyond this is not due to how tolerances are counted.
 TOLERANCES_CANNOT = 80.0
-#: What the tolerances of several places do instead must fall short by this many times what is asked of an effect: sticking
-#: friction makes the cost of either model rough by some ten units.
+#: What tolerances do instead must fall short by this many times what is asked of an effect, unless it adds to one number only:
+#: sticking friction makes the cost of either model rough by some ten units, the more so the more numbers move.
 CLEARLY = 1.5
 #: A named effect is preferred to a formula if it improves the fit by at least this share of what the formula does.
 NAMED_FIRST = 0.9
@@ -136,12 +136,13 @@ def worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def left_to_fit(hypotheses: Sequence[Hypothesis], finals: Sequence[Finalist]) -> list[Hypothesis]:
-    """Return the best of every name that has not been fitted in full, best first, :data:`MOST_LEFT` at most."""
-    had = {final.hypothesis.candidate.name for final in finals}
+    """Return the most promising of every name that has not been fitted in full, :data:`MOST_LEFT` at most."""
+    had = {final.hypothesis.candidate.name + final.hypothesis.candidate.formula for final in finals}
     best: dict[str, Hypothesis] = {}
-    for hypothesis in hypotheses:
-        if hypothesis.candidate.name not in had:
-            best.setdefault(hypothesis.candidate.name, hypothesis)
+    for hypothesis in sorted(hypotheses, key=lambda h: -max(h.gain, h.predicted_gain)):
+        name = hypothesis.candidate.name + hypothesis.candidate.formula
+        if name not in had:
+            best.setdefault(name, hypothesis)
     return list(best.values())[:MOST_LEFT]
 
 
@@ -206,7 +207,7 @@ def cross_validated(problem: Problem, runs: Sequence[int], bare: Fit, whole: Fit
     """Whether the effect passes leave-one-run-out cross-validation: runs improve by a share of what they do when fitted.
 
     Only the likelihood is compared, not the prior. Two runs are not tested; of :data:`FORGIVING` and more, one is ignored.
-    Where each run alone improves by what an effect must, the share does not matter: one run may have most of it.
+    Where each run alone improves by :data:`LEAST_GAIN`, the share does not matter: one run may have most of it.
     """
     if len(runs) < LEAST_RUNS:
         return True
@@ -281,8 +282,14 @@ def _tolerances_do(problem: Problem, runs: Sequence[int], threshold: float, fina
         ).cost
         for found in (bare, final.fit)
     ]
-    several = CLEARLY if len(final.hypothesis.candidate.where) > 1 else 1.0
-    return costs[0] - costs[1] < several * least_gain(len(final.hypothesis.values), threshold)
+    room = 1.0 if _has_a_number_of_its_own(final.hypothesis.candidate) else CLEARLY
+    return costs[0] - costs[1] < room * least_gain(len(final.hypothesis.values), threshold)
+
+
+def _has_a_number_of_its_own(candidate: Candidate) -> bool:
+    """Whether each unknown that meets calibrated parameters adds to one of them (zero of a joint, angle of the camera)."""
+    met = [tolerance for tolerance in candidate.tolerances if tolerance is not None]
+    return bool(met) and all(len(tolerance.quantities) == 1 for tolerance in met)
 
 
 def shown_by_some_runs_only(hypothesis: Hypothesis, threshold: float) -> bool:

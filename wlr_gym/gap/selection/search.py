@@ -36,7 +36,7 @@ from wlr_gym.gap.selection.threshold import acceptance_threshold, largest_by_cha
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
-#: Hypotheses that are refitted in one round, at most.
+#: Hypotheses that are refitted in one round for their scores, at most.
 SHORTLIST = 8
 #: The same per name.
 PER_NAME = 3
@@ -46,8 +46,8 @@ MORE_NAMES = 3
 PROPOSED = 1.5
 #: ... and so many at most.
 MOST_PROPOSED = 3
-#: Error, in units of sensor noise, that seldom remains where nothing is missing.
-MUCH_LEFT = 1.9
+#: Share of :attr:`wlr_gym.gap.problem.Problem.misfit`, in units of sensor noise, above which an error is much.
+MUCH_LEFT = 0.55
 #: Beside a formula, which only resembles the law, an effect must improve the fit by this share of what the formula did.
 BESIDE_FORMULA = 0.1
 #: Effects in one analysis.
@@ -195,7 +195,7 @@ def search_effects(
         first = screened(problem, runs, current, tell, excluded)
         scores, alone, found, products = first.scores, first.alone, first.found, first.products
         by_chance = np.zeros(0) if problem.thorough else largest_by_chance(problem, runs, current, found, products, scores)
-        threshold = max(acceptance_threshold(current.cost, by_chance), BESIDE_FORMULA * _by_formulas(rounds))
+        threshold = max(acceptance_threshold(current.cost, by_chance), BESIDE_FORMULA * _by_formulas(current, rounds))
         visible = {score.candidate.label for score in first.linear if is_visible(score, threshold)}
         scores = [replace(score, visible=score.candidate.label in visible) for score in scores]
         chosen = scores if problem.thorough else with_proposals(shortlist(scores, threshold), alone)
@@ -235,9 +235,11 @@ def search_effects(
     return SearchResult(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
 
 
-def _by_formulas(rounds: Sequence[Round]) -> float:
-    """The largest improvement by a formula so far."""
-    return max((look.selected.gain for look in rounds if look.selected and look.selected.candidate.formula), default=0.0)
+def _by_formulas(current: Fit, rounds: Sequence[Round]) -> float:
+    """The largest improvement by a formula that the model has."""
+    formulas = {candidate.label for candidate, _ in current.model.effects if candidate.formula}
+    selected = [look.selected for look in rounds if look.selected is not None]
+    return max((one.gain for one in selected if one.candidate.label in formulas), default=0.0)
 
 
 def _as_given(
@@ -250,13 +252,13 @@ def _as_given(
 
 
 def _is_explained(model: FittedModel, candidate: Candidate) -> bool:
-    """Whether the model has the candidate, or an unknown law on a joint where it acts.
+    """Whether the model has the candidate, or an unknown law on half of the joints where it acts.
 
-    An improvement by a name beside a formula at one joint is an error of the formula.
+    An improvement by a name beside a formula there is an error of the formula.
     """
     unknown = {place for other, _ in model.effects if other.formula for place in other.where}
-    had = {other.label for other, _ in model.effects}
-    return candidate.label in had or (not candidate.formula and not unknown.isdisjoint(candidate.where))
+    half = 2 * len(unknown.intersection(candidate.where)) >= len(candidate.where)
+    return candidate.label in {other.label for other, _ in model.effects} or (half and not candidate.formula)
 
 
 def _without_more(problem: Problem, current: Fit, hypotheses: Sequence[Hypothesis]) -> Fit:
@@ -293,7 +295,7 @@ def _much_is_left(problem: Problem, found: Fit) -> bool:
     Refits keep the calibrated parameters' responses of the model without the effect: where motors reach the voltage of their
     supply, a descent ends at once.
     """
-    return not problem.thorough and level(mean_squares(found.residuals, problem.cap)) > MUCH_LEFT
+    return level(mean_squares(found.residuals, problem.cap)) > MUCH_LEFT * problem.misfit
 
 
 def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:
