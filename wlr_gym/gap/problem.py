@@ -148,6 +148,11 @@ class Candidate:
         """Short text: ``coulomb_friction leg_rf``."""
         return " ".join([self.name, *self.where, self.formula]).strip()
 
+    @property
+    def law(self) -> str:
+        """What tells it from other effects, wherever they act: its name, and the formula of one without a name."""
+        return self.name + self.formula
+
     def kept(self, values: Sequence[float]) -> tuple[float, ...]:
         """Return the values brought into the plausible range."""
         ranged = tuple(float(np.clip(v, *u.bounds)) for v, u in zip(values, self.unknowns, strict=True))

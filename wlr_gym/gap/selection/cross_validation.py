@@ -126,7 +126,7 @@ def worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
         leading = effects[0]
         enough = hypothesis.gain >= max(FINALIST_SHARE * leading.gain, 0.5 * LEAST_GAIN)
         if enough and len(best) < MOST_FINALISTS:
-            best.setdefault(hypothesis.candidate.name + hypothesis.candidate.formula, hypothesis)
+            best.setdefault(hypothesis.candidate.law, hypothesis)
         narrower = len(leading.candidate.where) > 1 and len(hypothesis.candidate.where) == 1
         if narrower and hypothesis.candidate.name == leading.candidate.name and hypothesis.gain > NARROWER * leading.gain:
             best.setdefault("narrower", hypothesis)
@@ -137,12 +137,11 @@ def worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 def left_to_fit(hypotheses: Sequence[Hypothesis], finals: Sequence[Finalist]) -> list[Hypothesis]:
     """Return the most promising of every name that has not been fitted in full, :data:`MOST_LEFT` at most."""
-    had = {final.hypothesis.candidate.name + final.hypothesis.candidate.formula for final in finals}
+    had = {final.hypothesis.candidate.law for final in finals}
     best: dict[str, Hypothesis] = {}
     for hypothesis in sorted(hypotheses, key=lambda h: -max(h.gain, h.predicted_gain)):
-        name = hypothesis.candidate.name + hypothesis.candidate.formula
-        if name not in had:
-            best.setdefault(name, hypothesis)
+        if hypothesis.candidate.law not in had:
+            best.setdefault(hypothesis.candidate.law, hypothesis)
     return list(best.values())[:MOST_LEFT]
 
 

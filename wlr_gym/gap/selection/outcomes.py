@@ -88,10 +88,7 @@ def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Contain
         return "inconsistent", "helps some runs and harms others"
     if best is None:
         least = least_gain(len(hypothesis.values), look.threshold)
-        return (
-            TOO_LITTLE,
-            f"improves the fit by less than chance or an imperfect simulator or formula can ({least:.0f})",
-        )
+        return TOO_LITTLE, f"improves the fit by less than chance or an imperfect simulator or formula can ({least:.0f})"
     return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the best does"
 
 

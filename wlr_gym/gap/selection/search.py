@@ -191,6 +191,11 @@ def search_effects(
         given = linearise(problem, untouched(problem, start.model), runs)[1]
     current, calibrated, rounds, again = start, start, [], None
     models = [start.model]
+
+    def settled(bare: Fit) -> bool:
+        """Whether the calibrated model stands: once calibrated anew it does, else where none without an effect is lower."""
+        return current is again or not _deeper(problem, current, bare)
+
     while True:
         first = screened(problem, runs, current, tell, excluded)
         scores, alone, found, products = first.scores, first.alone, first.found, first.products
@@ -206,15 +211,15 @@ def search_effects(
         bare = _without_more(problem, current, hypotheses)
         finals: list[Finalist] = []
         accepted: Finalist | None = None
-        if current is again or not _deeper(problem, current, bare):
+        if settled(bare):
             finals, bare = fit_finalists(problem, runs, current, worth_a_fit(hypotheses), bare, tell)
-        if current is again or not _deeper(problem, current, bare):
+        if settled(bare):
             accepted, finals, bare = accept(problem, runs, threshold, finals, bare, tell)
-        if accepted is None and _much_is_left(problem, bare) and (current is again or not _deeper(problem, current, bare)):
+        if accepted is None and _much_is_left(problem, bare) and settled(bare):
             more, bare = fit_finalists(problem, runs, current, left_to_fit(hypotheses, finals), bare, tell)
             accepted, more, bare = accept(problem, runs, threshold, more, bare, tell)
             finals = sorted((*finals, *more), key=lambda final: -final.hypothesis.gain)
-        if current is not again and _deeper(problem, current, bare):
+        if not settled(bare):
             tell("calibrated parameters fit better elsewhere: calibrated anew from there")
             anew = fit(problem, runs, bare.model, scatter=current.noise.scatter, steps=problem.steps)
             current = again = widened(problem, runs, anew)
