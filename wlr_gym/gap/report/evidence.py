@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from wlr_gym.base.html import heading, section, table
-from wlr_gym.base.text import number
+from wlr_gym.base.html import folded, heading, section, table
+from wlr_gym.base.text import counted, number
 from wlr_gym.gap.analysis import REJECTED, SELECTED, Analysis, Evidence, FoundEffect
 from wlr_gym.gap.problem import Range
 from wlr_gym.gap.report.text import estimate, listed, percent, places, plain, unit_of
@@ -65,13 +65,17 @@ def _evidence(evidence: Sequence[Evidence], turn: int) -> str:
         (plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), one.outcome, one.reason)
         for one in fitted
     ]
-    rows += [_rejected(alike) for alike in _by_name([one for one in evidence if one.outcome == REJECTED])]
-    classes = ["selected" if one.outcome == SELECTED else "" for one in fitted] + [""] * (len(rows) - len(fitted))
-    headings = ("candidate", "where", "values", "gain", "predicted", "outcome", "reason")
-    return (
-        heading(f"Round {turn}: {len(evidence)} candidate{'s' if len(evidence) > 1 else ''} compared")
-        + "\n"
-        + table(headings, rows, {3, 4}, classes)
+    rejected = [_rejected(alike) for alike in _by_name([one for one in evidence if one.outcome == REJECTED])]
+    classes = ["selected" if one.outcome == SELECTED else "" for one in fitted]
+    return "\n".join(
+        [
+            heading(f"Round {turn}: {counted(len(evidence), 'candidate')} compared"),
+            table(("candidate", "where", "values", "gain", "predicted", "outcome", "reason"), rows, {3, 4}, classes),
+            folded(
+                f"{counted(len(rejected), 'effect')} rejected at screening",
+                table(("effect", "where", "predicted", "reason"), rejected, {2}),
+            ),
+        ]
     )
 
 
@@ -89,7 +93,7 @@ def _by_name(evidence: Sequence[Evidence]) -> list[list[Evidence]]:
 def _rejected(alike: Sequence[Evidence]) -> tuple[str, ...]:
     best, others = alike[0], len(alike) - 1
     more = f"; less at {others} other place{'s' if others > 1 else ''}" if others else ""
-    return plain(best.name), f"{places(best.where)}{more}", "", "-", number(best.screened), best.outcome, best.reason
+    return plain(best.name), f"{places(best.where)}{more}", number(max(best.screened, 0.0)), best.reason
 
 
 def _values(one: Evidence) -> str:

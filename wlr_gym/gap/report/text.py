@@ -144,7 +144,12 @@ def unit_of(unit: str) -> str:
 def estimate(found: ParameterEstimate) -> str:
     """Return ``0.041 (0.038 to 0.045) N m``; angles in degrees, too."""
     known = math.isfinite(found.low) and math.isfinite(found.high)
-    digits = _digits(found.value, 0.5 * (found.high - found.low)) if known else 3
+    uncertainty = 0.5 * (found.high - found.low) if known else 0.0
+    if uncertainty > abs(found.value):  # not distinguishable from zero: two digits of the uncertainty
+        decimals = max(0, 1 - math.floor(math.log10(uncertainty)))
+        value, low, high = (f"{round(one, decimals) + 0.0:.{decimals}f}" for one in (found.value, found.low, found.high))
+        return f"{value} ({low} to {high}){unit_of(found.unit)}"
+    digits = _digits(found.value, uncertainty)
     between = f" ({number(found.low, digits)} to {number(found.high, digits)})" if known else ""
     degrees = f" = {number(math.degrees(found.value))}°" if found.unit == "rad" else ""
     return f"{number(found.value, digits)}{between}{unit_of(found.unit)}{degrees}"
@@ -152,9 +157,7 @@ def estimate(found: ParameterEstimate) -> str:
 
 def _digits(value: float, uncertainty: float) -> int:
     """Significant digits that show a value down to its uncertainty, three at least: a scale of 1.022, known to 0.004."""
-    if not 0.0 < uncertainty < abs(value):
-        return 3
-    return max(3, math.ceil(math.log10(abs(value) / uncertainty)) + 1)
+    return max(3, math.ceil(math.log10(abs(value) / uncertainty)) + 1) if uncertainty > 0.0 else 3
 
 
 # ---- the verdict -----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from wlr_gym.base.plots import new_figure, tidy
 from wlr_gym.base.text import number
 from wlr_gym.gap.report.text import listed, places, plain, unit_of
 from wlr_gym.studies.demo.settings import Demo
-from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, drawn, paragraph, picture
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, drawn, link, paragraph, picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,7 +58,10 @@ def name(demo: Demo, tell: Tell) -> Section:
     ):  # fmt: skip
         if (plots / f"{kind}.png").is_file():
             html += picture(plots / f"{kind}.png", caption)
-    html += paragraph(f"The whole report: {demo.gap / REPORT_FILE}; the patch: {demo.gap / 'patch.yaml'}.")
+    links = [
+        link(demo, demo.gap / name, text) for name, text in ((REPORT_FILE, "the whole report"), ("patch.yaml", "the patch"))
+    ]
+    html += f"<p>Files: {', '.join(links)}.</p>"
     verdict = SHOWN if found.verdict == EFFECT_FOUND else NOT_SHOWN
     return Section(NAME_TITLE, sentence(found), html, verdict)
 

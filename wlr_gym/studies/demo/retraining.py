@@ -6,7 +6,6 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import commands, table
-from wlr_gym.base.text import number
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.gap.report.text import listed, places, plain
 from wlr_gym.learning.evaluation import FIRST_SEED, Subject
@@ -83,7 +82,7 @@ def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
         numbers: tracking errors ``old`` and ``new`` of the same episodes, ``better_percent`` and ``better_ci95``.
     """
     better, (low, high) = numbers["better_percent"], numbers["better_ci95"]
-    before, after = (number(_mean(numbers[name])) for name in ("old", "new"))
+    before, after = (f"{_mean(numbers[name]):.3f}" for name in ("old", "new"))
     interval, verdict, tail = f"95 % interval {low:.0f} to {high:.0f} %", NOT_SHOWN, ""
     if low > 0.0:
         change, verdict = f"{better:.0f} % lower", SHOWN
@@ -107,7 +106,7 @@ def _said(step: Any) -> str:
 
 def _episodes(numbers: dict[str, Any]) -> str:
     rows = [
-        (f"{index + 1}", number(old), number(new), f"{100.0 * (1.0 - new / old):+.0f}")
+        (f"{index + 1}", f"{old:.3f}", f"{new:.3f}", f"{100.0 * (1.0 - new / old):+.0f}")
         for index, (old, new) in enumerate(zip(numbers["old"], numbers["new"], strict=True))
     ]
     return table(("episode", f"tracking error, {OLD}", f"tracking error, {NEW}", "better by (%)"), rows, range(1, 4))

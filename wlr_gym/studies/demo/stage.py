@@ -64,6 +64,11 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
+def link(demo: Demo, path: Path, text: str) -> str:
+    """Return a link to a file beside the page."""
+    return f'<a href="{path.relative_to(demo.page.parent).as_posix()}">{escape(text)}</a>'
+
+
 def picture(path: Path, caption: str) -> str:
     """Return a picture or film inside the page, with its caption."""
     data = base64.b64encode(path.read_bytes()).decode("ascii")
