@@ -72,7 +72,7 @@ def numbers(old, new, better, low, high):
 def test_training_on_is_ticked_only_where_the_interval_says_so():
     sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.3, 0.5], 20.0, 12.0, 31.0))
     assert verdict == SHOWN
-    assert "0.5 before and 0.4 after training on: 20 % lower (95 % interval 12 to 31 %, 2 pairs" in sentence
+    assert "0.500 before and 0.400 after training on: 20 % lower (95 % interval 12 to 31 %, 2 pairs" in sentence
     sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.4, 0.58], 2.0, -3.0, 5.0))
     assert verdict == NOT_SHOWN
     assert "after training on: -2 % (95 % interval -5 to +3 %" in sentence  # of the error: minus is better
