@@ -50,6 +50,9 @@ _ON_REQUEST = ("vision", "bus", "camera", "perception", "learning", "sysid")
 BLIND_TEST = "gap"
 #: Another: what a hidden fault costs a policy, and how much of it is won back. See docs/adapt.md.
 ADAPT_STUDY = "adapt"
+#: Another: how soon, and how rightly, the gap workflow decides when it chooses the runs. See docs/gap.md.
+DECIDE_STUDY = "decide"
+_ALONE = (ADAPT_STUDY, BLIND_TEST, DECIDE_STUDY)
 SCHEMA = 1
 
 
@@ -59,7 +62,8 @@ class BenchOptions(JsonOption, ForceOption):
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
     """Some of engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception,
-    vision, sysid. gap (the blind test of the gap workflow), adapt (what adaptation wins back): alone, with --out."""
+    vision, sysid. gap (the blind test of the gap workflow), adapt (what adaptation wins back), decide (gap --until-decided):
+    alone, with --out."""
     save: Path | None = None
     """File (.json) for all numbers; the picture of the engine is written beside it."""
     rounds: int = 5
@@ -67,18 +71,18 @@ class BenchOptions(JsonOption, ForceOption):
     quick: bool = False
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
     out: Path | None = None
-    """gap, adapt: folder for results; an interrupted test resumes from it.
+    """gap, adapt, decide: folder for results; an interrupted test resumes from it.
     vision: instead of the table, film a lab that is not perfect and keep every film's result here; resumes likewise."""
     cases: tuple[str, ...] = ()
-    """adapt: names of cases, or how many of them; default: all."""
+    """adapt: names of cases, or how many of them; default: all. decide: how many (31)."""
     contenders: tuple[str, ...] = ()
-    """adapt: none, truth, wide, ours, calibrated; default: all."""
+    """adapt: none, truth, wide, ours, calibrated; default: all. decide: chosen, random, eight."""
     sets: int | None = None
     """gap: data sets (400: 240 of all kinds, 160 more without an effect). vision with --out: films (60)."""
     seed: int | None = None
     """vision: with --out, of the films (28); another one gives other films."""
     processes: int = 2
-    """gap: data sets at a time."""
+    """gap, decide: data sets at a time."""
     ray: tuple[str, ...] | None = None
     """gap: run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
     answers: Path | None = None
@@ -96,19 +100,21 @@ def run(options: BenchOptions) -> int:
     """Measure, print, write."""
     asked = (*options.what, *options.only)
     for name in asked:
-        if name not in (*MEASUREMENTS, BLIND_TEST, ADAPT_STUDY):
-            raise unknown_name("measurement", name, (*MEASUREMENTS, BLIND_TEST, ADAPT_STUDY))
+        if name not in (*MEASUREMENTS, *_ALONE):
+            raise unknown_name("measurement", name, (*MEASUREMENTS, *_ALONE))
     if options.rounds < 1:
         raise InputError(f"--rounds {options.rounds}: expected 1 or more")
     if options.save is not None:
         if not options.save.parent.is_dir():
             raise InputError(f"--save {options.save}: folder {options.save.parent} does not exist")
         refuse_existing(options.save, options.force, "--save")
-    for name in (ADAPT_STUDY, BLIND_TEST):
+    for name in _ALONE:
         if name in asked and len(asked) > 1:
             raise InputError(f"{name} takes hours and is run alone, not with {', '.join(set(asked) - {name})}")
     if ADAPT_STUDY in asked:
         return _adapt_study(options)
+    if DECIDE_STUDY in asked:
+        return _decide_study(options)
     if BLIND_TEST in asked:
         return _gap_speed(options) if options.speed else _blind_test(options)
     if options.out is not None:
@@ -200,6 +206,28 @@ def _adapt_study(options: BenchOptions) -> int:
     if options.json:
         print_json(lines)
     console.print(f"written: {options.out / adapt_study.LINES_FILE}, {options.out / 'adapt.md'}")
+    return OK
+
+
+def _decide_study(options: BenchOptions) -> int:
+    """Let the gap workflow choose what robots with hidden effects drive, and others beside it; print and write the tables."""
+    from wlr_gym.studies.bench import decide_study
+
+    if options.out is None:
+        raise InputError(f"{DECIDE_STUDY} needs --out DIR: finished cases are kept there, so that it can be interrupted")
+    for name in options.contenders:
+        if name not in decide_study.CONTENDERS:
+            raise unknown_name("contender", name, decide_study.CONTENDERS)
+    if len(options.cases) > 1 or not "".join(options.cases or ("1",)).isdigit():
+        raise InputError(f"--cases {' '.join(options.cases)}: decide takes how many, 1 or more")
+    console = Console(soft_wrap=True, highlight=False)
+    count = int(options.cases[0]) if options.cases else decide_study.CASES
+    contenders = options.contenders or tuple(decide_study.CONTENDERS)
+    lines = decide_study.run_decide_study(options.out, count, contenders, options.processes, console.print)
+    _write(options.out / "decide.md", decide_study.markdown(lines), console)
+    if options.json:
+        print_json(lines)
+    console.print(f"written: {options.out / 'decide.json'}, {options.out / 'decide.md'}")
     return OK
 
 

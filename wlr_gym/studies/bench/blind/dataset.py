@@ -1,9 +1,10 @@
-"""One data set: a robot copy with something hidden in it, eight runs, files in the measured-run format."""
+"""A robot copy with something hidden in it, runs of it, and a data set of eight: files in the measured-run format."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import yaml
 from wlr_gym.studies.bench.blind import commands, sensors
 from wlr_gym.studies.bench.blind.copies import Copy, draw, nominal, with_body_of, yielding
 from wlr_gym.studies.bench.blind.simulation import BlindProfile, simulate
-from wlr_gym.studies.bench.blind.truth import hide
+from wlr_gym.studies.bench.blind.truth import Hidden, hide
 from wlr_gym.studies.bench.blind.world import build
 
 #: Profile registers a set may have; 0 = off. Wheels, rad/s2.
@@ -27,6 +28,45 @@ LEG_ACCELERATIONS = (0.0, 7.490150, 14.980301)
 RESOLUTION = 1e-4
 #: Stands for what was not measured there.
 UNSEEN = -(2.0**53)
+
+
+@dataclass(frozen=True)
+class BlindRobot:
+    """A robot copy that can be driven.
+
+    Attributes:
+        robot: contents of a robot file. copy: what is true of this one. hidden: in it.
+        profile: of its servos. camera: whether one sees it.
+    """
+
+    robot: Mapping[str, Any]
+    copy: Copy
+    hidden: Hidden
+    profile: BlindProfile
+    camera: bool = True
+
+    def drive(self, script: commands.BlindScript, noise: np.random.Generator) -> pd.DataFrame:
+        """Return the table of one run."""
+        sheet, copy, hidden = dict(self.robot), self.copy, self.hidden
+        times = sensors.ticks(script.duration, float(sheet["sensors"]["control_rate"]), noise)
+        setpoints = script.setpoints(times)
+        start = setpoints[0, :4] + 0.02 * noise.standard_normal(4)
+        records = simulate(build(copy, hidden), copy, hidden, self.profile, times, setpoints, start, times[-1] + 0.01)
+        table = sensors.log(records, times, setpoints, copy, hidden, sheet, noise)
+        return table if self.camera else table.drop(columns=[name for name in table if name.startswith("cam_")])
+
+    def meta(self, notes: str) -> dict[str, Any]:
+        """Return the contents of ``meta.yaml`` of its runs."""
+        registers = {name: value for name, value in vars(self.profile).items() if value > 0}
+        meta = {"robot": self.robot["name"], "profile": registers, "ground": "indoor floor"}
+        return {**meta, "marker_offset": [0.0, 0.0, 0.0], "notes": notes}
+
+
+def copy_of(robot: Mapping[str, Any], seed: int, exact: bool = False, soft: bool = False) -> Copy:
+    """Draw a robot copy; see :func:`simulate_runs`."""
+    copy = draw(dict(robot), np.random.default_rng([seed, 1]))
+    copy = with_body_of(copy, nominal(dict(robot))) if exact else copy
+    return yielding(copy, np.random.default_rng([seed, 7])) if soft else copy
 
 
 def simulate_runs(
@@ -52,39 +92,17 @@ def simulate_runs(
     Returns:
         Tables of the runs, contents of ``meta.yaml``, the robot copy.
     """
-    copy = draw(dict(robot), np.random.default_rng([seed, 1]))
-    copy = with_body_of(copy, nominal(dict(robot))) if exact else copy
-    copy = yielding(copy, np.random.default_rng([seed, 7])) if soft else copy
+    copy = copy_of(robot, seed, exact, soft)
     choose = np.random.default_rng([seed, 2])
     geometry = commands.Geometry(float(robot["leg"]["length"]), float(robot["wheel"]["radius"]))
     scripts = commands.scripts(choose, geometry)
     profile = BlindProfile(
         float(choose.choice(ACCELERATIONS)), float(choose.choice(SPEEDS)), float(choose.choice(LEG_ACCELERATIONS))
     )
-    hidden = hide(effects, copy)
-    tables = []
-    for kind in runs:
-        noise = np.random.default_rng([seed, 3, kind])
-        script = scripts[kind]
-        times = sensors.ticks(script.duration, float(robot["sensors"]["control_rate"]), noise)
-        setpoints = script.setpoints(times)
-        start = setpoints[0, :4] + 0.02 * noise.standard_normal(4)
-        records = simulate(build(copy, hidden), copy, hidden, profile, times, setpoints, start, times[-1] + 0.01)
-        table = sensors.log(records, times, setpoints, copy, hidden, dict(robot), noise)
-        tables.append(table if camera else table.drop(columns=[name for name in table if name.startswith("cam_")]))
-    return tables, _meta(robot, profile, runs), copy
-
-
-def _meta(robot: Mapping[str, Any], profile: BlindProfile, runs: Sequence[int]) -> dict[str, Any]:
-    registers = {name: value for name, value in vars(profile).items() if value > 0}
+    driven = BlindRobot(robot, copy, hide(effects, copy), profile, camera)
+    tables = [driven.drive(scripts[kind], np.random.default_rng([seed, 3, kind])) for kind in runs]
     notes = ", ".join(f"run_{n + 1:02d} {commands.NAMES[kind]}" for n, kind in enumerate(runs))
-    return {
-        "robot": robot["name"],
-        "profile": registers,
-        "ground": "indoor floor",
-        "marker_offset": [0.0, 0.0, 0.0],
-        "notes": f"runs in order: {notes}",
-    }
+    return tables, driven.meta(f"runs in order: {notes}"), copy
 
 
 def fingerprint(tables: Sequence[pd.DataFrame]) -> str:
