@@ -24,9 +24,10 @@ def result(name, probability=1.0):
     """A result that names an effect of one wheel, as probable as it says; else rolling resistance."""
     parameters = {"torque": {"value": 0.1, "ci95": None, "unit": "N m"}}
     effect = {"name": name, "where": ["wheel_lf"], "parameters": parameters, "confidence": 1.0}
+    other = "worse fit" if probability == 1.0 else "equivalent"
     entry = {"round": 1, "where": ["wheel_lf"], "values": {}}
     evidence = [{**entry, "name": name, "outcome": "selected", "probability": probability}]
-    evidence.append({**entry, "name": "rolling_resistance", "outcome": "equivalent", "probability": 1.0 - probability})
+    evidence.append({**entry, "name": "rolling_resistance", "outcome": other, "probability": 1.0 - probability})
     content = {"verdict": "effect_found", "effects": [effect], "evidence": evidence}
     return Result.model_validate(
         EMPTY | content | {"thresholds": [{"round": 1, "none": 0.0}], "runs": {"fit": ["run_01"], "heldout": []}}
@@ -102,7 +103,7 @@ def test_a_study_goes_on_where_it_was(tmp_path, monkeypatch):
     monkeypatch.setattr(decide_study, "spread", spread)
     decide_study.run_decide_study(tmp_path, 1, ("chosen",), say=lambda text: None)
     lines = decide_study.run_decide_study(tmp_path, 1, ("chosen", "eight"), say=lambda text: None)
-    assert done == ["case_9000_chosen", "case_9000_eight"]
+    assert done == ["case_9100_chosen", "case_9100_eight"]
     text = markdown(lines)
     assert (
         "| the run that distinguishes best, per second | 1 | 1 (at least 5%) | 0 (at most 95%) | 50 s | 50 s | 0 | 0 |" in text

@@ -60,6 +60,18 @@ def test_names_that_share_the_probability_are_in_play():
     assert [one.name for one in explanations(found)] == ["coulomb_friction", "rolling_resistance"]
 
 
+def test_a_name_that_is_equivalent_is_in_play_however_improbable():
+    entries = [
+        candidate("coulomb_friction", 1.0, "selected"),
+        candidate("viscous_friction", 1e-50, "equivalent"),
+        candidate("rolling_resistance", 1e-60, "worse fit"),
+    ]
+    assert [one.name for one in explanations(result("effect_found", (0.0, entries)))] == [
+        "coulomb_friction",
+        "viscous_friction",
+    ]
+
+
 def test_places_of_a_name_count_together_and_the_best_one_stands_for_it():
     entries = [
         candidate("coulomb_friction", 0.5, "selected"),
@@ -202,6 +214,16 @@ def test_it_ends_with_the_budget_and_goes_on_with_a_larger_one(data, tmp_path, a
     assert (second.history.ended, len(second.history.rounds)) == ("decided", 3)
     assert answers["analysed"] == 2  # what was analysed is not analysed again
     assert decide(data, tmp_path / "out", record).history == second.history
+
+
+def test_a_name_that_leaves_far_more_than_simulators_do_is_not_decided(data, tmp_path, answers):
+    errors = dict.fromkeys(("fit_before", "heldout_before", "heldout_calibrated", "heldout_after"), 9.0)
+    gap = {"metric": "RMS", **errors, "noise_floor": 1.0, "reduction": 0.5, "reduction_ci95": None}
+    bad, good = (result(*CERTAIN).model_dump() | {"gap": {**gap, "fit_after": after}} for after in (5.0, 2.0))
+    answers["results"] = [Result.model_validate(one) for one in (bad, good)]
+    found = decide(data, tmp_path / "out", record)
+    assert (found.history.ended, len(found.history.driven)) == ("decided", 2)
+    assert found.history.rounds[1].why == "shows most effects best"
 
 
 def test_motions_that_take_longer_than_what_is_left_are_not_driven(data, tmp_path, answers):

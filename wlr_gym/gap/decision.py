@@ -22,6 +22,7 @@ from wlr_gym.gap.report.explanations import Explanation, explanations
 from wlr_gym.gap.report.result import RESULT_FILE, read_result
 from wlr_gym.gap.robot.next_run import TELLS, driven_already, most_shown, motions_to_drive, promises
 from wlr_gym.gap.robot.open import LEAST_RUNS
+from wlr_gym.gap.robot.problem import MISFIT
 from wlr_gym.gap.workflow import Tell, analyse
 from wlr_gym.physics.effects import Patch, Source, load_patch
 
@@ -29,8 +30,9 @@ HISTORY_FILE = "history.json"
 #: Instead of a verdict: no analysis yet.
 TOO_FEW_RUNS = "too_few_runs"
 
-#: Why it ended. ``decided``: one name has 95 %; ``nothing would tell``: no motion promises to distinguish what is left;
-#: ``budget``: runs or seconds are used up; ``stopped``: a drive recorded nothing. Empty: it goes on.
+#: Why it ended. ``decided``: one name has 95 %, none is equivalent to it, and what it leaves is no more than simulators leave;
+#: ``nothing would tell``: no motion promises to distinguish what is left; ``budget``: runs or seconds are used up;
+#: ``stopped``: a drive recorded nothing. Empty: it goes on.
 Ending = Literal["", "decided", "nothing would tell", "budget", "stopped"]
 
 
@@ -240,7 +242,7 @@ def _choice(
     asked: _Asked, history: History, now: DecisionRound, result: Result | None, left: Sequence[Explanation]
 ) -> tuple[Ending, _Next | None]:
     """Return what to drive next; or None and why it ends."""
-    if len(left) == 1 and now.verdict not in (NOT_EXCITED, BAD_DATA):
+    if len(left) == 1 and now.verdict not in (NOT_EXCITED, BAD_DATA) and not _unexplained(result):
         return "decided", None
     if len(history.driven) >= asked.budget.runs:
         return "budget", None
@@ -261,6 +263,12 @@ def _choice(
     best = found[0]
     names = " and ".join(best.pair)
     return "", _Next(best.motion, f"promises {best.telling / best.motion.duration:.2g} per s, {best.most:.0f} between {names}")
+
+
+def _unexplained(result: Result | None) -> bool:
+    """Whether the fitted runs are further off than simulators can be: a name may be the best of wrong ones."""
+    gap = result.gap if result is not None else None
+    return gap is not None and (gap.fit_after or 0.0) > MISFIT * (gap.noise_floor or math.inf)
 
 
 def _shows_most(result: Result | None, motions: Sequence[Motion], driven: Sequence[str]) -> _Next:

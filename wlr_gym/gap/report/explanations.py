@@ -35,8 +35,9 @@ class Explanation:
 def explanations(result: Result) -> tuple[Explanation, ...]:
     """Return the explanations in play, most probable first; one where the runs have decided, none without an analysis.
 
-    They are those of the first round of the search in which no name alone has 95 %: the smallest set of names that has it,
-    nothing among them, and what was selected. Once an effect was found, a round that adds nothing is decided.
+    They are those of the first round of the search in which no name alone has 95 %, or names are equivalent: the smallest set
+    of names that has 95 %, nothing among them, what was selected, and what is equivalent to it (probabilities know nothing of
+    what simulators cannot reproduce). Once an effect was found, a round that adds nothing is decided.
     """
     added: tuple[PatchEffect, ...] = ()
     found: list[Explanation] = []
@@ -66,14 +67,15 @@ def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[Pat
         for name, share in sorted(total.items(), key=lambda one: -one[1])
     ]
     chosen = next((entry.name for entry in entries if entry.outcome == SELECTED), NOTHING)
-    if ranked[0].name == chosen and ranked[0].probability >= DECIDED:
+    rivals = {entry.name for entry in entries if entry.outcome == EQUIVALENT} - {chosen}
+    if ranked[0].name == chosen and ranked[0].probability >= DECIDED and not rivals:
         return ranked[:1]
     reached, credible = 0.0, set()
     for one in ranked:
         if reached < DECIDED:
             credible.add(one.name)
         reached += one.probability
-    return [one for one in ranked if one.name in credible | {chosen}]
+    return [one for one in ranked if one.name in credible | rivals | {chosen}]
 
 
 def _effect(entry: EvidenceEntry) -> PatchEffect:
