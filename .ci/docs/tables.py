@@ -31,6 +31,7 @@ from wlr_gym.envs.tasks.describe import (
     randomization_rows,
 )
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
+from wlr_gym.envs.tasks.success import scales_of
 from wlr_gym.envs.tasks.task import ObservationColumn, Task
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.learning.evaluation.acceptance import acceptance_rows, read_acceptance
@@ -254,7 +255,11 @@ def _parameters(values: Mapping[str, Mapping[str, float] | None], defaults: Mapp
 
 
 def _measure_cell(task: Task, name: str) -> str:
-    return limits_text(task.config, name) if name in task.measures else ""
+    """The limit of success of a measure, and its scale in the tracking error; empty in tasks that have no such measure."""
+    if name not in task.measures:
+        return ""
+    scales = [f"scale {scale:g}" for (measure, _), scale in scales_of(task.config).items() if measure == name]
+    return ", ".join([limits_text(task.config, name), *scales])
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -46,8 +46,8 @@ class EnvironmentOptions(TypedDict, total=False):
         robot: name in ``configs/robot/``, path of a YAML file, its content, or a :class:`wlr_gym.robot.Robot`;
             None = the task's, of a real robot the one that its hardware file names. The task's numbers follow it by the rules
             of its file (``scaling``).
-        randomization: name in ``configs/randomization/`` (none, nominal, wide, slippery, asymmetric, ice, split, patches,
-            slope), path of such a file or of a gap result (``.json``), or mapping; None = the task's.
+        randomization: name in ``configs/randomization/`` (``docs/randomization.md``), path of such a file or of a gap result
+            (``.json``), or mapping; None = the task's.
         task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file.
         effects: what is added after randomisation: path of a patch file or name of one in ``configs/effects/``, an effect as a
             mapping (``{"name": "friction_level", "parameters": {"mu": 0.4}}``), or a list of any of these; None = nothing.
