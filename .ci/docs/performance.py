@@ -147,7 +147,7 @@ def write_readme(text: str, rows: list[Row]) -> str:
         wide, narrow = (f"{ratios[f'{precision}, {what}']:.0f}{TIMES}" for precision in ("float64", "float32"))
         cells.append(f"{what}: {wide} as fast (float64), {narrow} (float32)")
     command = "`wlr bench --only engine` ([performance](docs/performance.md))"
-    what = "engine against MuJoCo (float64), batches of 32 robots against one, rms error over ten motions"
+    what = "engine against MuJoCo (float64), a batch of 320 robots against one, rms error over ten motions"
     head = f"{what}, core of an {engine[0]['measured']['processor']}"
     row = f"| {head} | {'; '.join(cells)} | {command} |"
     return re.sub(r"^\| engine against .*$", lambda _: row, text, flags=re.MULTILINE)

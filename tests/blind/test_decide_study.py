@@ -73,6 +73,7 @@ def test_a_robot_drives_the_motion_that_was_chosen(tmp_path):
 
 def test_right_is_the_hidden_name_alone_and_decided(tmp_path, answers):
     one = cases(1)[0]
+    assert one.effect is not None
     answers[:] = [result(one.effect["name"]), result("coulomb_friction"), result(one.effect["name"], 0.5)]
     first, second, third = (decided_by("eight", one, tmp_path / str(k)) for k in range(3))
     assert (first["right"], first["ended"], first["runs"]) == (True, "decided", list(EIGHT))
@@ -83,6 +84,7 @@ def test_right_is_the_hidden_name_alone_and_decided(tmp_path, answers):
 
 def test_random_drives_until_it_is_decided(tmp_path, answers):
     one = cases(1)[0]
+    assert one.effect is not None
     answers[:] = [result(one.effect["name"], 0.5), result(one.effect["name"])]
     line = decided_by("random", one, tmp_path)
     assert (line["right"], len(line["runs"])) == (True, len(START) + 2)  # two runs are too few for an analysis
