@@ -50,6 +50,7 @@ def _joint_columns(kind: str, unit: tuple[str, str], doc: str, **flags: bool) ->
 
 
 _NO_READING, _NO_FRAME = "NaN without a new valid reading", "NaN without a new frame"
+_MARKER = "marker's centre (`marker_offset` in meta.yaml; default: the body's origin)"
 
 _TABLE: list[Column] = [
     Column(
@@ -75,12 +76,12 @@ _TABLE: list[Column] = [
     *[Column(f"gyro_{axis}", "gyro", "rad/s", "angular velocity, body frame", noisy=True) for axis in XYZ],
     *[Column(f"acc_{axis}", "acc", "m/s2", "specific force, body frame (+9.81 on z at rest)", noisy=True) for axis in XYZ],
     *[
-        Column(name, "cam_xy", "m", f"vision position of the marker's centre in the floor frame; {_NO_FRAME}", may_be_nan=True)
+        Column(name, "cam_xy", "m", f"vision position of the {_MARKER} in the floor frame; {_NO_FRAME}", may_be_nan=True)
         for name in ("cam_x", "cam_y")
     ],
     Column("cam_yaw", "cam_yaw", "rad", f"vision heading in the floor frame; {_NO_FRAME}", may_be_nan=True),
-    Column("cam_z", "cam_z", "m", f"side view: height of the marker's centre; {_NO_FRAME}", may_be_nan=True),
-    Column("cam_pitch", "cam_pitch", "rad", f"side view: pitch, nose down positive; {_NO_FRAME}", may_be_nan=True),
+    Column("cam_z", "cam_z", "m", f"vision height of the {_MARKER}; {_NO_FRAME}", may_be_nan=True),
+    Column("cam_pitch", "cam_pitch", "rad", f"vision pitch, nose down positive; {_NO_FRAME}", may_be_nan=True),
     Column("volt", "volt", "V", "supply voltage"),
     Column("cam_age", "cam_age", "s", "age of the last vision pose when the row's sensors were read; live cameras only"),
     *[
