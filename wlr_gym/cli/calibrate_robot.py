@@ -239,7 +239,7 @@ def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, as
     from wlr_gym.hardware import calibration as find
     from wlr_gym.hardware.imu.reading import to_body
 
-    level = "Stand the robot level on its wheels and let go of it, then Enter."
+    level = "Block the body level (the legs hold nothing) and let go of it, then Enter."
     if options.poses == 6:
         side = "Side {} of 6: turn the robot so that the sensor's axes point {}; keep it still, then Enter."
         poses = [_pose(options, link, ask, side.format(k, up)) for k, up in enumerate(_UP, 1)]
