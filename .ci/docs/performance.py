@@ -78,7 +78,7 @@ def machine_lines(rows: Iterable[Row]) -> list[str]:
 
 
 def _passes(text: str) -> str:
-    """The label of a setting with the pages' word for an iteration of the engine's contact solver."""
+    """The label of a setting as it is now: reports that are stored call an iteration of the engine's contact solver a sweep."""
     return text.replace(" sweeps", " passes")
 
 

@@ -14,7 +14,8 @@ from wlr_gym.gap.report.entries import Result
 from wlr_gym.studies.bench import decide_study
 from wlr_gym.studies.bench.blind.commands import BlindScript
 from wlr_gym.studies.bench.blind.truth import NAMED
-from wlr_gym.studies.bench.decide_study import CASES, EIGHT, START, cases, decided_by, markdown
+from wlr_gym.studies.bench.decide_study import CASES, EIGHT, START, cases, decided_by, run_decide_study
+from wlr_gym.studies.bench.decide_table import markdown
 
 decision = importlib.import_module("wlr_gym.gap.decision")
 EMPTY = {"equivalent": [], "calibration": {}, "localisation": {}, "gap": None, "patch": "patch.yaml"}
@@ -59,8 +60,6 @@ def test_every_effect_comes_once_and_some_robots_have_none():
     assert hidden.count("") == CASES - len(NAMED)
     assert all(one.camera for one in cases() if one.effect and one.effect["name"].startswith("camera"))
     assert cases(3) == cases()[:3]
-    with pytest.raises(InputError, match="--cases 0: expected 1 or more"):
-        cases(0)
 
 
 def test_a_robot_drives_the_motion_that_was_chosen(tmp_path):
@@ -91,23 +90,90 @@ def test_random_drives_until_it_is_decided(tmp_path, answers):
     assert len(read_run(tmp_path / "runs" / "run_04.parquet")["t"]) > 40
 
 
-def test_a_study_goes_on_where_it_was(tmp_path, monkeypatch):
-    done = []
+def test_driving_counts_the_motions_that_were_driven(tmp_path, answers, monkeypatch):
+    again = excite("straight", 1)
+    monkeypatch.setattr(decide_study, "motions_to_drive", lambda *_: [again])
+    one = cases(1)[0]
+    answers[:] = [result("payload", 0.5), result("payload")]
+    line = decided_by("random", one, tmp_path)
+    assert line["runs"] == ["straight", "random", "straight", "straight"]
+    assert line["seconds"] == pytest.approx(
+        excite("straight").duration + excite("random").duration + 2 * again.duration, abs=0.01
+    )
+    assert again.duration != excite("straight").duration
 
-    def spread(jobs, processes):
-        for job in jobs:
-            done.append(job.name)
-            line = {"case": job.name[:9], "contender": job.task["contender"], "hidden": ["payload"], "camera": True}
-            line |= {"ended": "decided", "verdict": "effect_found", "found": ["payload"], "right": True, "seconds": 50.0}
+
+def test_an_interrupted_contender_begins_anew(tmp_path, answers):
+    (tmp_path / "lines").mkdir()
+    task = {"out": str(tmp_path), "index": 0, "contender": "random"}
+    answers[:] = [result("payload", 0.5)]
+    with pytest.raises(IndexError):  # no second answer
+        decide_study._work(task, lambda message: None)
+    answers[:] = [result("payload")]
+    decide_study._work(task, lambda message: None)
+    line = json.loads((tmp_path / "lines" / "case_9100_random.json").read_text())
+    assert len(line["runs"]) == 3 == len(list((tmp_path / "work" / "case_9100_random" / "runs").glob("run_*.parquet")))
+
+
+def test_a_name_that_is_found_twice_is_one_name(tmp_path, answers):
+    one = cases(1)[0]
+    name = one.hidden[0]
+    twice = result(name).model_dump(mode="json")
+    answers[:] = [Result.model_validate(twice | {"effects": 2 * twice["effects"]})]
+    assert decided_by("eight", one, tmp_path)["found"] == [name]
+
+
+@pytest.fixture
+def jobs(monkeypatch, tmp_path):
+    """Jobs that were done, each with an effect found rightly; those in ``failing`` fail."""
+    told = {"done": [], "failing": ()}
+
+    def spread(left, processes):
+        for job in left:
+            told["done"].append(job.name)
+            if job.name in told["failing"]:
+                yield Ended(job.name, "killed")
+                continue
+            one = cases(job.task["index"] + 1)[-1]
+            line = decide_study._line(one, job.task["contender"]) | {"ended": "decided", "verdict": "effect_found"}
+            line |= {"found": one.hidden, "right": True, "seconds": 50.0}
             (tmp_path / "lines" / f"{job.name}.json").write_text(json.dumps(line))
             yield Ended(job.name)
 
     monkeypatch.setattr(decide_study, "spread", spread)
-    decide_study.run_decide_study(tmp_path, 1, ("chosen",), say=lambda text: None)
-    lines = decide_study.run_decide_study(tmp_path, 1, ("chosen", "eight"), say=lambda text: None)
-    assert done == ["case_9100_chosen", "case_9100_eight"]
+    return told
+
+
+def quiet(text):
+    pass
+
+
+def test_a_study_goes_on_where_it_was(tmp_path, jobs):
+    run_decide_study(tmp_path, 1, ("chosen",), say=quiet)
+    lines = run_decide_study(tmp_path, 1, ("chosen", "eight"), say=quiet)
+    assert jobs["done"] == ["case_9100_chosen", "case_9100_eight"]
     text = markdown(lines)
-    assert (
-        "| the run that distinguishes best, per second | 1 | 1 (at least 5%) | 0 (at most 95%) | 50 s | 50 s | 0 | 0 |" in text
-    )
-    assert "| payload | yes | right, decided, 50 s |  | right, decided, 50 s |" in text
+    assert "| the run that distinguishes best, per second | 1/1 (at least 5%) | 0 (at most 95%) | 0 | 50 s | 0/0 | 0 |" in text
+    assert f"| {cases(1)[0].hidden[0]} | yes | right, decided, 50 s | right, decided, 50 s |" in text
+    assert len(run_decide_study(tmp_path, 1, ("eight",), say=quiet)) == 1  # only what is asked
+
+
+def test_a_contender_that_fails_is_counted_and_tried_again(tmp_path, jobs):
+    jobs["failing"] = ("case_9100_chosen",)
+    said = []
+    lines = run_decide_study(tmp_path, 1, ("chosen",), say=said.append)
+    assert "failed, killed" in said[0]
+    assert "| 0/1 (at least 0%) | 0 (at most 95%) | 1 | - |" in markdown(lines)
+    jobs["failing"] = ()
+    assert run_decide_study(tmp_path, 1, ("chosen",), say=quiet)[0]["right"]
+
+
+def test_a_study_of_other_robots_or_nothing_is_refused(tmp_path, jobs, monkeypatch):
+    run_decide_study(tmp_path, 1, ("chosen",), say=quiet)
+    monkeypatch.setattr(decide_study, "SEVERITY", 1.0)
+    with pytest.raises(InputError, match=r"study.json: severity: 2.0, requested 1.0"):
+        run_decide_study(tmp_path, 1, ("chosen",), say=quiet)
+    with pytest.raises(InputError, match="--processes 0: expected 1 or more"):
+        run_decide_study(tmp_path, 1, processes=0)
+    with pytest.raises(InputError, match=r"unknown contender 'choosen'.*chosen"):
+        run_decide_study(tmp_path, 1, ("choosen",))

@@ -223,7 +223,7 @@ def test_a_name_that_leaves_far_more_than_simulators_do_is_not_decided(data, tmp
     answers["results"] = [Result.model_validate(one) for one in (bad, good)]
     found = decide(data, tmp_path / "out", record)
     assert (found.history.ended, len(found.history.driven)) == ("decided", 2)
-    assert found.history.rounds[1].why == "shows most effects best"
+    assert found.history.rounds[1].why == "an error of 5.0 noise floors is left, more than 3.5; shows most effects best"
 
 
 def test_motions_that_take_longer_than_what_is_left_are_not_driven(data, tmp_path, answers):

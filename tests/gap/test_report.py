@@ -323,6 +323,7 @@ def test_numbers_in_words():
     assert estimate(ParameterEstimate(1.021709, 1.0173, 1.0261, "-")) == "1.022 (1.017 to 1.026)"
     assert estimate(ParameterEstimate(0.0, -0.1, 0.1, "m")) == "0.00 (-0.10 to 0.10) m"
     assert estimate(ParameterEstimate(-3.73e-5, -0.00181, 0.00174, "rad/s")) == "0.0000 (-0.0018 to 0.0017) rad/s"
+    assert estimate(ParameterEstimate(0.01, -0.02, 0.022, "rad")) == "0.010 (-0.020 to 0.022) rad = 0.573°"
 
 
 # ---- pictures --------------------------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ class AdaptOptions(JsonOption, PatchOption, SensorsOption):
     excitations: tuple[str, ...] = ("straight", "turns", "stop_and_go", "posture")
     """First runs, see: wlr record --list."""
     budget_runs: int = 2
-    """Most further runs, until one name has 95 %."""
+    """Most further runs, until it is decided."""
     budget_seconds: float | None = None
     """Most seconds of driving them; default: as many as they take."""
     drives: int = 6

@@ -82,7 +82,7 @@ class BenchOptions(JsonOption, ForceOption):
     seed: int | None = None
     """vision: with --out, of the films (28); another one gives other films."""
     processes: int = 2
-    """gap, decide: data sets at a time."""
+    """gap: data sets at a time; decide: contenders."""
     ray: tuple[str, ...] | None = None
     """gap: run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
     answers: Path | None = None
@@ -212,22 +212,20 @@ def _adapt_study(options: BenchOptions) -> int:
 def _decide_study(options: BenchOptions) -> int:
     """Let the gap workflow choose what robots with hidden effects drive, and others beside it; print and write the tables."""
     from wlr_gym.studies.bench import decide_study
+    from wlr_gym.studies.bench.decide_table import markdown
 
     if options.out is None:
         raise InputError(f"{DECIDE_STUDY} needs --out DIR: finished cases are kept there, so that it can be interrupted")
-    for name in options.contenders:
-        if name not in decide_study.CONTENDERS:
-            raise unknown_name("contender", name, decide_study.CONTENDERS)
-    if len(options.cases) > 1 or not "".join(options.cases or ("1",)).isdigit():
+    if len(options.cases) > 1 or not all(count.isdecimal() for count in options.cases):
         raise InputError(f"--cases {' '.join(options.cases)}: decide takes how many, 1 or more")
-    console = Console(soft_wrap=True, highlight=False)
+    console = Console(soft_wrap=True, highlight=False, markup=False)
     count = int(options.cases[0]) if options.cases else decide_study.CASES
     contenders = options.contenders or tuple(decide_study.CONTENDERS)
     lines = decide_study.run_decide_study(options.out, count, contenders, options.processes, console.print)
-    _write(options.out / "decide.md", decide_study.markdown(lines), console)
+    _write(options.out / "decide.md", markdown(lines), console)
     if options.json:
         print_json(lines)
-    console.print(f"written: {options.out / 'decide.json'}, {options.out / 'decide.md'}")
+    console.print(f"written: {options.out / decide_study.LINES_FILE}, {options.out / 'decide.md'}")
     return OK
 
 
@@ -236,7 +234,7 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
     from wlr_gym.studies.bench.lab_films import FILMS, SEED, bars, run_lab_films, score
 
     if asked != ("vision",) or options.out is None:
-        raise InputError(f"--out: for gap, adapt or vision, alone; got {', '.join(asked) or 'nothing'}")
+        raise InputError(f"--out: for {', '.join(_ALONE)} or vision, alone; got {', '.join(asked) or 'nothing'}")
     console = Console(soft_wrap=True, highlight=False)
     count = FILMS if options.sets is None else options.sets
     if count < 1:

@@ -33,7 +33,7 @@ class DecideOptions:
     """Options of ``--until-decided``."""
 
     until_decided: bool = False
-    """Have further runs driven, each chosen by what it would tell per second, until one name has 95 %; see --record."""
+    """Have further runs driven, each chosen by what it would tell per second, until it is decided; see --record."""
     record: Literal["emulated", "simulator", "ask"] = "ask"
     """Who drives them: an emulated robot, the simulator (--backend), or you: the motion is written and the run waited for."""
     hidden: tuple[str, ...] = ()

@@ -76,7 +76,7 @@ class DecisionRound(SettingsModel):
         number: from 1 on; its report is in ``round_01``, ...
         runs: that were there.
         verdict: of the analysis; ``too_few_runs``: there was none, for want of runs.
-        names: left, with their probabilities; more than one = not decided.
+        names: left, with their probabilities, which say nothing of what simulators cannot reproduce.
         excitation: driven next; "" = none. why: it was chosen.
         run: that it left; "" = none yet. seconds: of driving. stopped: why the drive ended early.
     """
@@ -140,7 +140,7 @@ def decide(
     threads: int = 1,
     tell: Tell = lambda stage, share: None,
 ) -> Decided:
-    """Analyse measured runs, have the runs driven that distinguish best what may be missing, until one name has 95 %.
+    """Analyse measured runs, have the runs driven that distinguish best what may be missing, until it is decided.
 
     Called again with the same folders it goes on where it was interrupted, or with a larger budget where that was used up. A
     run that somebody added to ``data`` meanwhile is analysed with the others.
@@ -242,7 +242,8 @@ def _choice(
     asked: _Asked, history: History, now: DecisionRound, result: Result | None, left: Sequence[Explanation]
 ) -> tuple[Ending, _Next | None]:
     """Return what to drive next; or None and why it ends."""
-    if len(left) == 1 and now.verdict not in (NOT_EXCITED, BAD_DATA) and not _unexplained(result):
+    misfit = _misfit(result)
+    if len(left) == 1 and now.verdict not in (NOT_EXCITED, BAD_DATA) and misfit <= MISFIT:
         return "decided", None
     if len(history.driven) >= asked.budget.runs:
         return "budget", None
@@ -255,7 +256,9 @@ def _choice(
     if not motions:
         return "budget", None
     if result is None or len(left) < 2:
-        return "", _shows_most(result, motions, driven)
+        shows_most = _shows_most(result, motions, driven)
+        too_far = f"an error of {misfit:.1f} noise floors is left, more than {MISFIT:g}; "
+        return "", _Next(shows_most.motion, (too_far if misfit > MISFIT else "") + shows_most.why)
     asked.tell("choosing the next run", 1.0)
     found = promises(result, left, motions, own, known=asked.known, backend=asked.backend, threads=asked.threads)
     if max(one.most for one in found) < TELLS:
@@ -265,10 +268,10 @@ def _choice(
     return "", _Next(best.motion, f"promises {best.telling / best.motion.duration:.2g} per s, {best.most:.0f} between {names}")
 
 
-def _unexplained(result: Result | None) -> bool:
-    """Whether the fitted runs are further off than simulators can be: a name may be the best of wrong ones."""
+def _misfit(result: Result | None) -> float:
+    """Error of the fitted runs in noise floors: where it is large, a name may be the best of wrong ones."""
     gap = result.gap if result is not None else None
-    return gap is not None and (gap.fit_after or 0.0) > MISFIT * (gap.noise_floor or math.inf)
+    return 0.0 if gap is None else (gap.fit_after or 0.0) / (gap.noise_floor or math.inf)
 
 
 def _shows_most(result: Result | None, motions: Sequence[Motion], driven: Sequence[str]) -> _Next:

@@ -33,7 +33,7 @@ class Explanation:
 
 
 def explanations(result: Result) -> tuple[Explanation, ...]:
-    """Return the explanations in play, most probable first; one where the runs have decided, none without an analysis.
+    """Return the explanations in play, most probable first; one where the runs distinguish it, none without an analysis.
 
     They are those of the first round of the search in which no name alone has 95 %, or names are equivalent: the smallest set
     of names that has 95 %, nothing among them, what was selected, and what is equivalent to it (probabilities know nothing of
@@ -67,7 +67,7 @@ def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[Pat
         for name, share in sorted(total.items(), key=lambda one: -one[1])
     ]
     chosen = next((entry.name for entry in entries if entry.outcome == SELECTED), NOTHING)
-    rivals = {entry.name for entry in entries if entry.outcome == EQUIVALENT} - {chosen}
+    rivals = {entry.name for entry in entries if entry.outcome == EQUIVALENT}
     if ranked[0].name == chosen and ranked[0].probability >= DECIDED and not rivals:
         return ranked[:1]
     reached, credible = 0.0, set()

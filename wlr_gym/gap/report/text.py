@@ -143,16 +143,21 @@ def unit_of(unit: str) -> str:
 
 def estimate(found: ParameterEstimate) -> str:
     """Return ``0.041 (0.038 to 0.045) N m``; angles in degrees, too."""
-    known = math.isfinite(found.low) and math.isfinite(found.high)
-    uncertainty = 0.5 * (found.high - found.low) if known else 0.0
-    if uncertainty > abs(found.value):  # not distinguishable from zero: two digits of the uncertainty
-        decimals = max(0, 1 - math.floor(math.log10(uncertainty)))
-        value, low, high = (f"{round(one, decimals) + 0.0:.{decimals}f}" for one in (found.value, found.low, found.high))
-        return f"{value} ({low} to {high}){unit_of(found.unit)}"
-    digits = _digits(found.value, uncertainty)
-    between = f" ({number(found.low, digits)} to {number(found.high, digits)})" if known else ""
     degrees = f" = {number(math.degrees(found.value))}°" if found.unit == "rad" else ""
-    return f"{number(found.value, digits)}{between}{unit_of(found.unit)}{degrees}"
+    known = math.isfinite(found.low) and math.isfinite(found.high)
+    value, low, high = _written(found.value, found.low, found.high) if known else (number(found.value), "", "")
+    return f"{value}{f' ({low} to {high})' if known else ''}{unit_of(found.unit)}{degrees}"
+
+
+def _written(value: float, low: float, high: float) -> tuple[str, str, str]:
+    """A value and its interval: down to the uncertainty, or, where the value is smaller than that, to its second digit."""
+    uncertainty = 0.5 * (high - low)
+    if uncertainty <= abs(value):
+        digits = _digits(value, uncertainty)
+        return number(value, digits), number(low, digits), number(high, digits)
+    decimals = max(0, 1 - math.floor(math.log10(uncertainty)))
+    first, second, third = (f"{round(one, decimals) + 0.0:.{decimals}f}" for one in (value, low, high))
+    return first, second, third
 
 
 def _digits(value: float, uncertainty: float) -> int:

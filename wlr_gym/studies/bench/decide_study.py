@@ -1,12 +1,14 @@
 """``wlr bench decide``: how often, and after how much driving, ``wlr gap --until-decided`` decides rightly.
 
 A robot of the blind test's simulator has one effect of severity 2, or none. It has driven two runs. Contenders differ in what
-it drives next. Each contender in each case is a process of its own, whose line is kept: an interrupted study goes on.
+it drives next. Each contender in each case is a process of its own, whose line is kept: an interrupted study goes on, an
+interrupted contender begins anew.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,21 +17,22 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, write_json
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import check_same_request, make_output_folder, write_json
 from wlr_gym.base.jobs import Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.data.excitations import Motion, excite
 from wlr_gym.data.read import read_meta
+from wlr_gym.data.record import next_run
 from wlr_gym.gap.decision import Budget, Decided, Recorded, decide
 from wlr_gym.gap.robot.next_run import motions_to_drive
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.bench.blind.cases import OF_CAMERA, named
+from wlr_gym.studies.bench.blind.cases import CAMERA_SHARE, OF_CAMERA, named
 from wlr_gym.studies.bench.blind.commands import BlindScript
 from wlr_gym.studies.bench.blind.copies import read_robot
 from wlr_gym.studies.bench.blind.dataset import BlindRobot, copy_of, write
-from wlr_gym.studies.bench.blind.score import at_least, at_most, found_names
+from wlr_gym.studies.bench.blind.score import FAILED, found_names
 from wlr_gym.studies.bench.blind.simulation import BlindProfile
 from wlr_gym.studies.bench.blind.truth import NAMED, hide
 
@@ -50,7 +53,11 @@ FIRST_SEED = 9100
 #: After so many effects comes a robot copy without any.
 NULL_EVERY = 6
 CASES = len(NAMED) + len(NAMED) // NULL_EVERY
+LINES_FILE = "decide.json"
 _MODULE = "wlr_gym.studies.bench.decide_study"
+
+Line = Mapping[str, Any]
+Say = Callable[[str], object]
 
 
 @dataclass(frozen=True)
@@ -62,15 +69,14 @@ class DecideCase:
     effect: Mapping[str, Any] | None
     camera: bool
 
+    @property
+    def hidden(self) -> list[str]:
+        """The names that are right."""
+        return [] if self.effect is None else [str(self.effect["name"])]
+
 
 def cases(count: int = CASES) -> list[DecideCase]:
-    """Return so many robots: every effect once in an order drawn beforehand, every seventh robot without any; then anew.
-
-    Raises:
-        InputError: none.
-    """
-    if count < 1:
-        raise InputError(f"--cases {count}: expected 1 or more")
+    """Return so many robots: every effect once in an order drawn beforehand, every seventh robot without any; then anew."""
     order, found, effects = np.random.default_rng(FIRST_SEED).permutation(sorted(NAMED)), [], 0
     for index in range(count):
         seed, effect = FIRST_SEED + index, None
@@ -78,7 +84,7 @@ def cases(count: int = CASES) -> list[DecideCase]:
         if index % (NULL_EVERY + 1) != NULL_EVERY:
             effect = named(str(order[effects % len(order)]), SEVERITY, rng)
             effects += 1
-        camera = bool(rng.random() < 0.5) or (effect is not None and effect["name"] in OF_CAMERA)
+        camera = bool(rng.random() < CAMERA_SHARE) or (effect is not None and effect["name"] in OF_CAMERA)
         found.append(DecideCase(f"case_{seed}", seed, effect, camera))
     return found
 
@@ -87,39 +93,38 @@ def cases(count: int = CASES) -> list[DecideCase]:
 
 
 def decided_by(contender: str, one: DecideCase, folder: Path) -> dict[str, Any]:
-    """Let a contender drive and analyse until it has decided; return its line."""
-    begin, robot = time.monotonic(), _robot(one)
+    """Let a contender drive and analyse in an empty folder until it has decided; return its line."""
+    begin, robot, data = time.monotonic(), _robot(one), folder / "runs"
     noise = np.random.default_rng([one.seed, 3])
-    data = folder / "runs"
-    first = EIGHT if contender == "eight" else START
-    write(data, [robot.drive(_script(excite(name)), noise) for name in first], robot.meta(", ".join(first)))
+    driven = [excite(name) for name in (EIGHT if contender == "eight" else START)]
+    tables = [robot.drive(_script(motion), noise) for motion in driven]
+    write(data, tables, robot.meta(", ".join(motion.name for motion in driven)))
 
     def record(motion: Motion, runs: Path) -> Recorded:
-        path = runs / f"run_{len(list(runs.glob('run_*.parquet'))) + 1:02d}.parquet"
+        path = next_run(runs)
         robot.drive(_script(motion), noise).to_parquet(path, index=False)
+        driven.append(motion)
         return Recorded(path)
 
     if contender == "random":
-        found, driven = _at_random(data, folder, record, np.random.default_rng([one.seed, 9]))
+        found = _at_random(data, folder, record, np.random.default_rng([one.seed, 9]))
     else:
         found = decide(data, folder / "rounds", record, Budget(runs=FURTHER if contender == "chosen" else 0))
-        driven = found.history.driven
-    result = {"verdict": "none"} if found.result is None else found.result.model_dump(mode="json")
-    names, hidden = found_names(result), [] if one.effect is None else [one.effect["name"]]
-    return {
-        "case": one.name,
-        "contender": contender,
-        "hidden": hidden,
-        "camera": one.camera,
+    assert found.result is not None
+    names = list(dict.fromkeys(found_names(found.result.model_dump(mode="json"))))
+    return _line(one, contender) | {
         "ended": found.history.ended,
-        "verdict": result["verdict"],
+        "verdict": found.result.verdict,
         "found": names,
-        "right": found.history.ended == "decided" and names == hidden,
-        "runs": [*first, *driven],
-        "seconds": round(sum(excite(name).duration for name in (*first, *driven)), 2),
+        "right": found.history.ended == "decided" and names == one.hidden,
+        "runs": [motion.name for motion in driven],
+        "seconds": round(sum(motion.duration for motion in driven), 2),
         "wall_seconds": round(time.monotonic() - begin, 1),
-        "commit": git_commit(),
     }
+
+
+def _line(one: DecideCase, contender: str) -> dict[str, Any]:
+    return {"case": one.name, "contender": contender, "hidden": one.hidden, "camera": one.camera, "commit": git_commit()}
 
 
 def _robot(one: DecideCase) -> BlindRobot:
@@ -136,15 +141,13 @@ def _script(motion: Motion) -> BlindScript:
     return BlindScript(motion.duration, lambda t: motion.setpoints[np.clip((t / motion.period).astype(int), 0, last)])
 
 
-def _at_random(
-    data: Path, folder: Path, record: Callable[[Motion, Path], Recorded], rng: np.random.Generator
-) -> tuple[Decided, list[str]]:
+def _at_random(data: Path, folder: Path, record: Callable[[Motion, Path], Recorded], rng: np.random.Generator) -> Decided:
     """Analyse after every run, and drive any motion next."""
     driven: list[str] = []
     while True:
         found = decide(data, folder / f"after_{len(driven)}", record, Budget(runs=0))
         if found.history.ended == "decided" or len(driven) == FURTHER:
-            return found, driven
+            return found
         motions = motions_to_drive(load_robot(), read_meta(data).profile, [*START, *driven])
         motion = motions[int(rng.integers(len(motions)))]
         record(motion, data)
@@ -155,81 +158,78 @@ def _at_random(
 
 
 def run_decide_study(
-    out: Path, count: int = CASES, contenders: Sequence[str] = tuple(CONTENDERS), processes: int = 2, say: Callable = print
+    out: Path, count: int = CASES, contenders: Sequence[str] = tuple(CONTENDERS), processes: int = 2, say: Say = print
 ) -> list[dict[str, Any]]:
-    """Do what is left of a study, and return all lines; they are in ``out/decide.json``, too."""
-    for name in ("", "lines", "work"):
-        make_output_folder(out / name)
-    jobs = []
-    for one in cases(count):
-        for contender in contenders:
-            name = f"{one.name}_{contender}"
-            task = {"out": str(out.resolve()), "index": one.seed - FIRST_SEED, "contender": contender}
-            if not (out / "lines" / f"{name}.json").is_file():
-                jobs.append(Job(name, _MODULE, task, str((out / "work" / f"{name}.log").resolve())))
+    """Do what is left of a study, failed contenders too, and return its lines; they are in ``decide.json``, too.
+
+    Raises:
+        InputError: no cases or processes, an unknown contender, or the folder has a study of other robots or runs.
+    """
+    for name, value in (("--cases", count), ("--processes", processes)):
+        if value < 1:
+            raise InputError(f"{name} {value}: expected 1 or more")
+    for name in contenders:
+        if name not in CONTENDERS:
+            raise unknown_name("contender", name, CONTENDERS)
+    for folder in ("", "lines", "work"):
+        make_output_folder(out / folder)
+    _check_request(out / "study.json")
+    asked = [(one, contender) for one in cases(count) for contender in dict.fromkeys(contenders)]
+    left = {f"{one.name}_{contender}": (one, contender) for one, contender in asked if not _is_done(out, one, contender)}
+    jobs = [
+        Job(name, _MODULE, {"out": str(out.resolve()), "index": one.seed - FIRST_SEED, "contender": contender}, _log(out, name))
+        for name, (one, contender) in left.items()
+    ]
     begin = time.monotonic()
     for done, ended in enumerate(spread(jobs, processes), 1):
-        passed = time.monotonic() - begin
-        rest = passed / done * (len(jobs) - done) / 60.0
-        said = ended.error or _said(json.loads((out / "lines" / f"{ended.name}.json").read_text(encoding="utf-8")))
-        say(f"{done}/{len(jobs)}  {ended.name}: {said}; about {rest:.0f} min to go")
-    lines = [json.loads(path.read_text(encoding="utf-8")) for path in sorted((out / "lines").glob("case_*.json"))]
-    write_json(out / "decide.json", lines)
+        file = _file(out, *left[ended.name])
+        if ended.error:
+            write_json(file, _line(*left[ended.name]) | {"ended": FAILED, "right": False, "found": [], "message": ended.error})
+        rest = (time.monotonic() - begin) / done * (len(jobs) - done) / 60.0
+        say(f"{done}/{len(jobs)}  {ended.name}: {_said(_read(file))}; about {rest:.0f} min to go")
+    lines = [_read(_file(out, one, contender)) for one, contender in asked]
+    write_json(out / LINES_FILE, lines)
     return lines
 
 
-def _said(line: Mapping[str, Any]) -> str:
+def _check_request(path: Path) -> None:
+    """Refuse to add to a study of other robots or runs."""
+    request = {"first_seed": FIRST_SEED, "severity": SEVERITY, "further": FURTHER, "start": list(START), "eight": list(EIGHT)}
+    if path.is_file():
+        check_same_request(path, json.loads(path.read_text(encoding="utf-8")), request)
+    write_json(path, request)
+
+
+def _file(out: Path, one: DecideCase, contender: str) -> Path:
+    return out / "lines" / f"{one.name}_{contender}.json"
+
+
+def _log(out: Path, name: str) -> str:
+    return str((out / "work" / f"{name}.log").resolve())
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _is_done(out: Path, one: DecideCase, contender: str) -> bool:
+    file = _file(out, one, contender)
+    return file.is_file() and _read(file)["ended"] != FAILED
+
+
+def _said(line: Line) -> str:
+    if line["ended"] == FAILED:
+        return f"{FAILED}, {line['message']}"
     rightly = "right" if line["right"] else "not right"
-    return f"{line['ended']}, {', '.join(line['found']) or line['verdict']}: {rightly} after {line['seconds']:.0f} s of driving"
+    return f"{line['ended']}, {', '.join(line['found']) or line['verdict']}: {rightly}, {line['seconds']:.0f} s of driving"
 
 
 def _work(task: Mapping[str, Any], send: Send) -> None:
     out, contender = Path(task["out"]), task["contender"]
     one = cases(task["index"] + 1)[-1]
     folder = out / "work" / f"{one.name}_{contender}"
-    write_json(out / "lines" / f"{folder.name}.json", decided_by(contender, one, folder))
-
-
-def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Return the tables: how often each contender decided rightly, after how much driving, and case by case."""
-    text = [
-        "| drives | robots with an effect | decided rightly | wrongly | driving, median | mean | robots without | rightly |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    text += [_row(name, [one for one in lines if one["contender"] == name]) for name in CONTENDERS]
-    text += ["", "| hidden | camera | " + " | ".join(CONTENDERS) + " |", "|---|---|" + "---|" * len(CONTENDERS)]
-    for case in dict.fromkeys(one["case"] for one in lines):
-        own = {one["contender"]: one for one in lines if one["case"] == case}
-        first = next(iter(own.values()))
-        cells = [_cell(own[name]) if name in own else "" for name in CONTENDERS]
-        text.append(
-            f"| {', '.join(first['hidden']) or 'nothing'} | {'yes' if first['camera'] else 'no'} | {' | '.join(cells)} |"
-        )
-    return "\n".join(text) + "\n"
-
-
-def _row(name: str, lines: Sequence[Mapping[str, Any]]) -> str:
-    hiding, nulls = [one for one in lines if one["hidden"]], [one for one in lines if not one["hidden"]]
-    right = at_least(sum(one["right"] for one in hiding), len(hiding))
-    wrong = at_most(sum(one["ended"] == "decided" and not one["right"] for one in hiding), len(hiding))
-    seconds = [one["seconds"] for one in hiding]
-    driving = (f"{np.median(seconds):.0f} s", f"{np.mean(seconds):.0f} s") if seconds else ("-", "-")
-    cells = (
-        CONTENDERS[name],
-        str(len(hiding)),
-        f"{right.hits} (at least {right.bound:.0%})" if hiding else "-",
-        f"{wrong.hits} (at most {wrong.bound:.0%})" if hiding else "-",
-        *driving,
-        str(len(nulls)),
-        str(sum(one["right"] for one in nulls)),
-    )
-    return f"| {' | '.join(cells)} |"
-
-
-def _cell(line: Mapping[str, Any]) -> str:
-    return (
-        f"{'right' if line['right'] else ', '.join(line['found']) or line['verdict']}, {line['ended']}, {line['seconds']:.0f} s"
-    )
+    shutil.rmtree(folder, ignore_errors=True)
+    write_json(_file(out, one, contender), decided_by(contender, one, folder))
 
 
 if __name__ == "__main__":

@@ -78,7 +78,7 @@ class EngineSetting:
         if self.side == "MuJoCo":
             parts += [self.cone, f"{self.contact} contact", self.integrator]
         if not self.is_usual:
-            parts.append(f"{self.iterations} {'sweeps' if self.side == 'engine' else 'iterations'}")
+            parts.append(f"{self.iterations} {'passes' if self.side == 'engine' else 'iterations'}")
         if self.call == "rollout":
             parts.append("mujoco.rollout")
         if self.threads > 1:
