@@ -129,10 +129,37 @@ def test_a_motion_that_loads_what_is_in_question_promises_more():
     found = result("effect_found", (0.0, both))
     drive = excite("straight", robot=ROBOT, seconds=3.0)
     stand = decision.Motion("stand", np.repeat(drive.setpoints[:1], 150, axis=0), drive.period)
-    promised = next_run.promises(found, explanations(found), [stand, drive], ROBOT)
-    assert [one.motion.name for one in promised] == ["straight", "stand"]
-    assert promised[0].most > next_run.TELLS > promised[1].most
-    assert {"coulomb_friction", "viscous_friction"} & set(promised[0].pair)
+    (promised,) = next_run.promises(found, explanations(found), [stand, drive], ROBOT)  # standing cannot promise more
+    (alone,) = next_run.promises(found, explanations(found), [stand], ROBOT)
+    assert (promised.motion.name, alone.motion.name) == ("straight", "stand")
+    assert promised.most > next_run.TELLS > alone.most
+    assert {"coulomb_friction", "viscous_friction"} & set(promised.pair)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "whole", "worked_out", "best"),
+    [
+        ({"a": (9, 9), "b": (8, 8), "c": (2, 2)}, {"a": (5, 5), "b": (7, 7), "c": (1, 1)}, ["a", "b"], "b"),
+        ({"a": (9, 5), "b": (2, 9)}, {"a": (8, 4), "b": (1, 7)}, ["a", "b"], "a"),  # b may be the only one that tells
+        ({"a": (0, 0), "b": (0, 0)}, {"a": (0, 0), "b": (0, 0)}, ["a"], "a"),
+    ],
+)
+def test_motions_that_cannot_promise_more_are_not_worked_out(data, monkeypatch, bounds, whole, worked_out, best):
+    monkeypatch.setattr(next_run, "record_simulation", lambda path, motion, *_: data / "run_01.parquet")
+    monkeypatch.setattr(next_run, "RobotProblem", lambda *_, **__: None)
+    done = []
+
+    def promise(problem, found, left, motion, calibrated=True):
+        if calibrated:
+            done.append(motion.name)
+        per_second, most = (whole if calibrated else bounds)[motion.name]
+        return next_run.Promise(motion, per_second * motion.duration, most, ("x", "y"))
+
+    monkeypatch.setattr(next_run, "_promise", promise)
+    drive = excite("straight", robot=ROBOT, seconds=1.0)
+    motions = [decision.Motion(name, drive.setpoints, drive.period) for name in bounds]
+    found = next_run.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, ROBOT)
+    assert (done, found[0].motion.name) == (worked_out, best)
 
 
 def test_motions_keep_the_profile_of_the_runs_and_are_drawn_anew():

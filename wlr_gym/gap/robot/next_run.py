@@ -106,7 +106,10 @@ def promises(
     backend: str = "gibbs_appell",
     threads: int = 1,
 ) -> list[Promise]:
-    """Return what every motion promises, most per second first.
+    """Return what motions promise, most per second first; the first is the best of all.
+
+    What calibrated numbers take up costs most to know, and only lowers a promise: motions that promise less even without it,
+    and would tell no more, are left out.
 
     Args:
         result: of the last analysis: its calibration, and what its model leaves.
@@ -115,17 +118,27 @@ def promises(
         robot, known, backend, threads: of the analysis.
     """
     with tempfile.TemporaryDirectory() as folder:
-        found = []
+        bounds = []
         for motion in motions:
             path = record_simulation(Path(folder) / f"run_{motion.name}.parquet", motion, robot, "gibbs_appell")
             problem = RobotProblem([read_run(path)], robot, known, backend, threads=threads)
-            found.append(_promise(problem, result, explanations, motion))
+            bounds.append((_promise(problem, result, explanations, motion, calibrated=False), problem))
+        found: list[Promise] = []
+        for bound, problem in sorted(bounds, key=lambda pair: -pair[0].per_second):
+            best = max((one.per_second for one in found), default=-math.inf)
+            tells = max((one.most for one in found), default=0.0) >= TELLS
+            if bound.per_second > best or (bound.most >= TELLS and not tells):
+                found.append(_promise(problem, result, explanations, bound.motion))
     return sorted(found, key=lambda one: -one.per_second)
 
 
-def _promise(problem: RobotProblem, result: Result, explanations: Sequence[Explanation], motion: Motion) -> Promise:
+def _promise(
+    problem: RobotProblem, result: Result, explanations: Sequence[Explanation], motion: Motion, calibrated: bool = True
+) -> Promise:
+    """What a motion promises; not ``calibrated``: if calibrated numbers took up nothing, which is at least as much."""
     values, deviations = _calibrated(problem, result)
-    moved = [Setting(values + step) for step in np.diag(_inside(problem, values, deviations))]
+    steps = np.diag(_inside(problem, values, deviations)) if calibrated else []
+    moved = [Setting(values + step) for step in steps]
     settings = [*(Setting(values, one.effects) for one in explanations), Setting(values), *moved]
     (residuals,) = problem.residuals(settings, [0])
     rows = np.nan_to_num(residuals) * np.sqrt(_weights(problem, result))
