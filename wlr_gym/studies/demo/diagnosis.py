@@ -58,9 +58,8 @@ def name(demo: Demo, tell: Tell) -> Section:
     ):  # fmt: skip
         if (plots / f"{kind}.png").is_file():
             html += picture(plots / f"{kind}.png", caption)
-    links = [
-        link(demo, demo.gap / name, text) for name, text in ((REPORT_FILE, "the whole report"), ("patch.yaml", "the patch"))
-    ]
+    files = ((REPORT_FILE, "the whole report"), ("patch.yaml", "the patch"))
+    links = [link(demo, demo.gap / name, text) for name, text in files if (demo.gap / name).is_file()]
     html += f"<p>Files: {', '.join(links)}.</p>"
     verdict = SHOWN if found.verdict == EFFECT_FOUND else NOT_SHOWN
     return Section(NAME_TITLE, sentence(found), html, verdict)
