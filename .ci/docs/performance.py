@@ -47,7 +47,7 @@ def speed_table(rows: Iterable[Row]) -> list[str]:
     rows = [row for row in rows if row["name"] not in APART and (row["peer"] or row["bar"])]
     lines = ["| what | ours | peer | ratio [min..max] | bar | command | measured |", "|---|---|---|---|---|---|---|"]
     for row in rows:
-        cells = (_passes(row["what"]), _value(row["ours"], row["unit"]), _peer(row), _ratio(row), _bar(row))
+        cells = (row["what"], _value(row["ours"], row["unit"]), _peer(row), _ratio(row), _bar(row))
         lines.append(f"| {' | '.join(cells)} | `wlr bench --only {row['name']}` | {_condition(row['measured'])} |")
     return lines
 
@@ -75,11 +75,6 @@ def machine_lines(rows: Iterable[Row]) -> list[str]:
         note = f" {found['note']}" if found.get("note") else ""
         lines.append(f"- {found['date']}: {found['processor']}, {found['cores']} cores, {found['system']}; {packages}.{note}")
     return list(dict.fromkeys(lines))
-
-
-def _passes(text: str) -> str:
-    """The label of a setting as it is now: reports that are stored call an iteration of the engine's contact solver a sweep."""
-    return text.replace(" sweeps", " passes")
 
 
 def _value(found: Row, unit: str) -> str:
@@ -124,7 +119,7 @@ def engine_lines(engine: dict[str, Any]) -> list[str]:
     found = engine["measured"]
     head = f"Measured {_condition(found)}, {found['processor']}; speed: median [smallest..largest] of the rounds."
     headings, rows = settings_table(engine)
-    table = [_passes(f"| {' | '.join(cells)} |") for cells in (headings, *rows)]
+    table = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
     return [head, reference_text(engine), "", table[0], f"|{'---|' * len(headings)}", *table[1:]]
 
 

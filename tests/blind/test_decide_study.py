@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from wlr_gym.data.excitations import excite
 from wlr_gym.data.read import read_run
 from wlr_gym.gap.report.entries import Result
 from wlr_gym.studies.bench import decide_study
-from wlr_gym.studies.bench.blind.commands import BlindScript
 from wlr_gym.studies.bench.blind.truth import NAMED
 from wlr_gym.studies.bench.decide_study import CASES, EIGHT, START, cases, decided_by, run_decide_study
 from wlr_gym.studies.bench.decide_table import markdown
@@ -44,12 +44,9 @@ def answers(monkeypatch):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "result.json").write_text(given.pop(0).model_dump_json())
 
-    def short(motion):
-        last = len(motion.setpoints) - 1
-        return BlindScript(1.0, lambda t: motion.setpoints[np.clip((t / motion.period).astype(int), 0, last)])
-
     monkeypatch.setattr(decision, "analyse", analyse)
-    monkeypatch.setattr(decide_study, "_script", short)
+    script = decide_study._script
+    monkeypatch.setattr(decide_study, "_script", lambda motion: replace(script(motion), duration=1.0))
     return given
 
 

@@ -52,6 +52,17 @@ def resumes(folder: Path, file: str) -> bool:
     return False
 
 
+def keep_request(path: Path, requested: Mapping[str, Any]) -> None:
+    """Write what is requested of a folder into its file; refuse, if it is there, to go on with what was requested otherwise.
+
+    Raises:
+        InputError: the first difference.
+    """
+    if path.is_file():
+        check_same_request(path, json.loads(path.read_text(encoding="utf-8")), requested)
+    write_json(path, requested)
+
+
 def check_same_request(path: Path, there: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
     """Refuse to resume what was requested otherwise.
 

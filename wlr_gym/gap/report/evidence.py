@@ -92,7 +92,7 @@ def _by_name(evidence: Sequence[Evidence]) -> list[list[Evidence]]:
 
 def _rejected(alike: Sequence[Evidence]) -> tuple[str, ...]:
     best, others = alike[0], len(alike) - 1
-    more = f"; less at {others} other place{'s' if others > 1 else ''}" if others else ""
+    more = f"; less at {counted(others, 'other place')}" if others else ""
     return plain(best.name), f"{places(best.where)}{more}", number(max(best.screened, 0.0)), best.reason
 
 

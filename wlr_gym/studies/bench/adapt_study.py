@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import check_same_request, make_output_folder
+from wlr_gym.base.files import keep_request, make_output_folder
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
@@ -156,10 +156,7 @@ def _check_size(study: AdaptStudy) -> None:
     """Refuse to add to a study of another size."""
     size = {"drives": study.drives, "seconds": study.seconds, "steps": study.steps, "episodes": study.episodes}
     size |= {"excitations": list(study.excitations), "budget_runs": study.budget_runs}
-    path = study.out / "size.json"
-    if path.is_file():
-        check_same_request(path, json.loads(path.read_text(encoding="utf-8")), size)
-    path.write_text(json.dumps(size) + "\n", encoding="utf-8")
+    keep_request(study.out / "size.json", size)
 
 
 def _order(study: AdaptStudy, lines: Sequence[Mapping[str, Any]]) -> Iterator[tuple[AdaptCase, str]]:

@@ -7,7 +7,6 @@ interrupted contender begins anew.
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import check_same_request, make_output_folder, write_json
+from wlr_gym.base.files import keep_request, make_output_folder, write_json
 from wlr_gym.base.jobs import Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
@@ -35,6 +34,7 @@ from wlr_gym.studies.bench.blind.dataset import BlindRobot, copy_of, write
 from wlr_gym.studies.bench.blind.score import FAILED, found_names
 from wlr_gym.studies.bench.blind.simulation import BlindProfile
 from wlr_gym.studies.bench.blind.truth import NAMED, hide
+from wlr_gym.studies.bench.gap import read_result
 
 #: Contender -> what it drives.
 CONTENDERS = {
@@ -173,7 +173,7 @@ def run_decide_study(
             raise unknown_name("contender", name, CONTENDERS)
     for folder in ("", "lines", "work"):
         make_output_folder(out / folder)
-    _check_request(out / "study.json")
+    keep_request(out / "study.json", _request())
     asked = [(one, contender) for one in cases(count) for contender in dict.fromkeys(contenders)]
     left = {f"{one.name}_{contender}": (one, contender) for one, contender in asked if not _is_done(out, one, contender)}
     jobs = [
@@ -186,18 +186,15 @@ def run_decide_study(
         if ended.error:
             write_json(file, _line(*left[ended.name]) | {"ended": FAILED, "right": False, "found": [], "message": ended.error})
         rest = (time.monotonic() - begin) / done * (len(jobs) - done) / 60.0
-        say(f"{done}/{len(jobs)}  {ended.name}: {_said(_read(file))}; about {rest:.0f} min to go")
-    lines = [_read(_file(out, one, contender)) for one, contender in asked]
+        say(f"{done}/{len(jobs)}  {ended.name}: {_said(read_result(file))}; about {rest:.0f} min to go")
+    lines = [read_result(_file(out, one, contender)) for one, contender in asked]
     write_json(out / LINES_FILE, lines)
     return lines
 
 
-def _check_request(path: Path) -> None:
-    """Refuse to add to a study of other robots or runs."""
-    request = {"first_seed": FIRST_SEED, "severity": SEVERITY, "further": FURTHER, "start": list(START), "eight": list(EIGHT)}
-    if path.is_file():
-        check_same_request(path, json.loads(path.read_text(encoding="utf-8")), request)
-    write_json(path, request)
+def _request() -> dict[str, Any]:
+    """What makes robots and runs."""
+    return {"first_seed": FIRST_SEED, "severity": SEVERITY, "further": FURTHER, "start": list(START), "eight": list(EIGHT)}
 
 
 def _file(out: Path, one: DecideCase, contender: str) -> Path:
@@ -208,13 +205,9 @@ def _log(out: Path, name: str) -> str:
     return str((out / "work" / f"{name}.log").resolve())
 
 
-def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
 def _is_done(out: Path, one: DecideCase, contender: str) -> bool:
     file = _file(out, one, contender)
-    return file.is_file() and _read(file)["ended"] != FAILED
+    return file.is_file() and read_result(file)["ended"] != FAILED
 
 
 def _said(line: Line) -> str:

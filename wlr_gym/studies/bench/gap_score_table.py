@@ -66,7 +66,7 @@ def _at_least(what: str, share: Mapping[str, Any], target: float | None = None) 
     value = _share(share, "at least")
     if target is None:
         return ScoreLine(what, value)
-    met = _met(share["share"] >= target, target == 1.0 or share["bound95"] >= target) if share["count"] else ""
+    met = _met(share["share"] >= target, share["bound95"] >= target) if share["count"] else ""
     return ScoreLine(what, value, f">= {target:.0%}", met)
 
 
@@ -79,7 +79,7 @@ def _at_most(what: str, share: Mapping[str, Any], target: float | None = None) -
 
 
 def _none(what: str, share: Mapping[str, Any]) -> ScoreLine:
-    """Something that must not happen in any of these sets: as with a share of 1, no bound could show that it never does."""
+    """Something that must not happen in any of these sets: no bound could show that it never does."""
     return ScoreLine(what, _share(share, "at most"), "0", _met(not share["hits"], True) if share["count"] else "")
 
 

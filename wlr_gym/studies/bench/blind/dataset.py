@@ -58,8 +58,13 @@ class BlindRobot:
     def meta(self, notes: str) -> dict[str, Any]:
         """Return the contents of ``meta.yaml`` of its runs."""
         registers = {name: value for name, value in vars(self.profile).items() if value > 0}
-        meta = {"robot": self.robot["name"], "profile": registers, "ground": "indoor floor"}
-        return {**meta, "marker_offset": [0.0, 0.0, 0.0], "notes": notes}
+        return {
+            "robot": self.robot["name"],
+            "profile": registers,
+            "ground": "indoor floor",
+            "marker_offset": [0.0, 0.0, 0.0],
+            "notes": notes,
+        }
 
 
 def copy_of(robot: Mapping[str, Any], seed: int, exact: bool = False, soft: bool = False) -> Copy:
