@@ -66,6 +66,7 @@ def test_a_training_does_not_write_into_a_used_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_a_policy_is_trained_scored_and_loaded_from_python(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3")
     size = {"total_steps": 512, "num_envs": 8, "steps_per_env": 32, "batch_size": 128, "epochs": 1}

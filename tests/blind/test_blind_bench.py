@@ -49,6 +49,7 @@ def _finish(tmp_path_factory):
     return plan, report, said
 
 
+@pytest.mark.slow
 def test_progress_tells_the_time_left_and_no_truth(finished):
     _, report, said = finished
     assert report["sets"] == 2
@@ -141,6 +142,7 @@ def test_goes_on_where_it_stopped(finished):
     assert not any("to go" in line for line in said)
 
 
+@pytest.mark.slow
 def test_goes_on_from_the_answers_of_another_folder(finished, tmp_path):
     first, report, _ = finished
     plan = dataclasses.replace(first, out=tmp_path / "again")

@@ -48,6 +48,7 @@ def test_effects_are_taken_by_name_and_refused_when_unknown():
         emulate.run(options(stepped=True, effects=("tired_batery",)))
 
 
+@pytest.mark.slow
 def test_takes_command_lines_from_a_pipe():
     script = "from wlr_gym.cli import emulate; emulate.run(emulate.EmulateOptions(stepped=True, seconds=1.0))"
     text = "drop legs probability=0.5\nfaults\nstep 0.25\nnonsense\n"

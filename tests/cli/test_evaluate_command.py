@@ -10,6 +10,7 @@ from wlr_gym.cli import evaluate, main
 SMALL = ["--episodes", "3", "--no-progress"]
 
 
+@pytest.mark.slow
 def test_it_writes_the_same_card_twice(tmp_path, capsys):
     arguments = ["evaluate", "constant_command", "--baselines", "do_nothing", "--seeds", "2", *SMALL, "--out"]
     assert main([*arguments, str(tmp_path / "a")]) == 0
@@ -43,6 +44,7 @@ def test_an_agent_is_scored_without_what_policy_files_need(monkeypatch, capsys):
     assert main(["evaluate", "pid", "--episodes", "2", "--no-progress"]) == 0
 
 
+@pytest.mark.slow
 def test_full_means_seeds_sweeps_and_both_simulators(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "FULL_EPISODES", 2)
     monkeypatch.setattr(evaluate, "FULL_SEEDS", 2)

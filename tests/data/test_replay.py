@@ -206,6 +206,7 @@ def test_measured_run_is_within_the_robots_tolerances():
         assert worst(result, kind) < bound, kind
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not TWIN.is_dir(), reason="the measured data are not beside the repository")
 @pytest.mark.parametrize(
     ("name", "run", "channel", "shrinks_to"),

@@ -27,8 +27,14 @@ NOT_RUN = {
     "docs/sweep.md": 1,  # a cluster
     "docs/vision.md": 4,  # installation, pictures, a film, a photograph
 }
-#: Pages whose blocks take most of a minute or more together; the slow suite runs them.
-LONG = {"README.md", "docs/quickstart.md", "docs/run_format.md", "docs/compare.md", "docs/pictures.md", "docs/sweep.md"}
+#: Pages whose blocks take longest; the slow suite runs them.
+LONG = {
+    "README.md",
+    *(
+        f"docs/{name}.md"
+        for name in ("camera", "commissioning", "compare", "learning", "pictures", "quickstart", "robot", "run_format", "sweep")
+    ),
+}
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 
 

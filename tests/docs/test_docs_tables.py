@@ -35,6 +35,7 @@ def test_the_files_are_those_that_the_script_writes():
     assert {path.name: path.read_text(encoding="utf-8") for path in tables.FOLDER.iterdir()} == tables.table_files()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", tables.TABLES)
 def test_the_site_has_whole_rows(name):
     lines = [line for line in tables.TABLES[name]() if line.startswith("|")]

@@ -93,6 +93,7 @@ def test_the_interface_of_stable_baselines3_takes_a_spec(registry, task):
     assert Sb3VecEnv(spec.id, 2).core.limit == 50
 
 
+@pytest.mark.slow
 def test_a_pickled_batch_of_stable_baselines3_knows_the_task_elsewhere(registry, task, tmp_path):
     """So does the evaluation once the file is gone: the spec holds the whole task."""
     from wlr_gym.learning.evaluation import make_core

@@ -695,6 +695,7 @@ def test_time_of_a_formula_is_that_of_the_run_however_it_is_replayed(tmp_path):
     assert min(errors[1]) > 3.0
 
 
+@pytest.mark.slow
 def test_floor_is_what_a_perfect_model_reaches(good):
     problem = RobotProblem([good])
     setting = nominal_model(problem).setting
@@ -741,6 +742,7 @@ def test_rolling_resistance_is_found_in_four_runs(tmp_path):
     assert found.gap.reduction > 0.5
 
 
+@pytest.mark.slow
 def test_what_a_robot_cannot_have_beside_its_effects_is_not_tried(good):
     """A joint has one Stribeck speed: where one is found, or given as known, another is no candidate."""
     problem = RobotProblem([good])

@@ -34,6 +34,7 @@ def found(runs):
     return analyse(runs, rig=str(FILE))
 
 
+@pytest.mark.slow
 def test_asymmetric_friction_is_named_and_sized(found):
     (effect,) = found.effects
     assert (found.verdict, effect.name, effect.where) == ("effect_found", "asymmetric_friction", ("axis",))
@@ -43,6 +44,7 @@ def test_asymmetric_friction_is_named_and_sized(found):
     assert found.gap.reduction > 0.8
 
 
+@pytest.mark.slow
 def test_nothing_is_missing_beside_what_is_given(runs, found):
     given = {"name": "asymmetric_friction", "where": ["axis"], "parameters": {"difference": 1.0}}
     again = analyse(runs, known=given, rig=str(FILE))

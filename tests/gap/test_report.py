@@ -248,6 +248,8 @@ def test_sentences_say_what_was_found():
     assert "it removes 95 % (run by run 94 % and 96 %; no interval) of the avoidable" in sentence(two_runs)
     worse = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=-0.27, reduction_ci95=(-0.33, -0.21)))
     assert "added, it makes the error of the held-out runs larger: -27 % (95 % interval -33 to -21 %);" in sentence(worse)
+    alike = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=-0.02, reduction_ci95=(-0.07, 0.02)))
+    assert "it does not measurably change the error of the held-out runs: -2 % (95 % interval -7 to 2 %);" in sentence(alike)
     no_room = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=float("nan")))
     assert "; the error of the held-out runs is as small without it;" in sentence(no_room)
     two = (*examples.EFFECT_FOUND.effects, FoundEffect("payload", ("body",), {}, 0.9, 300.0))

@@ -26,6 +26,7 @@ def fitted(problem, size=0.7):
     return fit(problem, range(len(problem.runs)), model, steps=problem.steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("white", "error", "ar1"), [(1.5, 0.0, 0.0), (1.0, 1.5, 0.6)], ids=["white", "ar1"])
 def test_intervals_cover_the_truth_as_often_as_they_say(white, error, ar1):
     inside, draws = [], 100

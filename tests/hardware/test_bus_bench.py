@@ -31,6 +31,7 @@ def test_both_read_the_same():
             assert ours.position[joints].tolist() == pytest.approx(angles, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_every_row_is_measured(monkeypatch):
     """The drive in emulated time, so that it does not depend on this computer: nothing is late there."""
     monkeypatch.setattr(bus, "_DRIVE", bus._DRIVE.replace('"--emulated"', '"--emulated", "--stepped"'))
@@ -62,6 +63,7 @@ def test_a_drive_that_hangs_is_ended(monkeypatch):
         bus.drive_in_real_time(1, ["pid"])
 
 
+@pytest.mark.slow
 def test_a_drive_that_does_not_end_well_is_no_measurement():
     with pytest.raises(RuntimeError, match="--seconds 0: expected more than 0"):
         bus.drive_in_real_time(0, ["pid"])

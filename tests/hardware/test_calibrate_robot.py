@@ -393,6 +393,7 @@ def test_an_adapter_that_goes_while_servos_are_searched_is_told(bench, monkeypat
     assert (code, "First: robot, bus: port is gone" in capsys.readouterr().out) == (1, True)
 
 
+@pytest.mark.slow
 def test_servos_that_cannot_be_set_up(bench):
     machine, plug = bench
     ports = plug("wheel_lf")

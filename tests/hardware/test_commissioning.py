@@ -68,6 +68,7 @@ def nominal(tmp_path_factory):
     return main(["commission", "--emulated", "--out", str(out)]), out
 
 
+@pytest.mark.slow
 def test_an_unaltered_robot_differs_nowhere(nominal):
     code, out = nominal
     assert differing(out) == set()
@@ -78,6 +79,7 @@ def test_an_unaltered_robot_differs_nowhere(nominal):
     assert sum(len(result["findings"]) for result in results.values()) > 100
 
 
+@pytest.mark.slow
 def test_what_it_measures_is_what_the_emulator_is_made_of(nominal):
     measured = load_hardware(nominal[1] / "hardware.yaml").measured
     for wheel in WHEELS:
@@ -92,6 +94,7 @@ def test_what_it_measures_is_what_the_emulator_is_made_of(nominal):
         assert measured.adapter_latency[bus].unit == "s"
 
 
+@pytest.mark.slow
 def test_the_hardware_file_keeps_its_comments_and_gets_every_measured_value(nominal):
     text = (nominal[1] / "hardware.yaml").read_text()
     source = (data_directory("configs") / "hardware/nominal.yaml").read_text()
@@ -106,6 +109,7 @@ def test_every_measured_field_is_a_quantity_of_a_test():
     assert set(Measured.model_fields) <= set(QUANTITIES)
 
 
+@pytest.mark.slow
 def test_its_runs_are_measured_runs(nominal):
     dataset = read_dataset(nominal[1])
     names = {result["run"] for result in results_of(nominal[1]).values()} - {""}
@@ -159,6 +163,7 @@ def test_a_servo_that_differs_is_found_and_named(tmp_path, name, joint, factor, 
     assert not results[test].is_good
 
 
+@pytest.mark.slow
 def test_a_rubbing_wheel_and_a_slow_adapter_are_told_on_the_command_line(tmp_path, capsys):
     patch = {"effects": [{"name": "coulomb_friction", "where": ["wheel_rf"], "parameters": {"torque": 0.05}}]}
     (tmp_path / "rub.yaml").write_text(yaml.safe_dump(patch))
@@ -181,6 +186,7 @@ def test_a_joint_mounted_the_other_way_and_a_wrong_zero_are_found(tmp_path):
     assert found_in(results) == {("joint_zero", "leg_lr")}
 
 
+@pytest.mark.slow
 def test_an_imu_that_is_mounted_otherwise_is_found(tmp_path):
     emulated = EmulatedStand(ROBOT, NOMINAL)
     link = emulated_link(emulated.machine)
@@ -420,6 +426,7 @@ def beside(monkeypatch, emulated):
     monkeypatch.setattr(HardwareOption, "link_to", lambda self, robot, hardware, patch=None: emulated_link(emulated.machine))
 
 
+@pytest.mark.slow
 def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(monkeypatch, tmp_path):
     emulated = EmulatedStand(ROBOT, NOMINAL)
     beside(monkeypatch, emulated)
@@ -489,6 +496,7 @@ def make_with_hiccups(folder, test, waits, person=None):
     return result, emulated.machine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("test", "wait"),
     [
@@ -548,6 +556,7 @@ def test_a_lost_answer_now_and_then_leaves_no_gap(tmp_path):
     assert {result.state for result in results.values()} == {"done"}
 
 
+@pytest.mark.slow
 def test_over_serial_ports(tmp_path, monkeypatch):
     """In emulated time: what the emulator and this process are given of the processor does not matter."""
     pytest.importorskip("termios")

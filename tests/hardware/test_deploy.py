@@ -72,6 +72,7 @@ def tired_core(folder):
 # ---- deploying ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make", [lambda core: Wobble(core.observation.shape[1]), lambda core: make_policy("pid", core.contract())]
 )
@@ -90,6 +91,7 @@ def test_the_log_shown_to_the_policy_again_gives_the_same_actions(tmp_path, make
     core.close()
 
 
+@pytest.mark.slow
 def test_commands_that_change_on_the_way_are_seen_again(tmp_path):
     core = robot_core(tmp_path, 9.0)
     policy = make_policy("pid", core.contract())
@@ -191,6 +193,7 @@ def test_simulators_are_no_robots():
     core.close()
 
 
+@pytest.mark.slow
 def test_a_policys_run_is_replayed_from_its_first_tick(tmp_path):
     """The robot drives off at once: the effort of that is no tension that it stood under before."""
     core = robot_core(tmp_path)
@@ -199,6 +202,7 @@ def test_a_policys_run_is_replayed_from_its_first_tick(tmp_path):
     assert errors["gyro_z"].segment_rms < 2.0 * errors["gyro_z"].noise
 
 
+@pytest.mark.slow
 def test_an_emulated_robot_may_hide_something(tmp_path):
     """Effects act on what is emulated; environment and policy are not told."""
     runs = {}
@@ -312,6 +316,7 @@ def test_nobody_there_to_start_the_robot(tmp_path, monkeypatch):
         run_command("deploy", ["pid", "--out", str(tmp_path)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", ["signal", "key"])
 def test_command_line_on_real_terminals(tmp_path, stop):
     """The whole way in real time: emulator process, ports, watchdog process, a stop from outside. No claim about time."""
@@ -400,6 +405,7 @@ def times_of(path):
 STOP_TICKS = round(HARDWARE.safety.stop_time / PERIOD)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("late", "sleeps", "reason"),
     [(10000, (10, 30, 31, 60), "time is over"), (20, range(20, 100), "deadlines: 20 ticks in a row late")],

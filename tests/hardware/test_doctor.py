@@ -123,6 +123,7 @@ def test_verbose_lists_every_joint(machine, capsys):
     assert len(look(capsys, verbose=True)[1].splitlines()) == 212
 
 
+@pytest.mark.slow
 def test_on_ports_with_a_scan(capsys, monkeypatch):
     machine = Machine(ROBOT, HARDWARE, MachineOptions(timing=NO_TIME, sensor_noise=False))
     machine.servos["wheel_lf"].set("id", 42)

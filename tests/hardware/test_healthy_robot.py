@@ -54,6 +54,7 @@ def test_a_pause_before_a_read_is_no_jump(pause, monkeypatch):
     rig.loop.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("acceleration", [8.0, 11.2, 14.0, 20.0, 40.0])
 def test_wheels_whose_profile_is_slow_are_not_away(acceleration):
     rig = Rig(profile=Profile(wheel_acceleration=acceleration))
@@ -62,6 +63,7 @@ def test_wheels_whose_profile_is_slow_are_not_away(acceleration):
     rig.loop.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("velocity", "acceleration"), [(1.0, 1.0), (3.0, 2.0), (5.0, 3.0)])
 def test_legs_whose_profile_is_slow_may_turn_back(velocity, acceleration):
     rig = Rig(profile=Profile(leg_velocity=velocity, leg_acceleration=acceleration))

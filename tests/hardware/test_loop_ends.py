@@ -363,6 +363,7 @@ def test_the_way_to_the_start_pose_waits_for_the_operator(tmp_path):
     rig.loop.close()
 
 
+@pytest.mark.slow
 def test_the_way_to_the_start_pose_does_not_wait_for_ever():
     with pytest.raises(StoppedError, match="held for 30 s on the way to the start pose: deadman: no sign of the operator"):
         Rig(deadman=0.3).loop.start([1.0, 1.0, 2.1, 2.1])

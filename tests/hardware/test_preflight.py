@@ -76,6 +76,7 @@ def test_each_fault_is_found_alone_and_not_mended(server, servos, item, count):
     assert failed(servos) == [check]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", ["leg_lf", "leg_rr"])
 def test_a_silent_servo_is_named_and_no_other_one(server, servos, joint):
     server.machine.inject(f"dead {joint}")
@@ -177,6 +178,7 @@ def test_old_firmware_warns_and_very_old_fails():
             assert {check.what for check in failed(servos)} == words
 
 
+@pytest.mark.slow
 def test_bus_speed_names_losses(server, servos):
     assert preflight.check_bus_speed(servos, reads=20, budget=1.0).ok
     for group in servos.groups.values():

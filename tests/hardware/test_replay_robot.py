@@ -39,6 +39,7 @@ def again(run, out, **options):
     return code, json.loads((out / "errors.json").read_text())["run_01"]
 
 
+@pytest.mark.slow
 def test_the_same_robot_does_the_same(run, tmp_path, capsys):
     """In emulated time the same robot, driven by the same setpoints from the same pose, gives the same bits."""
     code, errors = again(run, tmp_path)

@@ -106,6 +106,7 @@ def test_kill_9_is_no_way_past_torque_off(tmp_path, server):
     assert len(run.table) >= 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_signals_end_a_driving_process_in_good_order(tmp_path, server, name):
     driver, watchdog = start_driver(tmp_path, server)
@@ -158,6 +159,7 @@ def test_a_driver_that_hangs_is_killed_and_torque_goes_off(tmp_path, server):
     assert '"driver": "hangs"' in (tmp_path / "log" / "guard.jsonl").read_text()
 
 
+@pytest.mark.slow
 def test_a_driver_whose_watchdog_process_is_gone_stops(tmp_path, server):
     driver, watchdog = start_driver(tmp_path, server)
     os.kill(watchdog, signal.SIGKILL)

@@ -38,6 +38,7 @@ def act(path, env, observations):
     return make_policy(path, env.contract()).act(observations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["PPO", "PPO squashed", "SAC", "TD3"])
 def test_an_archive_acts_as_its_model_predicts(env, tmp_path, algorithm):
     """Through the command, normalisation included; the model's own ``predict`` and ``normalize_obs`` are the reference."""

@@ -108,6 +108,7 @@ def test_neutral_formula_changes_no_bit():
     np.testing.assert_array_equal(drive(make_plant(3, forces=neutral), 0.3, setpoints).values, plain.values)
 
 
+@pytest.mark.slow
 def test_formula_force_on_the_floor_is_the_external_force():
     setpoints = np.concatenate([LEGS_DOWN, np.full(4, 2.0)])
     pull = [make_force(["floor_force_y"], "f", {"f": 3.0}, {"f": "N"})]
@@ -116,6 +117,7 @@ def test_formula_force_on_the_floor_is_the_external_force():
     np.testing.assert_allclose(formula.values, pushed.values, rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_formula_spring_in_a_leg_acts_like_a_motor():
     """Torque off, in space: leg and platform swing against each other about the spring's rest angle."""
     stiffness, rest = 2.0, 1.4
@@ -135,6 +137,7 @@ def test_formula_spring_in_a_leg_acts_like_a_motor():
     np.testing.assert_allclose([angles.min(), angles.max()], [2 * rest - np.pi / 2, np.pi / 2], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_formula_drag_on_the_body_slows_it_exponentially():
     drag = [make_force(["body_force_x"], "-c * velocity_x", {"c": 2.0}, {"c": "N s/m"})]
 

@@ -30,12 +30,14 @@ def messages(path):
     from mcap.reader import make_reader
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    found = {}
+    found, stores = {}, {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
             assert schema is not None
-            store = get_typestore(Stores.EMPTY)
-            store.register(get_types_from_msg(schema.data.decode(), schema.name))
+            if schema.id not in stores:
+                stores[schema.id] = get_typestore(Stores.EMPTY)
+                stores[schema.id].register(get_types_from_msg(schema.data.decode(), schema.name))
+            store = stores[schema.id]
             found.setdefault(channel.topic, []).append((message.log_time, store.deserialize_cdr(message.data, schema.name)))
     return found
 

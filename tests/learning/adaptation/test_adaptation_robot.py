@@ -42,6 +42,7 @@ class Watched(EmulatedRobot):
         return plant, truth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["gibbs_appell", "mujoco"])
 def test_an_episode_is_scored_by_the_true_motion(backend, monkeypatch):
     commands = []
@@ -56,6 +57,7 @@ def test_an_episode_is_scored_by_the_true_motion(backend, monkeypatch):
     assert episode.tracking_error == pytest.approx(scaled, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_and_what_is_hidden_shows():
     hidden = load_patch([{"name": "friction_asymmetry", "where": ["wheel_lf", "wheel_lr"], "parameters": {"mu": 0.1}}])
     robots = (EmulatedRobot(load_robot()), EmulatedRobot(load_robot()), EmulatedRobot(load_robot(), hidden))

@@ -170,6 +170,7 @@ def test_settings_of_every_task_are_valid(name, task):
     core.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("config", ["ppo_slip_aware", "ppo_blind"])
 @pytest.mark.parametrize("task", ["velocity", "path", "posture", "slope"])
 def test_what_is_learnt_from_comes_later_than_what_is_scored(task, config):

@@ -57,6 +57,7 @@ def test_scoring_changes_nothing_of_the_training(run, tmp_path):
     assert_same_weights(unscored, run / "policy")
 
 
+@pytest.mark.slow
 def test_scores_go_on_after_a_resume(run, tmp_path):
     folder = tmp_path / "run"
     settings = SETTINGS | SCORED

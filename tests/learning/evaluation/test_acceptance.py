@@ -23,6 +23,7 @@ STORED = sorted((Path(__file__).parents[3] / "docs" / "data" / "acceptance").glo
 TINY = {"floors": ["ice"], "episodes": 8, "seeds": 2}
 
 
+@pytest.mark.slow
 def test_a_policy_loses_nothing_against_itself_and_gains_against_standing_still():
     result = accept("slip_compensating", references=["again=slip_compensating", "do_nothing"], **TINY)
     itself, idle = result.losses

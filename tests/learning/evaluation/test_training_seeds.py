@@ -281,6 +281,7 @@ def test_bad_groups_are_refused_and_leave_nothing(trials, tmp_path, capsys):
     assert not (tmp_path / "card").exists()
 
 
+@pytest.mark.slow
 def test_trainings_are_scored_as_one_column_by_the_command_and_in_python_to_the_bit(tmp_path):
     pytest.importorskip("torch")
     tiny = {"total_steps": 64, "num_envs": 8, "steps_per_env": 8, "batch_size": 32, "evaluate_every": 0}

@@ -32,6 +32,7 @@ checkpoint.save = save_on_full_disk
 """
 
 
+@pytest.mark.slow
 def test_one_fails_the_others_go_on_and_a_resume_completes_it(tmp_path, monkeypatch, capsys):
     """Four trials, one of them without space on its disk; then there is space again."""
     (tmp_path / "disk_for_tests.py").write_text(FULL_DISK)

@@ -85,6 +85,7 @@ def test_tilts_that_frames_tell_badly_come_from_the_legs(paper, alone):
     assert not found.contradictions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0.0, 0.008])
 def test_a_straight_drive_finds_no_slope_of_the_floor(paper, alone, tilt):
     """Paper test 1: loads shift as the legs sweep, so heights that tyres cause go with the way driven."""
@@ -140,6 +141,7 @@ def test_a_wheel_on_a_step_is_said_and_the_legs_are_not_used(drive, alone):
     assert np.array_equal(found.pose, alone(drive, stepped).pose)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0.0, 0.003, 0.008])
 def test_front_wheels_on_a_kerb_of_3_mm_are_said(paper, tilt):
     """Also where each frame shows no more than its own noise."""

@@ -56,6 +56,7 @@ def test_clocks_are_aligned_within_2_ms(turn, seed):
     assert "yaw" in found.parts
 
 
+@pytest.mark.slow
 def test_the_wheels_errors_are_correlated_as_the_covariance_says(turn):
     """Against the errors of other draws of the frames' noise; its diagonal is that of the sigmas."""
     draws = [
@@ -115,6 +116,7 @@ def test_slip_is_within_a_millimetre_and_its_sigma_is_honest(turn):
     assert np.all((spread > 0.25) & (spread < 1.93))
 
 
+@pytest.mark.slow
 def test_sigma_of_slip_grows_with_what_is_known_less(turn):
     """Clocks count while it moves, tilts of the body and the layout of its markers always."""
     samples, nominal = samples_of(turn), Parameters.nominal(turn.robot)

@@ -90,6 +90,7 @@ def test_the_imu_makes_poses_and_rates_sharper_and_the_sigmas_hold():
     assert np.all(rms(both[0].value_std)[[0, 1, 3, 5]] < 0.9 * rms(alone[0].value_std)[[0, 1, 3, 5]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_imu", [False, True])
 def test_the_covariance_of_slip_is_that_of_its_errors(with_imu):
     """Slip is the change of x, and of y and yaw, since the first row; wheels that slip alike err alike."""
@@ -129,6 +130,7 @@ def measured(drive, samples=None, **columns):
     return measure_slip(samples or samples_of(drive), OFFSET, run, drive.robot, Parameters.nominal(drive.robot))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("legs", "share"), [(True, 0.9), (False, 0.8)])
 def test_slip_to_the_side_is_sharper_with_the_imu(drive, monkeypatch, legs, share):
     if not legs:
@@ -163,6 +165,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_wrong_imu_changes_nothing_and_is_a_finding(drive, wrong):
     columns = WRONG[wrong](drive.run)
@@ -191,6 +194,7 @@ def test_one_missing_reading_does_not_matter(drive):
     assert np.abs(found.pose - whole.pose).max() < 0.05 * np.abs(alone.pose - whole.pose).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_imu", [False, True])
 def test_sigmas_hold_in_gaps_of_the_film(drive, with_imu):
     """Of half a second to 4 s, at starts, turns and stops; with the gyroscope the yaw stays known to milliradians."""

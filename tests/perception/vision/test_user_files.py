@@ -98,6 +98,7 @@ def test_a_film_of_a_moving_board_tells_the_shutter(readout):
     assert camera.quality.rms < 0.1  # what the shutter moves is off the corners, too
 
 
+@pytest.mark.slow
 def test_a_board_that_stands_in_every_view_does_not_tell_the_shutter():
     """Its places are those of a moving one, each held for three frames."""
     film = [frame for frame in board_film(Board(), LENS, 0.0, 150) if frame.index % 9 == 0]
@@ -140,6 +141,7 @@ def test_boards_that_cannot_be_are_refused(make, message):
         make()
 
 
+@pytest.mark.slow
 def test_command_writes_the_readout_into_the_camera_file(tmp_path, capsys):
     film = tmp_path / "board.avi"
     with VideoFile(film, "FFV1", 30.0) as video:

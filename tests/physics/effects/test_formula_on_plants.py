@@ -46,6 +46,7 @@ def end_of(backend: str, effects: list[dict]) -> tuple[np.ndarray, np.ndarray]:
         plant.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", SIMULATORS)
 @pytest.mark.parametrize(
     ("effect", "formulas"), [(PUSH, PUSH_FORMULAS), (TETHER, TETHER_FORMULAS)], ids=["external_force", "tether"]
@@ -71,6 +72,7 @@ def test_a_spring_moves_its_own_leg(backend):
     assert moved[2] == pytest.approx(torque / stiffness, abs=2 * leg.coulomb_friction / stiffness)
 
 
+@pytest.mark.slow
 def test_environments_give_formulas_to_their_plant():
     def yaw_rate(effects: list[dict] | None) -> float:
         env = gymnasium.make("WLR-Velocity-v0", effects=effects, randomization="none", episode_length=1.0)

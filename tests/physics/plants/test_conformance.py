@@ -511,6 +511,7 @@ def test_a_neutral_formula_does_not_change_a_bit(simulator):
     np.testing.assert_array_equal(run(plant, 0, 10), run(make(simulator, 3), 0, 10))
 
 
+@pytest.mark.slow
 def test_a_formula_of_time_is_asked_at_every_step_and_time_goes_on_with_the_state(simulator):
     """Against an external force set anew before each step, from 2 s on; halfway through, robots are put where they are."""
     rise = make_force(["floor_force_x"], "f * time", {"f": 2.0}, {"f": "N/s"})

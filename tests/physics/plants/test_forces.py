@@ -55,8 +55,9 @@ def run(forces, state, precision="float64", values=None):
 
 
 def factor_unit(name: str, target: str) -> str:
-    """Unit of the constant that turns a feature into ``target``."""
-    numerator, _, denominator = FEATURES[name].unit.partition("/")
+    """Unit of the constant that turns a feature, or that of a corner, into ``target``."""
+    feature = FEATURES.get(name) or FEATURES[name.rpartition("_")[0]]
+    numerator, _, denominator = feature.unit.partition("/")
     return f"{target} {denominator}".strip() + "".join(f"/{unit}" for unit in numerator.split())
 
 
@@ -64,6 +65,16 @@ def of(where: str, name: str, state) -> np.ndarray:
     """The value of one feature, through a force that is nothing else."""
     force = make_force([where], f"c * {name}", {"c": 1.0}, {"c": factor_unit(name, COORDINATES[where])})
     return run([force], state)[where]
+
+
+def assert_sum(where: str, expected: dict[str, np.ndarray], state) -> None:
+    """Compare features, each with a weight of its own, in one formula: one compilation."""
+    weights = {f"c{n}": 0.1 * (n + 1) for n in range(len(expected))}
+    units = {c: factor_unit(name, "N m") for c, name in zip(weights, expected, strict=True)}
+    formula = " + ".join(f"{c} * {name}" for c, name in zip(weights, expected, strict=True))
+    found = run([make_force([where], formula, weights, units)], state)[where]
+    total = sum(weight * values for weight, values in zip(weights.values(), expected.values(), strict=True))
+    np.testing.assert_allclose(found, total, rtol=1e-12)
 
 
 def test_spring_pulls_its_own_joint_only(state):
@@ -114,19 +125,9 @@ def test_features_of_a_joint_and_of_its_corner(state, joint):
         "slip_speed": np.hypot(state[f"slip_velocity_{corner}_x"], state[f"slip_velocity_{corner}_y"]),
     }
     assert set(expected) == {name for name, feature in FEATURES.items() if feature.scope != "robot"}
-    formula, parameters, units = [], {}, {}
-    for n, name in enumerate(expected):
-        formula.append(f"c{n} * {name}")
-        parameters[f"c{n}"] = 0.1 * (n + 1)
-        units[f"c{n}"] = factor_unit(name, "N m")
-    found = run([make_force([joint], " + ".join(formula), parameters, units)], state)[joint]
-    total = sum(value * values for value, values in zip(parameters.values(), expected.values(), strict=True))
-    np.testing.assert_allclose(found, total, rtol=1e-12)
-    for name, values in expected.items():
-        if FEATURES[name].scope == "corner":
-            full = f"{name}_{CORNERS[corner]}"
-            other = make_force(["body_torque_yaw"], f"a * {full}", {"a": 1.0}, {"a": factor_unit(name, "N m")})
-            np.testing.assert_allclose(run([other], state)["body_torque_yaw"], values, rtol=1e-12)
+    assert_sum(joint, expected, state)
+    there = {f"{name}_{CORNERS[corner]}": values for name, values in expected.items() if FEATURES[name].scope == "corner"}
+    assert_sum("body_torque_yaw", there, state)
 
 
 def test_several_places_get_the_law_of_their_own_joint(state):

@@ -14,6 +14,7 @@ from wlr_gym.hardware.loop import Phase, StoppedError
 from wlr_gym.studies.paper.experiments import PROFILE, TESTS
 
 
+@pytest.mark.slow
 def test_report_is_written(tmp_path, capsys):
     out = tmp_path / "out"
     assert run_command("paper", ["--out", str(out), "--plant", "gibbs_appell", "--draws", "0"]) == 0

@@ -49,6 +49,7 @@ def records(pairs):
     return {model: {name: select(own, np.array([0])) for name, own in tests.items()} for model, tests in pairs.items()}
 
 
+@pytest.mark.slow
 def test_models_agree_within_the_bounds_of_the_plants(records):
     """2 % of the travel, 2 degrees of yaw, 5 % of the torques (docs/cross_plant.md); in fact ten times better."""
     for model, tests in report.agreement(records).items():

@@ -321,6 +321,9 @@ def _improvement(analysis: Analysis) -> str:
     share, one = analysis.gap.reduction, len(analysis.added) == 1
     if not math.isfinite(share):
         return "; the error of the held-out runs is as small without it"
+    if share < 0.0 <= analysis.gap.reduction_ci95[1]:
+        does = "it does" if one else "they do"
+        return f"; added, {does} not measurably change the error of the held-out runs: {removed(analysis)}"
     if share < 0.0:
         does = "makes" if one else "make"
         return f"; added, {'it' if one else 'they'} {does} the error of the held-out runs larger: {removed(analysis)}"
