@@ -108,8 +108,8 @@ def test_an_interrupted_contender_begins_anew(tmp_path, answers):
         decide_study._work(task, lambda message: None)
     answers[:] = [result("payload")]
     decide_study._work(task, lambda message: None)
-    line = json.loads((tmp_path / "lines" / "case_9100_random.json").read_text())
-    assert len(line["runs"]) == 3 == len(list((tmp_path / "work" / "case_9100_random" / "runs").glob("run_*.parquet")))
+    line = json.loads((tmp_path / "lines" / "case_9200_random.json").read_text())
+    assert len(line["runs"]) == 3 == len(list((tmp_path / "work" / "case_9200_random" / "runs").glob("run_*.parquet")))
 
 
 def test_a_name_that_is_found_twice_is_one_name(tmp_path, answers):
@@ -148,15 +148,16 @@ def quiet(text):
 def test_a_study_goes_on_where_it_was(tmp_path, jobs):
     run_decide_study(tmp_path, 1, ("chosen",), say=quiet)
     lines = run_decide_study(tmp_path, 1, ("chosen", "eight"), say=quiet)
-    assert jobs["done"] == ["case_9100_chosen", "case_9100_eight"]
+    assert jobs["done"] == ["case_9200_chosen", "case_9200_eight"]
     text = markdown(lines)
     assert "| the run that distinguishes best, per second | 1/1 (at least 5%) | 0 (at most 95%) | 0 | 50 s | 0/0 | 0 |" in text
-    assert f"| {cases(1)[0].hidden[0]} | yes | right, decided, 50 s | right, decided, 50 s |" in text
+    (one,) = cases(1)
+    assert f"| {one.hidden[0]} | {'yes' if one.camera else 'no'} | right, decided, 50 s | right, decided, 50 s |" in text
     assert len(run_decide_study(tmp_path, 1, ("eight",), say=quiet)) == 1  # only what is asked
 
 
 def test_a_contender_that_fails_is_counted_and_tried_again(tmp_path, jobs):
-    jobs["failing"] = ("case_9100_chosen",)
+    jobs["failing"] = ("case_9200_chosen",)
     said = []
     lines = run_decide_study(tmp_path, 1, ("chosen",), say=said.append)
     assert "failed, killed" in said[0]

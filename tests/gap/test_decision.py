@@ -115,22 +115,23 @@ def test_later_rounds_build_on_what_was_found():
 
 
 def test_what_calibration_takes_up_does_not_tell():
-    predicted = np.array([[3.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
     columns = np.array([[2.0, 0.0]])
-    found = next_run._differences(predicted, columns)
-    assert found[0, 1] == pytest.approx(9.0 / (1.0 + 4.0))  # a number of unit variance leaves d^2 / (1 + c^2)
-    assert found[1, 2] == pytest.approx(4.0)
-    assert np.allclose(found, found.T)
+    # a number of unit variance leaves d^2 / (1 + c^2)
+    assert next_run._told(np.array([3.0, 0.0]), columns) == pytest.approx(9.0 / (1.0 + 4.0))
+    assert next_run._told(np.array([0.0, 2.0]), columns) == pytest.approx(4.0)
+    assert next_run._told(np.array([0.0, 2.0]), columns[:0]) == pytest.approx(4.0)
 
 
 @pytest.mark.slow
-def test_a_motion_that_loads_what_is_in_question_promises_more():
+def test_a_motion_that_loads_what_is_in_question_promises_more(data):
+    driven = [read_run(path) for path in sorted(data.glob("run_*.parquet"))]
     both = [candidate("coulomb_friction", 0.5, "selected"), candidate("viscous_friction", 0.5, "equivalent")]
     found = result("effect_found", (0.0, both))
     drive = excite("straight", robot=ROBOT, seconds=3.0)
     stand = decision.Motion("stand", np.repeat(drive.setpoints[:1], 150, axis=0), drive.period)
-    (promised,) = next_run.promises(found, explanations(found), [stand, drive], ROBOT)  # standing cannot promise more
-    (alone,) = next_run.promises(found, explanations(found), [stand], ROBOT)
+    # standing cannot promise more
+    (promised,) = next_run.promises(found, explanations(found), [stand, drive], ROBOT, driven)
+    (alone,) = next_run.promises(found, explanations(found), [stand], ROBOT, driven)
     assert (promised.motion.name, alone.motion.name) == ("straight", "stand")
     assert promised.most > next_run.TELLS > alone.most
     assert {"coulomb_friction", "viscous_friction"} & set(promised.pair)
@@ -147,18 +148,19 @@ def test_a_motion_that_loads_what_is_in_question_promises_more():
 def test_motions_that_cannot_promise_more_are_not_worked_out(data, monkeypatch, bounds, whole, worked_out, best):
     monkeypatch.setattr(next_run, "record_simulation", lambda path, motion, *_: data / "run_01.parquet")
     monkeypatch.setattr(next_run, "RobotProblem", lambda *_, **__: None)
+    monkeypatch.setattr(next_run, "_own_uncertainty", lambda *_: [])
     done = []
 
-    def promise(problem, found, left, motion, calibrated=True):
-        if calibrated:
+    def promise(problem, found, left, motion, free=None):
+        if free is not None:
             done.append(motion.name)
-        per_second, most = (whole if calibrated else bounds)[motion.name]
+        per_second, most = (bounds if free is None else whole)[motion.name]
         return next_run.Promise(motion, per_second * motion.duration, most, ("x", "y"))
 
     monkeypatch.setattr(next_run, "_promise", promise)
     drive = excite("straight", robot=ROBOT, seconds=1.0)
     motions = [decision.Motion(name, drive.setpoints, drive.period) for name in bounds]
-    found = next_run.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, ROBOT)
+    found = next_run.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, ROBOT, [])
     assert (done, found[0].motion.name) == (worked_out, best)
 
 
@@ -209,7 +211,7 @@ def answers(monkeypatch):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "result.json").write_text(given["results"].pop(0).model_dump_json())
 
-    def promises(found, left, motions, robot, **options):
+    def promises(found, left, motions, robot, runs, **options):
         names = (left[0].name, left[1].name)
         return [
             next_run.Promise(motion, given["telling"], given["telling"], names) for motion in motions if motion.name == "turns"
@@ -251,6 +253,28 @@ def test_a_name_that_leaves_far_more_than_simulators_do_is_not_decided(data, tmp
     found = decide(data, tmp_path / "out", record)
     assert (found.history.ended, len(found.history.driven)) == ("decided", 2)
     assert found.history.rounds[1].why == "an error of 5.0 noise floors is left, more than 3.5; shows most effects best"
+
+
+def test_a_name_that_no_motion_tells_from_an_equivalent_one_is_decided_where_it_has_95_percent(data, tmp_path, answers):
+    names = [candidate("coulomb_friction", 0.97, "selected"), candidate("viscous_friction", 0.03, "equivalent")]
+    found = result("effect_found", (0.0, names))
+    effect = {"name": "coulomb_friction", "where": ["wheel_lf"], "parameters": {}, "confidence": 1.0, "gain": 99.0}
+    answers.update(results=[Result.model_validate(found.model_dump() | {"effects": [effect]})], telling=1.0)
+    history = decide(data, tmp_path / "out", record).history
+    assert (history.ended, list(history.rounds[-1].names)) == ("decided", ["coulomb_friction", "viscous_friction"])
+
+
+def test_that_nothing_is_missing_takes_six_runs(data, tmp_path, answers):
+    nothing = result("nothing_missing", (1.0, []))
+    answers["results"] = [nothing] * 4
+    history = decide(data, tmp_path / "out", record).history
+    assert (history.ended, len(history.rounds[-1].runs)) == ("decided", 6)
+    assert history.rounds[1].why.startswith("6 runs or more tell that nothing is missing; ")
+    assert len(set(history.driven)) == 4
+    answers["results"] = [nothing]
+    (tmp_path / "few").mkdir()
+    few = decide(data, tmp_path / "few" / "out", record, Budget(runs=0)).history
+    assert few.ended == "decided"  # the six are there
 
 
 def test_motions_that_take_longer_than_what_is_left_are_not_driven(data, tmp_path, answers):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from wlr_gym.data.read import read_meta, read_run, run_files
 from wlr_gym.data.replay import robot_of
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
 from wlr_gym.gap.report.entries import Result
-from wlr_gym.gap.report.explanations import Explanation, explanations
+from wlr_gym.gap.report.explanations import DECIDED, NOTHING, Explanation, explanations
 from wlr_gym.gap.report.result import RESULT_FILE, read_result
 from wlr_gym.gap.robot.next_run import TELLS, driven_already, most_shown, motions_to_drive, promises
 from wlr_gym.gap.robot.open import LEAST_RUNS
@@ -27,11 +27,14 @@ from wlr_gym.gap.workflow import Tell, analyse
 from wlr_gym.physics.effects import Patch, Source, load_patch
 
 HISTORY_FILE = "history.json"
+#: "Nothing is missing" is decided from so many runs on: fewer may not show what is.
+RUNS_FOR_NOTHING = 6
 #: Instead of a verdict: no analysis yet.
 TOO_FEW_RUNS = "too_few_runs"
 
-#: Why it ended. ``decided``: one name has 95 %, none is equivalent to it, and what it leaves is no more than simulators leave;
-#: ``nothing would tell``: no motion promises to distinguish what is left; ``budget``: runs or seconds are used up;
+#: Why it ended. ``decided``: one name has 95 %, none is equivalent to it, or none that any motion promises to tell from it, and
+#: what it leaves is no more than simulators leave; ``nothing would tell``: no motion promises to distinguish what is left, none
+#: of which has 95 %; ``budget``: runs or seconds are used up;
 #: ``stopped``: a drive recorded nothing. Empty: it goes on.
 Ending = Literal["", "decided", "nothing would tell", "budget", "stopped"]
 
@@ -243,29 +246,42 @@ def _choice(
 ) -> tuple[Ending, _Next | None]:
     """Return what to drive next; or None and why it ends."""
     misfit = _misfit(result)
-    if len(left) == 1 and now.verdict not in (NOT_EXCITED, BAD_DATA) and misfit <= MISFIT:
+    nothing = result is not None and not result.effects and any(one.name == NOTHING for one in left[:1])
+    too_few = nothing and len(now.runs) < RUNS_FOR_NOTHING
+    answered = now.verdict not in (NOT_EXCITED, BAD_DATA) and misfit <= MISFIT and not too_few
+    if len(left) == 1 and answered:
         return "decided", None
     if len(history.driven) >= asked.budget.runs:
         return "budget", None
-    before = [read_run(path) for path in run_files(asked.data) if path.stem not in {one.run for one in history.rounds}]
-    own = robot_of(read_run(run_files(asked.data)[0]), asked.robot)
+    runs = {path.stem: read_run(path) for path in run_files(asked.data)}
+    before = [run for name, run in runs.items() if name not in {one.run for one in history.rounds}]
+    own = robot_of(next(iter(runs.values())), asked.robot)
     driven = [*driven_already(before, own), *history.driven]
     seconds = asked.budget.seconds - history.seconds
     motions = motions_to_drive(own, read_meta(asked.data).profile, driven)
     motions = [motion for motion in motions if motion.duration <= seconds]
     if not motions:
         return "budget", None
+    shows_most = _shows_most(result, motions, driven)
+    if too_few:
+        shows_most = replace(shows_most, why=f"{RUNS_FOR_NOTHING} runs or more tell that nothing is missing; {shows_most.why}")
+    elif misfit > MISFIT:
+        shows_most = replace(
+            shows_most, why=f"an error of {misfit:.1f} noise floors is left, more than {MISFIT:g}; {shows_most.why}"
+        )
     if result is None or len(left) < 2:
-        shows_most = _shows_most(result, motions, driven)
-        too_far = f"an error of {misfit:.1f} noise floors is left, more than {MISFIT:g}; "
-        return "", _Next(shows_most.motion, (too_far if misfit > MISFIT else "") + shows_most.why)
+        return "", shows_most
     asked.tell("choosing the next run", 1.0)
-    found = promises(result, left, motions, own, known=asked.known, backend=asked.backend, threads=asked.threads)
-    if max(one.most for one in found) < TELLS:
-        return "nothing would tell", None
-    best = found[0]
-    names = " and ".join(best.pair)
-    return "", _Next(best.motion, f"promises {best.telling / best.motion.duration:.2g} per s, {best.most:.0f} between {names}")
+    there = [runs[name] for name in now.runs]
+    found = promises(result, left, motions, own, there, known=asked.known, backend=asked.backend, threads=asked.threads)
+    if max(one.most for one in found) >= TELLS:
+        best = found[0]
+        between = f"{best.most:.0f} between {' and '.join(best.pair)}"
+        return "", _Next(best.motion, f"promises {best.telling / best.motion.duration:.2g} per s, {between}")
+    if too_few:
+        return "", shows_most
+    is_named = nothing or left[0].name in [effect.name for effect in result.effects]
+    return "decided" if is_named and answered and left[0].probability >= DECIDED else "nothing would tell", None
 
 
 def _misfit(result: Result | None) -> float:

@@ -1,9 +1,13 @@
 """Which motion to drive next: the one that distinguishes best, per second of driving, what may still be missing.
 
 Every explanation in play is replayed in every motion, and so is the model with each of its numbers moved. What two
-explanations predict differently, less what calibrated numbers can take up within their uncertainty, is what a run of that
-motion would add to the difference of their minus two log evidence, to first order; levels and autocorrelation times are those
-that the last analysis found. The mean over all pairs is weighted by the probabilities of both (Box and Hill, 1967).
+explanations predict differently, less what calibrated numbers and their own can take up within their uncertainty, is what a
+run of that motion would add to the difference of their minus two log evidence, to first order; levels and autocorrelation
+times are those that the last analysis found. The mean over all pairs is weighted by the probabilities of both (Box and Hill,
+1967).
+
+An explanation's own numbers are as uncertain as the runs that are there leave them: a law that becomes another one at the
+edge of a number (Stribeck friction with a large speed is Coulomb friction) cannot be told from it by any run.
 """
 
 from __future__ import annotations
@@ -24,10 +28,10 @@ from wlr_gym.data.read import Run, read_run
 from wlr_gym.data.record import motion_of, record_simulation
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.entries import AdequacyEntry, Result
-from wlr_gym.gap.report.explanations import Explanation
+from wlr_gym.gap.report.explanations import NOTHING, Explanation
 from wlr_gym.gap.robot.candidates import shown_by
 from wlr_gym.gap.robot.problem import RobotProblem
-from wlr_gym.physics.effects import Source
+from wlr_gym.physics.effects import PatchEffect, Source
 from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
@@ -38,6 +42,9 @@ LEAST_WEIGHT = 1e-6
 TELLS = 2.0 * math.log(19.0)
 #: Half of a 95 % interval, in standard deviations.
 _HALF_95 = 1.96
+#: Change of an explanation's own number, relative, for finite differences: large, for friction that sticks and slips answers small
+#: ones by chance. Before any run the number is unknown by its whole value.
+STEP = 0.2
 #: Share of rows in which a run of an excitation has its setpoints.
 ALIKE = 0.9
 
@@ -101,6 +108,7 @@ def promises(
     explanations: Sequence[Explanation],
     motions: Sequence[Motion],
     robot: Robot,
+    runs: Sequence[Run],
     *,
     known: Source = None,
     backend: str = "gibbs_appell",
@@ -108,57 +116,96 @@ def promises(
 ) -> list[Promise]:
     """Return what motions promise, most per second first; the first is the best of all.
 
-    What calibrated numbers take up costs most to know, and only lowers a promise: motions that promise less even without it,
-    and would tell no more, are left out.
+    What numbers take up costs most to know, and only lowers a promise: motions that promise less even without it, and would
+    tell no more, are left out.
 
     Args:
         result: of the last analysis: its calibration, and what its model leaves.
         explanations: in play, two or more.
         motions: to choose from.
-        robot, known, backend, threads: of the analysis.
+        robot, runs, known, backend, threads: of the analysis.
     """
+    there = RobotProblem(runs, robot, known, backend, threads=threads)
+    free = _own_uncertainty(there, result, explanations)
     with tempfile.TemporaryDirectory() as folder:
         bounds = []
         for motion in motions:
             path = record_simulation(Path(folder) / f"run_{motion.name}.parquet", motion, robot, "gibbs_appell")
             problem = RobotProblem([read_run(path)], robot, known, backend, threads=threads)
-            bounds.append((_promise(problem, result, explanations, motion, calibrated=False), problem))
+            bounds.append((_promise(problem, result, explanations, motion), problem))
         found: list[Promise] = []
         for bound, problem in sorted(bounds, key=lambda pair: -pair[0].per_second):
             best = max((one.per_second for one in found), default=-math.inf)
             tells = max((one.most for one in found), default=0.0) >= TELLS
             if bound.per_second > best or (bound.most >= TELLS and not tells):
-                found.append(_promise(problem, result, explanations, bound.motion))
+                found.append(_promise(problem, result, explanations, bound.motion, free))
     return sorted(found, key=lambda one: -one.per_second)
 
 
 def _promise(
-    problem: RobotProblem, result: Result, explanations: Sequence[Explanation], motion: Motion, calibrated: bool = True
+    problem: RobotProblem,
+    result: Result,
+    explanations: Sequence[Explanation],
+    motion: Motion,
+    free: Sequence[Array] | None = None,
 ) -> Promise:
-    """What a motion promises; not ``calibrated``: if calibrated numbers took up nothing, which is at least as much."""
+    """What a motion promises; ``free``: see :func:`_own_uncertainty`; None: if no number took up anything, the most it can."""
     values, deviations = _calibrated(problem, result)
-    steps = np.diag(_inside(problem, values, deviations)) if calibrated else []
-    moved = [Setting(values + step) for step in steps]
-    settings = [*(Setting(values, one.effects) for one in explanations), Setting(values), *moved]
-    (residuals,) = problem.residuals(settings, [0])
-    rows = np.nan_to_num(residuals) * np.sqrt(_weights(problem, result))
-    rows = rows.reshape(len(settings), -1)
+    moved = [] if free is None else [values + step for step in np.diag(_inside(problem, values, deviations))]
+    settings = [*(Setting(values, one.effects) for one in explanations), Setting(values), *map(Setting, moved)]
+    rows = _rows(problem, result, settings)
     predicted, bare, columns = rows[: len(explanations)], rows[len(explanations)], rows[len(explanations) + 1 :]
-    differ = _differences(predicted, columns - bare)
+    own = [columns[:0]] * len(explanations)
+    if free is not None:
+        own = [share @ slopes for share, slopes in zip(free, _own_columns(problem, result, explanations), strict=True)]
     weights = np.maximum([one.probability for one in explanations], LEAST_WEIGHT)
     pairs = list(itertools.combinations(range(len(explanations)), 2))
     shares = np.array([weights[i] * weights[j] for i, j in pairs])
-    told = np.array([differ[i, j] for i, j in pairs])
+    told = np.array([_told(predicted[i] - predicted[j], np.vstack([columns - bare, own[i], own[j]])) for i, j in pairs])
     best = tuple(explanations[k].name for k in pairs[int(np.argmax(told))])
     return Promise(motion, float(shares @ told / shares.sum()), float(told.max()), (best[0], best[1]))
 
 
-def _differences(predicted: Array, columns: Array) -> Array:
-    """Squared distances (explanations, explanations) of weighted predictions, less what numbers of unit variance take up."""
-    small = np.linalg.inv(np.eye(len(columns)) + columns @ columns.T)
-    away = predicted @ predicted.T - (predicted @ columns.T) @ small @ (columns @ predicted.T)
-    own = np.diag(away)
-    return np.maximum(own[:, None] + own[None, :] - away - away.T, 0.0)
+def _told(difference: Array, columns: Array) -> float:
+    """Square of a weighted difference (rows), less what numbers of unit variance, whose columns are given, take up."""
+    across = columns @ difference
+    return max(
+        float(difference @ difference - across @ np.linalg.solve(np.eye(len(columns)) + columns @ columns.T, across)), 0.0
+    )
+
+
+def _own_uncertainty(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
+    """How explanations' own numbers may still move, each (numbers, numbers): rows are independent, of unit variance."""
+    columns = _own_columns(problem, result, explanations)
+    return [np.linalg.inv(np.linalg.cholesky(np.eye(len(own)) + own @ own.T)) for own in columns]
+
+
+def _own_columns(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
+    """Change of the weighted predictions per relative change of explanations' own numbers, each (numbers, rows)."""
+    values, _ = _calibrated(problem, result)
+    moved = [_own_moved(one) for one in explanations]
+    settings = [
+        Setting(values, effects) for one, own in zip(explanations, moved, strict=True) for effects in (one.effects, *own)
+    ]
+    parts = np.split(_rows(problem, result, settings), np.cumsum([1 + len(own) for own in moved])[:-1])
+    return [(part[1:] - part[0]) / STEP for part in parts]
+
+
+def _own_moved(one: Explanation) -> list[tuple[PatchEffect, ...]]:
+    """The effects of an explanation with each of its own numbers moved by :data:`STEP`."""
+    if one.name == NOTHING:
+        return []
+    *before, own = one.effects
+    numbers = [name for name, value in own.parameters.items() if value]
+    moved = [{**own.parameters, name: own.parameters[name] * (1.0 + STEP)} for name in numbers]
+    return [(*before, replace(own, parameters=parameters)) for parameters in moved]
+
+
+def _rows(problem: RobotProblem, result: Result, settings: Sequence[Setting]) -> Array:
+    """Weighted predictions (settings, rows of all runs and channels)."""
+    root = np.sqrt(_weights(problem, result))
+    runs = problem.residuals(settings, range(len(problem.runs)))
+    return np.concatenate([(np.nan_to_num(one) * root).reshape(len(settings), -1) for one in runs], axis=1)
 
 
 def _calibrated(problem: RobotProblem, result: Result) -> tuple[Array, Array]:
