@@ -259,7 +259,7 @@ def test_a_name_that_no_motion_tells_from_an_equivalent_one_is_decided_where_it_
     names = [candidate("coulomb_friction", 0.97, "selected"), candidate("viscous_friction", 0.03, "equivalent")]
     found = result("effect_found", (0.0, names))
     effect = {"name": "coulomb_friction", "where": ["wheel_lf"], "parameters": {}, "confidence": 1.0, "gain": 99.0}
-    answers.update(results=[Result.model_validate(found.model_dump() | {"effects": [effect]})], telling=1.0)
+    answers.update(results=[Result.model_validate(found.model_dump() | {"effects": [effect]})], telling=1.5 * next_run.TELLS)
     history = decide(data, tmp_path / "out", record).history
     assert (history.ended, list(history.rounds[-1].names)) == ("decided", ["coulomb_friction", "viscous_friction"])
 

@@ -29,6 +29,8 @@ from wlr_gym.physics.effects import Patch, Source, load_patch
 HISTORY_FILE = "history.json"
 #: "Nothing is missing" is decided from so many runs on: fewer may not show what is.
 RUNS_FOR_NOTHING = 6
+#: Expected difference of minus two log evidence that takes 95 % for one name to 95 % for another.
+TELLS_OTHERWISE = 2.0 * TELLS
 #: Instead of a verdict: no analysis yet.
 TOO_FEW_RUNS = "too_few_runs"
 
@@ -245,10 +247,8 @@ def _choice(
     asked: _Asked, history: History, now: DecisionRound, result: Result | None, left: Sequence[Explanation]
 ) -> tuple[Ending, _Next | None]:
     """Return what to drive next; or None and why it ends."""
-    misfit = _misfit(result)
-    nothing = result is not None and not result.effects and any(one.name == NOTHING for one in left[:1])
-    too_few = nothing and len(now.runs) < RUNS_FOR_NOTHING
-    answered = now.verdict not in (NOT_EXCITED, BAD_DATA) and misfit <= MISFIT and not too_few
+    doubt = _doubt(now, result, left)
+    answered = now.verdict not in (NOT_EXCITED, BAD_DATA) and not doubt
     if len(left) == 1 and answered:
         return "decided", None
     if len(history.driven) >= asked.budget.runs:
@@ -263,31 +263,32 @@ def _choice(
     if not motions:
         return "budget", None
     shows_most = _shows_most(result, motions, driven)
-    if too_few:
-        shows_most = replace(shows_most, why=f"{RUNS_FOR_NOTHING} runs or more tell that nothing is missing; {shows_most.why}")
-    elif misfit > MISFIT:
-        shows_most = replace(
-            shows_most, why=f"an error of {misfit:.1f} noise floors is left, more than {MISFIT:g}; {shows_most.why}"
-        )
+    shows_most = replace(shows_most, why=doubt + shows_most.why)
     if result is None or len(left) < 2:
         return "", shows_most
     asked.tell("choosing the next run", 1.0)
     there = [runs[name] for name in now.runs]
     found = promises(result, left, motions, own, there, known=asked.known, backend=asked.backend, threads=asked.threads)
-    if max(one.most for one in found) >= TELLS:
+    sure = left[0].probability >= DECIDED and left[0].name in {NOTHING, *(effect.name for effect in result.effects)}
+    if max(one.most for one in found) >= (TELLS_OTHERWISE if sure else TELLS):
         best = found[0]
         between = f"{best.most:.0f} between {' and '.join(best.pair)}"
         return "", _Next(best.motion, f"promises {best.telling / best.motion.duration:.2g} per s, {between}")
-    if too_few:
+    if doubt:
         return "", shows_most
-    is_named = nothing or left[0].name in [effect.name for effect in result.effects]
-    return "decided" if is_named and answered and left[0].probability >= DECIDED else "nothing would tell", None
+    return "decided" if sure and answered else "nothing would tell", None
 
 
-def _misfit(result: Result | None) -> float:
-    """Error of the fitted runs in noise floors: where it is large, a name may be the best of wrong ones."""
-    gap = result.gap if result is not None else None
-    return 0.0 if gap is None else (gap.fit_after or 0.0) / (gap.noise_floor or math.inf)
+def _doubt(now: DecisionRound, result: Result | None, left: Sequence[Explanation]) -> str:
+    """Why the runs do not carry an answer yet, whatever it is; empty: they do."""
+    if result is None:
+        return ""
+    nothing = not result.effects and any(one.name == NOTHING for one in left[:1])
+    if nothing and len(now.runs) < RUNS_FOR_NOTHING:
+        return f"{RUNS_FOR_NOTHING} runs or more tell that nothing is missing; "
+    misfit = 0.0 if result.gap is None else (result.gap.fit_after or 0.0) / (result.gap.noise_floor or math.inf)
+    # where the error is large, a name may be the best of wrong ones
+    return f"an error of {misfit:.1f} noise floors is left, more than {MISFIT:g}; " if misfit > MISFIT else ""
 
 
 def _shows_most(result: Result | None, motions: Sequence[Motion], driven: Sequence[str]) -> _Next:

@@ -42,8 +42,8 @@ LEAST_WEIGHT = 1e-6
 TELLS = 2.0 * math.log(19.0)
 #: Half of a 95 % interval, in standard deviations.
 _HALF_95 = 1.96
-#: Change of an explanation's own number, relative, for finite differences: large, for friction that sticks and slips answers small
-#: ones by chance. Before any run the number is unknown by its whole value.
+#: Relative change of an explanation's own number for finite differences: large, for friction that sticks and slips answers
+#: small ones by chance. Before any run the number is unknown by its whole value.
 STEP = 0.2
 #: Share of rows in which a run of an excitation has its setpoints.
 ALIKE = 0.9
