@@ -605,6 +605,13 @@ def test_sensors_that_say_nothing_leave_finite_residuals(good):
     assert others.max() < 3.0
 
 
+def test_motions_that_show_a_camera_are_for_robots_with_one(good):
+    blind = replace(good, table=good.table.drop(columns=[name for name in good.table if name.startswith("cam_")]))
+    named = {name for name in RobotProblem([good]).motions if name.startswith("camera_")}
+    assert named
+    assert set(RobotProblem([good]).motions) - set(RobotProblem([blind]).motions) == named
+
+
 def test_where_no_camera_saw_it_a_window_starts_from_the_simulation(good):
     """The last frame half a second away tells nothing of a heading: a parabola through noise would."""
     table = good.table.copy()

@@ -86,7 +86,9 @@ class RobotProblem:
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
         self.cap, self.steps, self.tempering = CAP, STEPS, TEMPERING
         self.disagreement, self.misfit = DISAGREEMENT, MISFIT
-        self.thorough, self.held_out, self.motions = False, (), shown_by()
+        self.thorough, self.held_out = False, ()
+        seen = any("cam_x" in run for run in runs)
+        self.motions = {name: motion for name, motion in shown_by().items() if seen or not name.startswith("camera_")}
         self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
             wheel: (f"joint_position[{wheel}]", (*(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff")), *ROCKING))
             for wheel in WHEELS
