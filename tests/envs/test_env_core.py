@@ -20,8 +20,9 @@ from wlr_gym.envs.tasks.compiled_terms import (
     reader,
 )
 from wlr_gym.envs.tasks.describe import column_name
-from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, MEASURES, REWARDS, TERMINATIONS, ScalarTerm
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
+from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 
 ID = "WLR-Velocity-v0"
@@ -69,7 +70,9 @@ def test_bad_actions_name_robot_and_joint_and_never_reach_the_plant(fake, value,
     assert np.array_equal(env.core.episodes.steps, ticks)
 
 
-@pytest.mark.parametrize("action", [np.zeros(7), np.zeros((1, 8)), 0.5, np.zeros((2, 8)), "forward", None, [None] * 8])
+@pytest.mark.parametrize(
+    "action", [np.zeros(7), np.zeros((1, 8)), 0.5, np.zeros((2, 8)), "forward", None, [None] * 8, ["0.5"] * 8, [True] * 8]
+)
 def test_actions_of_wrong_shape_or_type(fake, action):
     env = make()
     env.reset(seed=0)
@@ -265,6 +268,23 @@ def test_command_can_be_fixed_for_an_episode_and_live(fake):
         env.set_command(yaw_rat=0.3)
     with pytest.raises(InputError, match="finite"):
         env.reset(options={"command": {"yaw_rate": np.nan}})
+
+
+def test_commands_that_are_not_given_are_drawn_as_before(fake):
+    changes = {"task": {"commands": {"hold_time": [0.1, 0.1], "ramp": None, "zero_probability": 0.0}}, "randomization": "none"}
+    free, env = make(**changes), make(**changes)
+    free.reset(seed=0)
+    env.reset(seed=0, options={"command": {"linear_velocity_x": 0.07}})
+    seen = []
+    for _ in range(30):
+        assert env.core.command[0].tolist() == [0.07, free.core.command[0, 1]]
+        seen.append(env.core.command[0, 1])
+        for each in (free, env):
+            each.step(np.zeros(8, np.float32))
+    assert len(set(seen)) == 6
+    env.reset(seed=0)
+    free.reset(seed=0)
+    assert env.core.command.tolist() == free.core.command.tolist()
 
 
 # ---- rewards and terminations ----
@@ -466,7 +486,24 @@ def test_a_plant_that_leaves_the_finite_numbers_is_reported(fake):
         plant.truth()["linear_velocity_in_body"][:, 0] = np.nan
 
     plant._publish = broken
-    with pytest.raises(FloatingPointError, match="robot 0"):
+    with pytest.raises(FloatingPointError, match="robot 0 of the batch left the finite numbers"):
+        env.step(np.zeros(8, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("registry", "kind", "task"),
+    [
+        (REWARDS, "reward", {"rewards": {"broken": {"weight": 1.0}}}),
+        (MEASURES, "measure", {"measures": {"broken": {}}}),
+        (TERMINATIONS, "termination", {"terminations": {"broken": {}}}),
+    ],
+)
+def test_a_term_that_leaves_the_finite_numbers_is_named(fake, monkeypatch, registry, kind, task):
+    term = ScalarTerm("broken", lambda signals: ops.sqrt(-1.0 - signals.time), {}, {}, "No number.")
+    monkeypatch.setitem(registry, "broken", term)
+    env = make(task=task)
+    env.reset(seed=0)
+    with pytest.raises(FloatingPointError, match=f"^{kind} 'broken': not finite for robot 0 of the batch"):
         env.step(np.zeros(8, np.float32))
 
 
@@ -485,6 +522,11 @@ def test_reset_options_set_parameters_after_randomisation(fake):
     for options, expected in (
         ({"parameters": {"ground.mux": 1.0}}, "did you mean 'ground.mu_x'"),
         ({"parameters": {"ground.mu_x": -1.0}}, r"outside \[0, 5\]"),
+        (
+            {"parameters": {"ground.mu_x": "a"}},
+            r"parameters: ground.mu_x = 'a': expected a number, or an array of shape \(4,\)",
+        ),
+        ({"parameters": {"ground.mu_x": [[1.0], [1.0, 2.0]]}}, "expected a number, or an array"),
         ({"comand": {}}, "did you mean 'command'"),
     ):
         with pytest.raises(InputError, match=expected):
@@ -568,6 +610,14 @@ def test_every_episode_of_a_robot_is_another_one_and_all_repeat_with_the_seed(fa
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     assert len({tuple(observation.tolist()) for observation in first}) == 4
     assert not np.array_equal(env.reset(seed=6)[0], first[0])
+
+
+def test_unseeded_batches_differ_and_tell_their_seed(fake):
+    one, two = make_vec(3), make_vec(3)
+    observations, _ = one.reset()
+    assert not np.array_equal(observations, two.reset()[0])
+    assert len({tuple(row) for row in observations.tolist()}) == 3
+    assert np.array_equal(make_vec(3).reset(seed=one.np_random_seed)[0], observations)
 
 
 def test_unseeded_environments_differ_and_tell_their_seed(fake):

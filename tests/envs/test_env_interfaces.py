@@ -240,6 +240,7 @@ def test_a_render_mode_that_does_not_exist(fake):
         ({"num_envs": 0}, "num_envs = 0"),
         ({"num_envs": 2, "autoreset_mode": "NextStp"}, "did you mean 'NextStep'"),
         ({"num_envs": 2, "max_episode_steps": 0}, "max_episode_steps = 0"),
+        ({"num_envs": 2, "max_episode_steps": True}, "max_episode_steps = True"),
     ],
 )
 def test_bad_vector_keywords(fake, keywords, expected):

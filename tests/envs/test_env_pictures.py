@@ -137,6 +137,12 @@ def test_bad_view(fake):
         gym.make(ID, view={"camera": "chse"})
     with pytest.raises(InputError, match="view = 3: expected a mapping"):
         gym.make(ID, view=3)
+    with pytest.raises(InputError, match="view: path = True: only films show a path"):
+        gym.make(ID, view={"path": True})
+
+
+def test_sizes_may_be_numpy_integers(fake):
+    assert gym.make(ID, view={"size": (np.int64(320), 240)}).unwrapped.core.settings.picture_view.size == (320, 240)  # type: ignore[attr-defined]
 
 
 def test_stable_baselines(fake, graphics):

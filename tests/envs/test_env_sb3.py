@@ -125,6 +125,19 @@ def test_an_id_may_name_its_module(fake):
     assert (spec.id, spec.max_episode_steps) == (ID, 50)
 
 
+def test_a_spec_brings_its_render_mode_and_limit(fake):
+    spec = gym.make(ID, render_mode="rgb_array", max_episode_steps=100).spec
+    assert spec is not None
+    env = Sb3VecEnv(spec, 2)
+    assert (env.render_mode, env.core.limit) == ("rgb_array", 100)
+    copy = pickle.loads(pickle.dumps(env))
+    assert (copy.render_mode, copy.core.limit) == ("rgb_array", 100)
+    assert Sb3VecEnv(spec, 2, max_episode_steps=7).core.limit == 7
+    assert Sb3VecEnv(spec, 2, episode_length=60.0, max_episode_steps=-1).core.limit == 3000
+    with pytest.raises(InputError, match="max_episode_steps = 0: expected a whole number of 1 or more, or -1"):
+        Sb3VecEnv(spec, 2, max_episode_steps=0)
+
+
 def test_step_before_reset(fake):
     with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
         Sb3VecEnv(ID, 2, seed=0).step(np.zeros((2, 8), np.float32))

@@ -110,16 +110,36 @@ def test_estimates_are_as_old_as_the_joint_readings():
 
 
 @pytest.mark.parametrize(
-    ("env_id", "command", "least"),
+    ("env_id", "command", "expected"),
     [
-        ("WLR-Path-v0", {"path_wavelength": 0.0}, "0.1 m"),
-        ("WLR-Posture-v0", {"leg_rate": -0.3}, "0 rad/s"),
-        ("WLR-Slope-v0", {"climb_speed": -0.05}, "0 m/s"),
+        ("WLR-Path-v0", {"path_wavelength": 0.0}, "0.1 m or more"),
+        ("WLR-Path-v0", {"path_shape": -7}, "0 to 3"),
+        ("WLR-Path-v0", {"path_curvature": 1e6}, "-20 to 20 1/m"),
+        ("WLR-Posture-v0", {"leg_rate": -0.3}, "0 to 5.55 rad/s"),
+        ("WLR-Posture-v0", {"front_leg_first": 9}, "0.35 to 2.79 rad"),
+        ("WLR-Slope-v0", {"climb_speed": -0.05}, "0 to 0.217 m/s"),
+        ("WLR-Velocity-v0", {"linear_velocity_x": 5.0}, "-0.217 to 0.217 m/s"),
+        ("WLR-Velocity-v0", {"yaw_rate": -5.0}, "-1.36 to 1.36 rad/s"),
     ],
 )
-def test_commands_that_mean_nothing_are_refused(env_id, command, least):
-    with pytest.raises(InputError, match=f"command {next(iter(command))} = .*: expected {least} or more"):
-        make(env_id).reset(seed=0, options={"command": command})
+def test_commands_that_mean_nothing_or_that_no_robot_follows_are_refused(env_id, command, expected):
+    env = make(env_id)
+    text = f"command {next(iter(command))} = .*: expected {expected}$"
+    with pytest.raises(InputError, match=text):
+        env.reset(seed=0, options={"command": command})
+    with pytest.raises(InputError, match=text):
+        env.set_command(**command)
+
+
+def test_commands_beyond_those_of_the_task_are_not_refused():
+    env = make("WLR-Velocity-v0")
+    env.reset(seed=0, options={"command": {"linear_velocity_x": -0.21, "yaw_rate": 1.3}})
+    assert env.core.command.tolist() == [[-0.21, 1.3]]
+
+
+def test_commands_of_a_task_mean_something():
+    with pytest.raises(InputError, match=r"commands.terms.path_shape = \[0.0, 9.0\]: expected 0 to 3$"):
+        make("WLR-Path-v0", task={"commands": {"terms": {"path_shape": [0.0, 9.0]}}})
 
 
 def test_observer_follows_what_the_sensors_read():
@@ -268,7 +288,7 @@ def test_progress_narrows_what_is_drawn_and_says_nothing_of_the_past():
     assert widths(500) == pytest.approx((0.6 * whole[0], 0.625 * whole[1]))
     assert widths(5000) == whole
     assert widths(0) == start
-    for steps in (-1, float("nan"), "all", None):
+    for steps in (-1, float("nan"), "all", None, True):
         with pytest.raises(InputError, match="0 or more"):
             env.unwrapped.set_progress(steps)
 

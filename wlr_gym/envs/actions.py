@@ -107,7 +107,7 @@ def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float
         return actions  # as nearly always: half of the time of what follows, twice in a step
     try:
         given = np.asarray(actions)
-        if given.dtype.kind == "c":
+        if given.dtype.kind not in "iuf":
             raise TypeError
         given = given.astype(np.float32, copy=False)
     except (TypeError, ValueError):

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.envs.actions import Actions
 from wlr_gym.envs.commands import Commands
-from wlr_gym.envs.episodes import Episodes
+from wlr_gym.envs.episodes import Episodes, is_whole
 from wlr_gym.envs.measured import measurable, measured_truth, require_flow
 from wlr_gym.envs.observation import ObservationPipeline
 from wlr_gym.envs.randomized_robots import RandomizedRobots
 from wlr_gym.envs.settings import Settings
-from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_scores
+from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_scores, not_finite
 from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.envs.tasks.signals import PRESENCE, START
@@ -77,7 +77,7 @@ class Core:
     """
 
     def __init__(self, task_name: str | Mapping[str, Any], settings: Settings, count: int) -> None:
-        if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+        if not is_whole(count) or count < 1:
             raise InputError(f"num_envs = {count!r}: expected a whole number of 1 or more")
         self.settings = settings
         self.count: int = int(count)
@@ -127,7 +127,7 @@ class Core:
         self.episodes = Episodes(count)
         self.robots = RandomizedRobots(task.robot, self.randomization, self.patch, period, count, task.config.sensors)
         self.actions = Actions(task.actions, count, self.settings.free_wheels)
-        self.commands = Commands(task.config, count)
+        self.commands = Commands(task.config, task.robot, count)
         self.pipeline = ObservationPipeline(
             task, self.randomization.config, count, has_latency=not real, has_privileged=self.dictionary
         )
@@ -221,7 +221,7 @@ class Core:
         Raises:
             InputError: fewer than 0, or no number.
         """
-        if not isinstance(steps, (int, float, np.number)) or not steps >= 0:
+        if isinstance(steps, bool) or not isinstance(steps, (int, float, np.number)) or not steps >= 0:
             raise InputError(f"steps = {steps!r}: expected 0 or more")
         curriculum = self.task.config.curriculum
         self.commands.set_share(_share(curriculum.commands, steps))
@@ -297,10 +297,15 @@ class Core:
         np.multiply(self.episodes.steps + 1, self.task.config.control_period, out=self.end_time)
         bad = self._score_kernel.run(mask, signals, self._score_kernel.numbers, self._score_buffers)
         if bad >= 0:
-            hint = "; a formula among its effects may have left its domain" if self.patch.forces else ""
-            raise FloatingPointError(
-                f"robot {bad} of the batch left the finite numbers (episode seed {self.episodes.seeds[bad]}){hint}"
-            )
+            raise FloatingPointError(f"{self._what_is_not_finite(bad)} (episode seed {self.episodes.seeds[bad]})")
+
+    def _what_is_not_finite(self, row: int) -> str:
+        """Say whether a robot or, where its motion is finite, only terms of its task left the finite numbers."""
+        finite = not self.plant.capabilities.has_truth or np.isfinite(self.plant.truth().values[row]).all()
+        if finite and np.isfinite(self.sensors.values[row]).all():
+            return f"{' and '.join(not_finite(self.task, self.scores, row))}: not finite for robot {row} of the batch"
+        hint = "; a formula among its effects may have left its domain" if self.patch.forces else ""
+        return f"robot {row} of the batch left the finite numbers{hint}"
 
     def _observe(self, mask: Mask, signals: tuple[Array, ...], *, first: bool) -> None:
         if self._computed_kernel is not None:
@@ -334,6 +339,18 @@ class Core:
     def contract(self) -> dict[str, Any]:
         """Return what a policy must be fed and what its output means (see :func:`wlr_gym.envs.tasks.describe.contract`)."""
         return contract(self.task, self.randomization.config.model_dump(mode="json", exclude_none=True))
+
+    def shorten(self, max_episode_steps: int | None) -> None:
+        """Truncate episodes after so many control steps, if that is before the task's own limit; None and -1 leave that.
+
+        Raises:
+            InputError: no whole number of 1 or more, or -1.
+        """
+        if max_episode_steps is None or max_episode_steps == -1:
+            return
+        if not is_whole(max_episode_steps) or max_episode_steps < 1:
+            raise InputError(f"max_episode_steps = {max_episode_steps!r}: expected a whole number of 1 or more, or -1")
+        self.limit = min(self.limit, int(max_episode_steps))
 
     def close(self) -> None:
         """Release the plant."""

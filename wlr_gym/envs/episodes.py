@@ -106,12 +106,17 @@ class Episodes:
             raise ResetNeeded(f"call reset() before {what}: no episode of robot {waiting[0]} has begun")
 
 
+def is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number; True and False are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
 def read_seed(seed: Any) -> int:
     """Return a seed.
 
     Raises:
         InputError: no whole number of 0 or more.
     """
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+    if not is_whole(seed) or seed < 0:
         raise InputError(f"seed = {seed!r}: expected a whole number of 0 or more")
     return int(seed)

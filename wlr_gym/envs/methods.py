@@ -38,7 +38,12 @@ class TaskMethods:
             self._spec.max_episode_steps = self.core.limit
 
     def set_command(self, **values: float) -> None:
-        """Command all robots from the next step on, until their episodes end: ``set_command(linear_velocity_x=0.1)``."""
+        """Command all robots from the next step on, until their episodes end: ``set_command(linear_velocity_x=0.1)``. Commands
+        that are not named are drawn as before.
+
+        Raises:
+            InputError: unknown command, or a value without meaning or beyond what the robot can do.
+        """
         self.core.set_command(values)
 
     def set_progress(self, steps: float) -> None:

@@ -141,10 +141,12 @@ class RandomizedRobots:
         parameters are redrawn.
 
         Raises:
-            InputError: unknown parameter, or a value of another shape.
+            InputError: unknown parameter, or a value of another type or shape.
         """
         for name, value in given.items():
             one = self.parameters[str(name)][:1]
+            if _type_of(value) not in "biuf":
+                raise InputError(f"parameters: {name} = {value!r}: expected a number, or an array of shape {one.shape[1:]}")
             try:
                 np.broadcast_to(value, one.shape)
             except ValueError:
@@ -166,6 +168,13 @@ class RandomizedRobots:
     def _wait(self, rows: Rows, seeds: Seeds) -> Counts:
         """Control steps (M, intervals) until each interval event strikes some robots next."""
         return self._randomization.next_strike(seeds, self._occurrences[rows], self._period)
+
+
+def _type_of(value: Any) -> str:
+    try:
+        return np.asarray(value).dtype.kind
+    except ValueError:  # lists of different lengths
+        return "O"
 
 
 def _override(parameters: Parameters, values: Mapping[str, Any]) -> None:

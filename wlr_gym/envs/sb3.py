@@ -41,8 +41,10 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         env_id: id such as ``WLR-Velocity-v0``, or the spec of an environment.
         num_envs: N.
         seed: robot i gets seed + i at the first reset; None = fresh entropy.
+        max_episode_steps: truncate after so many control steps, if that is before the task's own limit; None = as the spec
+            says, -1 = the task's own limit only.
         render_mode: ``rgb_array`` (``render()`` returns the first robots as tiles of one picture), ``human`` (a window with the
-            first robot) or None.
+            first robot) or None (that of the spec, if it has one).
         **options: those of :class:`wlr_gym.envs.settings.EnvironmentOptions`.
     """
 
@@ -52,16 +54,20 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         num_envs: int,
         *,
         seed: int | None = None,
+        max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Unpack[EnvironmentOptions],
     ) -> None:
         spec = _spec_of(env_id)
-        EzPickle.__init__(self, spec, num_envs, seed=seed, render_mode=render_mode, **options)
+        given = dict(spec.kwargs)
+        definition, its_mode = given.pop("definition", None), given.pop("render_mode", None)
+        render_mode = its_mode if render_mode is None else render_mode
+        steps = spec.max_episode_steps if max_episode_steps is None else max_episode_steps
+        EzPickle.__init__(self, spec, num_envs, seed=seed, max_episode_steps=steps, render_mode=render_mode, **options)
         check_render_mode(render_mode)
         self.render_mode = render_mode
-        given = dict(spec.kwargs)
-        definition = given.pop("definition", None)
         self.core = Core(definition or task_name_of(spec.id), read_settings(given | options), num_envs)
+        self.core.shorten(steps)
         self.spec = spec
         super().__init__(self.core.count, self.core.observation_space, self.core.action_space)
         self.metadata: dict[str, Any] = metadata(self.core.task.config.control_period)
@@ -81,7 +87,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
 
     def reset(self) -> Any:
         """Start new episodes with the seeds and options given before."""
-        seed_robots(self.core, self._seeds, self.core.everyone)
+        seed_robots(self.core, self._seeds, self.core.everyone, int(np.random.SeedSequence().generate_state(1, np.uint64)[0]))
         plain = np.array([not options for options in self._options])
         if plain.any():
             self.core.begin_episodes(plain)

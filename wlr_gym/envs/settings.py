@@ -60,7 +60,7 @@ class EnvironmentOptions(TypedDict, total=False):
         threads: worker threads of the plant for large batches; results do not depend on it.
         truth_info: put true pose, velocities and the command into ``info["truth"]`` at every reset and step (simulators only).
         view: what pictures show (with ``render_mode``): mapping of ``size`` (width, height), ``camera`` (follow, chase, side,
-            top), ``friction``, ``slip``, ``forces``, ``path``, ``text`` (True or False), see :class:`wlr_gym.render.View`.
+            top), ``friction``, ``slip``, ``forces``, ``text`` (True or False), see :class:`wlr_gym.render.View`.
         hardware: of the real robot: name in ``configs/hardware/``, path of such a file, or mapping of the fields of
             :class:`wlr_gym.physics.plants.robot_options.RobotOptions` (``{"emulated": True}``).
     """
@@ -116,7 +116,8 @@ class Settings:
                 raise unknown_name("wheel", str(wheel), WHEELS, "free_wheels")
         if self.episode_length is not None and not 0 < self.episode_length < float("inf"):
             raise InputError(f"episode_length = {self.episode_length!r}: expected a time above 0 s")
-        read_view(self.view)
+        if read_view(self.view).path:
+            raise InputError("view: path = True: only films show a path (wlr play --video FILE --path), no environment does")
         if self.is_real:
             self._check_real()
         elif self.hardware is not None:

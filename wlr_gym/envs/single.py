@@ -57,8 +57,8 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):  # pyright: ignor
 
         Args:
             seed: whole number; starts a new, reproducible series of episodes. None continues the present series.
-            options: ``command`` {name: value} held for the whole episode; ``parameters`` {name or element: value} set
-                after randomisation and effects.
+            options: ``command`` {name: value} held for the whole episode (the others are drawn); ``parameters`` {name or
+                element: value} set after randomisation and effects.
 
         Raises:
             InputError: a seed or an option that is none.

@@ -64,10 +64,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         self.pictures: Pictures = Pictures(self.core, render_mode)
         self._infos = Infos(self.core)
         self.num_envs = self.core.count
-        if max_episode_steps is not None and max_episode_steps != -1:  # -1: as in gym.make, none beside the environment's own
-            if not isinstance(max_episode_steps, (int, np.integer)) or max_episode_steps < 1:
-                raise InputError(f"max_episode_steps = {max_episode_steps!r}: expected a whole number of 1 or more, or -1")
-            self.core.limit = min(self.core.limit, int(max_episode_steps))
+        self.core.shorten(max_episode_steps)
         self.single_observation_space = self.core.observation_space
         self.single_action_space = self.core.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -81,7 +78,8 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         """Start episodes.
 
         Args:
-            seed: one number s (robot i gets s + i), or one number or None per robot. None continues the present series.
+            seed: one number s (robot i gets s + i), or one number or None per robot. None continues the present series;
+                without a seed before, as if it were ``np_random_seed``.
             options: as in the single environment, alike for all robots that begin, and ``reset_mask`` (N,) bool: only these.
 
         Raises:
@@ -92,7 +90,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         seeds = _read_seeds(seed, self.num_envs)
         if isinstance(seed, (int, np.integer)):
             super().reset(seed=int(seed))
-        seed_robots(self.core, seeds, mask)
+        seed_robots(self.core, seeds, mask, self.np_random_seed or 0)
         self.core.begin_episodes(mask, given)
         self.pictures.after_step()
         return self.core.observations(), _masked(self._infos.reset(), mask)
@@ -171,14 +169,14 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         self.core.close()
 
 
-def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask) -> None:
-    """Seed the robots in ``mask``: with the given number, with fresh entropy if they never had one, else not at all."""
+def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask, first: int) -> None:
+    """Seed the robots in ``mask``: with the given number, robot i with ``first`` + i if it never had one, else not at all."""
     for row in np.flatnonzero(mask).tolist():
         given = seeds[row]
         if given is not None:
             core.seed(row, given)
         elif not core.episodes.seeded[row]:
-            core.seed(row, int(np.random.SeedSequence().generate_state(1, np.uint64)[0]))
+            core.seed(row, (first + row) % 2**64)
 
 
 def _read_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:

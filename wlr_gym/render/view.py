@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
@@ -41,7 +42,7 @@ class View:
         if self.camera not in CAMERAS:
             raise unknown_name("camera", str(self.camera), CAMERAS, "view")
         size = self.size
-        if not (isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, int) and _fits(n) for n in size)):
+        if not (isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and _fits(int(n)) for n in size)):
             raise InputError(f"view: size = {size!r}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
         object.__setattr__(self, "size", (int(size[0]), int(size[1])))
         for name in ("friction", "slip", "forces", "path", "text"):

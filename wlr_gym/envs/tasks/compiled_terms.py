@@ -52,8 +52,8 @@ class TermKernel:
     Attributes:
         run: takes ``active`` (N,), whose rows to do, a plain tuple of :data:`MATRICES`, and ``numbers``. That of rewards,
             terminations and measures also takes a plain tuple of :class:`Scores`, writes them, and returns the first robot
-            whose reward is not finite, or -1; that of computed observations writes ``computed``. (numba takes twice as long to
-            receive a named tuple as a plain one.)
+            whose reward or measure is not finite or whose termination is no number, or -1; that of computed observations
+            writes ``computed``. (numba takes twice as long to receive a named tuple as a plain one.)
         numbers: (P,) weights, parameters and robot numbers in the order the kernel reads them.
     """
 
@@ -77,6 +77,16 @@ def expressions(task: Task, read: Callable[[str], Value]) -> dict[str, Value]:
         total = total + outputs[f"term.{name}"]
     measures = {f"measure.{name}": _value(signals, read, "measure", MEASURES[name]) for name in task.measures}
     return {**outputs, "total": total, **measures}
+
+
+def not_finite(task: Task, scores: Scores, row: int) -> list[str]:
+    """Return the terms of a task, such as ``reward 'slip'``, whose values for one robot are not finite."""
+    groups = (
+        ("termination", task.terminations, np.isnan(scores.over[row])),  # an infinite one is fine
+        ("reward", task.rewards, ~np.isfinite(scores.terms[row])),
+        ("measure", task.measures, ~np.isfinite(scores.measures[row])),
+    )
+    return [f"{kind} '{name}'" for kind, names, bad in groups for name, wrong in zip(names, bad, strict=True) if wrong]
 
 
 def computed_expressions(task: Task, read: Callable[[str], Value]) -> dict[str, Value]:
@@ -217,12 +227,17 @@ _SCORES_HEAD = (
     "            continue",
 )
 _SCORES_TAIL = (
+    "        check = total[i]",
+    "        for k in range(over.shape[1]):",
+    "            if math.isnan(over[i, k]):",
+    "                check = over[i, k]",
     "        for k in range(terms.shape[1]):",
     "            sums[i, k] += terms[i, k]",
     "        for k in range(measures.shape[1]):",
+    "            check += measures[i, k]",
     "            squares[i, k] += measures[i, k] ** 2",
     "            largest[i, k] = max(largest[i, k], abs(measures[i, k]))",
-    "        if bad < 0 and not math.isfinite(total[i]):",
+    "        if bad < 0 and not math.isfinite(check):",
     "            bad = i",
     "    return bad",
 )

@@ -254,8 +254,9 @@ def _check_ranges(config: TaskConfig, where: str) -> None:
             raise unknown_name("command", name, COMMANDS, where)
         ranges[f"commands.terms.{name}"] = limits
         term = COMMANDS[name]
-        if limits[0] < term.least:
-            raise InputError(f"{where}: commands.terms.{name} = {list(limits)}: expected {term.least:g} {term.unit} or more")
+        if limits[0] < term.least or limits[1] > term.most:
+            expected = term.words(term.least, term.most)
+            raise InputError(f"{where}: commands.terms.{name} = {list(limits)}: expected {expected}")
     for name in config.commands.ramp:
         if name not in config.commands.terms:
             raise unknown_name("command", name, config.commands.terms, f"{where}: commands.ramp")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 
 Function = Callable[..., Any]
 
@@ -50,7 +50,11 @@ def refuse_another(function: Function, present: Function | None) -> None:
 def registered(
     registry: dict[str, ScalarTerm], unit: str = "", **ranges: tuple[float, float]
 ) -> Callable[[Function], Function]:
-    """Return a decorator that enters a function into ``registry`` under its own name, with ranges of its parameters."""
+    """Return a decorator that enters a function into ``registry`` under its own name, with ranges of its parameters.
+
+    Raises:
+        InputError: a range of a parameter that the function does not have, or a name that is taken.
+    """
 
     def enter(function: Function) -> Function:
         defaults = {
@@ -58,6 +62,9 @@ def registered(
             for name, parameter in inspect.signature(function).parameters.items()
             if parameter.kind is inspect.Parameter.KEYWORD_ONLY
         }
+        for name in ranges:
+            if name not in defaults:
+                raise unknown_name("parameter", name, defaults, f"term '{function.__name__}' of {function.__module__}")
         doc = (inspect.getdoc(function) or "").partition("\n")[0]
         if function.__name__ in registry:
             refuse_another(function, registry[function.__name__].function)
