@@ -430,8 +430,8 @@ def test_a_plant_is_made_of_a_robot_by_name_and_by_content():
     ("entry", "words"),
     [
         ("nomodule:Cls", "BACKENDS['x'] = 'nomodule:Cls': no module 'nomodule'; expected 'module:class'"),
-        ("wlr_gym.physics.plant:Cls", "no module 'wlr_gym.physics.plant'"),
-        ("wlr_gym.physics.plants.gibbs_appell.plant:GibbsAppelPlant", "did you mean 'GibbsAppellPlant'"),
+        ("json.nomodule:Cls", "no module 'json.nomodule'"),
+        ("fractions:Fractoin", "did you mean 'Fraction'"),
     ],
 )
 def test_a_backend_that_leads_nowhere_is_refused(monkeypatch, entry, words):

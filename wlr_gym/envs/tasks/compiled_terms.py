@@ -110,11 +110,11 @@ def _result(term: str, function: Callable[..., Any], signals: Signals, **paramet
     except TypeError as error:
         if "Node" not in str(error) and "traced value" not in str(error):
             raise
-        raise InputError(f"{term}: {error}; {_INSTEAD}") from error
+        raise InputError(f"{term}: a traced value (Node) cannot do this: {error}; {_INSTEAD}") from error
 
 
 _INSTEAD = (
-    "expected + - * / and functions of wlr_gym.physics.codegen.ops: ops.where_positive for if and comparisons, x * x for x**2, "
+    "use + - * / and the functions of wlr_gym.physics.codegen.ops: ops.where_positive for if and comparisons, x * x for x**2, "
     "ops.absolute for abs, ops.exp for np.exp"
 )
 
