@@ -70,6 +70,25 @@ def test_what_is_left_open_is_decided_by_full():
     assert (slope.seeds, slope.sweep) == (2, ("slope",))
 
 
+def test_a_baseline_that_is_the_policy_is_said_to_be_none(capsys):
+    evaluate._complete(evaluate.EvaluateOptions(("pid",), baselines=("do_nothing", "pid")))
+    assert capsys.readouterr().out == "no baseline, the policy itself: pid\n"
+    evaluate._complete(evaluate.EvaluateOptions(("pid",), baselines=("again=pid",)))
+    evaluate._complete(evaluate.EvaluateOptions(("pid",)))
+    assert capsys.readouterr().out == ""
+
+
+def test_a_policy_of_another_task_is_told_where_it_was_trained(capsys):
+    pytest.importorskip("onnxruntime")
+    words = ["--episodes", "2", "--no-progress", "--baselines"]
+    assert main(["evaluate", "velocity_slip_aware", "--env", "WLR-Path-v0", *words]) == 2
+    assert "'velocity_slip_aware' was trained in WLR-Velocity-v0, not WLR-Path-v0: " in capsys.readouterr().err
+    assert main(["evaluate", "velocity_blind", "--env", "WLR-Slope-v0", *words]) == 2
+    assert "'velocity_blind' was trained in WLR-Velocity-v0, not WLR-Slope-v0: " in capsys.readouterr().err
+    assert main(["evaluate", "velocity_blind", "--robot", "flow", "--randomization", "slipery", *words]) == 2
+    assert "was trained in" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -84,8 +103,18 @@ def test_what_is_left_open_is_decided_by_full():
         (["do_nothing", "--record", "3", "--episodes", "2"], "--record 3"),
         (["do_nothing", "--video", "a.webp", "--video-seconds", "0"], "--video-seconds 0"),
         (["a=do_nothing", "--baselines", "a=pid"], "two policies are called 'a'"),
+        (["do_nothing", "do_nothing"], "policy 'do_nothing' is given twice"),
+        (["do_nothing", "--accept", "--baselines", "do_nothing"], "nothing to compare it with"),
     ],
 )
 def test_bad_input_exits_with_2(arguments, message, capsys):
     assert main(["evaluate", *arguments, "--no-progress"]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [[], ["--accept"]])
+def test_no_sensors_and_some_are_refused_before_anything_is_written(more, tmp_path, capsys):
+    words = ["evaluate", "pid", "--sensors", "none", "camera", "--out", str(tmp_path / "card")]
+    assert main([*words, *more]) == 2
+    assert "--sensors none camera: expected none alone, or camera, flow or both" in capsys.readouterr().err
+    assert not (tmp_path / "card").exists()

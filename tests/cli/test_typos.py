@@ -41,6 +41,18 @@ COMMANDS = {
     "an agent": (["train", "--agent", "pppo"], "unknown agent 'pppo' (did you mean 'ppo'?)"),
     "a setting": (["train", "--set", "learning_rat=1"], "did you mean 'learning_rate'?"),
     "a setting's number": (["train", "--set", "total_steps=-5"], "total_steps = -5: expected greater than 0"),
+    "a setting given twice": (
+        ["train", "--set", "learning_rate=1", "learning_rate=2"],
+        "setting 'learning_rate' is given twice: 'learning_rate=1' and 'learning_rate=2'",
+    ),
+    "a setting of a sweep given twice": (
+        ["sweep", "WLR-Velocity-v0", "--set", "gamma=0.9", "gamma=0.97"],
+        "--set: 'gamma' is given twice; all its values go behind one: gamma=VALUE,VALUE",
+    ),
+    "a command given twice": (
+        ["deploy", "pid", "--command", "yaw_rate=0.1", "yaw_rate=0.2", "--emulated"],
+        "--command: 'yaw_rate' is given twice: 0.1 and 0.2",
+    ),
     "an effect": (["effects", "stribek"], "did you mean 'stribeck_friction'?"),
     "an effect where a patch goes": (["evaluate", "pid", "--effects", "backlash"], "'backlash' is an effect"),
     "a robot": (["robot", "show", "nominall"], "did you mean 'nominal'?"),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import closing
 
+import gymnasium
 import pytest
 from blocks import ROOT, site_script
 
@@ -32,6 +34,14 @@ def test_page_and_readme_have_the_numbers():
     readme = performance.README.read_text(encoding="utf-8")
     assert performance.write_readme(readme, ROWS) == readme
     assert {row["name"] for row in ROWS} <= set(MEASUREMENTS)
+
+
+def test_a_snapshot_is_as_large_as_the_page_says():
+    text = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
+    with closing(gymnasium.make("WLR-Velocity-v0", randomization="ice")) as env:
+        env.reset(seed=0)
+        size = env.get_wrapper_attr("get_state")().nbytes
+    assert f"`snapshot.nbytes` ({size / 1000:.0f} kB per robot in float64)" in text
 
 
 def test_a_report_replaces_its_own_measurement_only():

@@ -199,6 +199,14 @@ def test_a_robot_file_is_laid_over_its_base(tmp_path):
     assert (load_robot(further).body.mass, load_robot(further).wheel.radius) == (3.5, 0.04)
 
 
+def test_the_content_of_a_robot_file_is_the_robot_of_the_file():
+    content = {"base": "nominal", "name": "x", "servo": {"leg": {"stall_torque": 4.1}}}
+    assert load_robot(content).servo.leg.stall_torque == 4.1
+    assert load_robot(content).body == load_robot().body
+    with pytest.raises(InputError, match=re.escape("robot: unknown key 'body.mas' (did you mean 'mass'?)")):
+        load_robot({"base": "nominal", "name": "x", "body": {"mas": 3.0}})
+
+
 def test_a_robot_with_a_base_has_a_name_of_its_own(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text("base: nominal\nbody: {mass: 3.5}\n")

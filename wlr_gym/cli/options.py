@@ -56,7 +56,13 @@ class SensorsOption:
     robot's file says."""
 
     def present(self) -> tuple[str, ...] | None:
-        """Return the sensors; None = as the robot's file says."""
+        """Return the sensors; None = as the robot's file says.
+
+        Raises:
+            InputError: none, and others beside it.
+        """
+        if self.sensors and len(self.sensors) > 1 and "none" in self.sensors:
+            raise InputError(f"--sensors {' '.join(self.sensors)}: expected none alone, or camera, flow or both")
         return None if self.sensors is None else tuple(name for name in self.sensors if name != "none")
 
 
@@ -64,13 +70,15 @@ def pairs(option: str, words: Sequence[str], example: str) -> dict[str, str]:
     """Return name -> value of the words of an option, each ``name=value``.
 
     Raises:
-        InputError: another word; the message names the option and the example.
+        InputError: another word, or a name given twice; the message names the option and the example.
     """
-    found = {}
+    found: dict[str, str] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not (name and equals and value):
             raise InputError(f"{option} {word}: expected name=value, such as {example}")
+        if name in found:
+            raise InputError(f"{option}: '{name}' is given twice: {found[name]} and {value}")
         found[name] = value
     return found
 

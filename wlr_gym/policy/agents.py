@@ -169,9 +169,14 @@ def apply_changes(config: dict[str, Any], changes: Iterable[str]) -> None:
     """Lay changes such as ``environment.precision=float64`` over settings, in place.
 
     Raises:
-        InputError: a change that is not ``key=value``.
+        InputError: a change that is not ``key=value``, or a key given twice.
     """
+    made: dict[str, str] = {}
     for change in changes:
+        key = change.partition("=")[0].strip()
+        if key in made:
+            raise InputError(f"setting '{key}' is given twice: '{made[key]}' and '{change}'")
+        made[key] = change
         _apply(config, change)
 
 

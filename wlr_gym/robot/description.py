@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import Field, field_serializer, field_validator, model_validator
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_layers
+from wlr_gym.base.settings import SettingsModel, layers_of, overlay, parse_config, read_config
 from wlr_gym.robot.joints import JOINTS
 from wlr_gym.robot.parameter_table import TABLE, range_in_words, spec_of
 from wlr_gym.robot.sensors import SensorSet, Vector3
@@ -257,7 +257,7 @@ def _triangle_faults(name: str, inertia: tuple[float | None, ...]) -> list[str]:
     return [f"{name} = {values} breaks the triangle inequality every rigid body obeys"]
 
 
-#: Name in ``configs/robot/``, path of a YAML file, content of such a file without a base, or a :class:`Robot`.
+#: Name in ``configs/robot/``, path of a YAML file, content of such a file, or a :class:`Robot`.
 RobotSource = str | Path | Mapping[str, Any] | Robot
 
 
@@ -271,10 +271,7 @@ def load_robot(source: RobotSource = "nominal", *, check: bool = True) -> Robot:
     Raises:
         InputError: unreadable file, unknown or missing key, value of the wrong kind, or a physically impossible robot.
     """
-    if isinstance(source, Mapping):
-        robot = parse_config(Robot, dict(source), "robot")
-    else:
-        robot = source if isinstance(source, Robot) else _read(source)
+    robot = source if isinstance(source, Robot) else _read(source)
     faults = physical_faults(robot) if check else []
     if faults:
         raise InputError(f"robot '{robot.name}' cannot be simulated: " + "; ".join(faults))
@@ -292,9 +289,10 @@ def robot_content(source: RobotSource) -> dict[str, Any]:
     return load_robot(source).model_dump(mode="json")
 
 
-def _read(source: str | Path) -> Robot:
-    """Read a robot file, laid over its bases. The name is its own: another robot has another one."""
-    layers = read_layers("robot", source)
+def _read(source: str | Path | Mapping[str, Any]) -> Robot:
+    """Read a robot's file or content, laid over its bases. The name is its own: another robot has another one."""
+    top = (dict(source), "robot") if isinstance(source, Mapping) else read_config("robot", source)
+    layers = layers_of("robot", top)
     data, where = layers[0]
     robot = parse_config(Robot, data, where)  # what is wrong in a base is said with its own name
     for changes, where in layers[1:]:

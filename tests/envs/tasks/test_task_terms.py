@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import load_task
+from wlr_gym.envs.tasks.compiled_terms import compile_computed, compile_scores
 from wlr_gym.envs.tasks.signals import Signals
 from wlr_gym.envs.tasks.success import limits_of, scales_of, succeeded
-from wlr_gym.envs.tasks.terms import MEASURES, REWARDS, references
+from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, ScalarTerm, references
+from wlr_gym.envs.tasks.terms.computed import ComputedTerm
 from wlr_gym.envs.tasks.terms.geometry import PlanarPose, true_pose
 from wlr_gym.learning.evaluation.metrics import errors_of
 from wlr_gym.learning.evaluation.rollout import Measure
@@ -265,3 +268,36 @@ def test_a_scale_takes_the_place_of_the_limit_in_the_tracking_error_only():
     largest = {"velocity_error": {"rms": None, "max": 0.2, "scale": 0.4}}  # a scale of no limit: nothing
     config = load_task("velocity", load_robot(), {"success": changes["success"] | largest}).config
     assert scales_of(config) == {("velocity_error", "max"): 0.2}
+
+
+@pytest.mark.parametrize(
+    ("law", "words"),
+    [
+        (lambda v: v**2, "x * x for x**2"),
+        (abs, "ops.absolute for abs"),
+        (np.exp, "ops.exp for np.exp"),
+        (math.exp, "ops.exp for np.exp"),
+        (lambda v: 1.0 if v > 0 else 0.0, "ops.where_positive for if"),
+        (lambda v: 1.0 if v else 0.0, "ops.where_positive for if"),
+        (lambda v: [v], " returned list: expected a single number"),
+        (lambda v: None, " returned NoneType: expected a single number"),
+    ],
+    ids=["power", "abs", "numpy", "math", "comparison", "truth", "list", "nothing"],
+)
+def test_mistakes_in_a_reward_of_ones_own_are_named(monkeypatch, law, words):
+    monkeypatch.setitem(REWARDS, "own", ScalarTerm("own", lambda s: law(s.truth("position")[0]), {}, {}, ""))
+    task = load_task("velocity", overrides={"rewards": {"own": {"weight": 1.0}}})
+    with pytest.raises(InputError, match=f"^reward 'own'.*{re.escape(words)}"):
+        compile_scores(task)
+
+
+@pytest.mark.parametrize(("count", "got"), [(0, "0 of 1 values"), (2, "2 of 1 values"), (None, "no list")])
+def test_a_computed_term_returns_a_list_of_its_elements(monkeypatch, count, got):
+    def own(signals):
+        return signals.action[0] if count is None else signals.action[:count]
+
+    monkeypatch.setitem(COMPUTED, "speed_command", ComputedTerm(own, ("speed_command",)))
+    task = load_task("velocity", overrides={"observations": {"speed_command": {}}})
+    message = f"observation term 'speed_command' returned {got}: expected [speed_command]"
+    with pytest.raises(InputError, match=re.escape(message)):
+        compile_computed(task)

@@ -267,6 +267,7 @@ def test_bad_groups_are_refused_and_leave_nothing(trials, tmp_path, capsys):
     cases = {
         f"{trials}/lr=3*": "is no policy",
         f"ours=pid,{trials}/lr=1-seed0": "'pid' is an agent",
+        f"ours={trials}/lr=1-seed0,{trials}/lr=1-seed0": "lr=1-seed0' is given twice",
         f"ours={trials}/lr=1-seed0,{trials}/lr=1-seed4": "lr=1-seed4' is no policy",
     }
     for text, message in cases.items():
@@ -278,6 +279,8 @@ def test_bad_groups_are_refused_and_leave_nothing(trials, tmp_path, capsys):
         read_subjects([f"{trials}/lr=1*"])
     with pytest.raises(InputError, match="no policy given"):
         read_subjects([[]])
+    with pytest.raises(InputError, match="'velocity_blind' is given twice: expected each training of a recipe once"):
+        read_subjects([["velocity_blind", "velocity_blind"]])
     assert not (tmp_path / "card").exists()
 
 

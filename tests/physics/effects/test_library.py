@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.physics.effects import EFFECTS, STAGES, UNKNOWN_EFFECT, Effect, apply_patch, load_patch
+from wlr_gym.physics.effects import EFFECTS, STAGES, UNKNOWN_EFFECT, Effect, EffectParameter, apply_patch, load_patch
 from wlr_gym.physics.effects.document import places
-from wlr_gym.robot import load_robot
+from wlr_gym.physics.effects.effect import add, multiply, put
+from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
@@ -118,3 +119,18 @@ def test_values_outside_the_bounds_are_refused(effect):
         for outside in (parameter.low - 1e-3 * (1 + abs(parameter.low)), parameter.high * 1.001):
             with pytest.raises(InputError, match=rf"{effect.name}.*{name} = .* is outside"):
                 patched(effect, effect.where, severe(effect) | {name: outside})
+
+
+def test_mistakes_in_an_effect_of_ones_own_are_named():
+    parameters = {"scale": EffectParameter("-", "cold over hot", 0.2, 1.0, 1.0, (0.6, 1.0), 0.7)}
+
+    def own(**more):
+        return Effect("hot", "hot motor", "", JOINTS, parameters, multiply("servo.stall_torque", "scal"), **more)
+
+    with pytest.raises(InputError, match=re.escape("effect 'hot': unknown stage 'scal' (did you mean 'scale'?)")):
+        own(stage="scal")
+    with pytest.raises(InputError, match=re.escape("EFFECTS['k']: the effect calls itself 'hot'; expected the same name")):
+        EFFECTS["k"] = own()
+    for apply in (add, multiply, put):
+        with pytest.raises(InputError, match=re.escape("unknown parameter of the effect 'scal' (did you mean 'scale'?)")):
+            apply("servo.stall_torque", "scal")(Parameters.nominal(ROBOT, 1), ["leg_lf"], {"scale": 0.5})

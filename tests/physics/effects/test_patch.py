@@ -295,6 +295,15 @@ def test_each_robot_lays_a_patch_into_its_own_first_empty_place():
     np.testing.assert_array_equal(result["patch.mu"], [[0.1, 0.2, 0, 0], [0, 0.1, 0.2, 0], [0.1, 0, 0.2, 0]])
 
 
+@pytest.mark.parametrize(("name", "where"), [("friction_level", ["ground"]), ("friction_asymmetry", ["wheel_lf"])])
+def test_friction_levels_are_of_the_floor_outside_its_patches(name, where):
+    parameters = Parameters.nominal(ROBOT, 1)
+    parameters["patch.mu"][0, 0], parameters["patch.x_max"][0, 0] = 0.7, 1.0
+    result = apply_patch(load_patch({"name": name, "where": where, "parameters": {"mu": 0.4}}), parameters)
+    assert result["patch.mu"][0, 0] == 0.7
+    assert "patches" in EFFECTS[name].doc
+
+
 def test_slip_weakening_counts_from_each_wheels_own_friction():
     result = patched(
         {"name": "slip_weakening", "parameters": {"mu_k": 0.2, "slip_speed": 0.1}},

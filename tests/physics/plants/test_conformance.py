@@ -4,6 +4,8 @@ Tests that take ``plant_name`` need sensors only and hold for a real robot too; 
 or put robots into states.
 """
 
+import re
+
 import numpy as np
 import pytest
 from simulators import (
@@ -25,7 +27,7 @@ from simulators import (
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.model import dynamics
-from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants import BACKENDS, make_plant
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, standing_state
 from wlr_gym.physics.plants.forces import WIND_UP, make_force
 from wlr_gym.physics.plants.simulator import Simulator
@@ -407,6 +409,35 @@ def test_bad_resets_are_refused(simulator):
     state.position[0, 0] = np.nan
     with pytest.raises(InputError, match="not finite"):
         plant.reset(state=state)
+
+
+@pytest.mark.parametrize("seeds", [[1], [1, 2, 3], [-1, 2], np.array([-1, 2]), [1.5, 2.5], ["a", "b"], 7, [[1, 2]]], ids=str)
+def test_seeds_that_are_none_are_refused(simulator, seeds):
+    plant = make(simulator, 2)
+    with pytest.raises(InputError, match="expected whole numbers from 0 on, one for each robot, here 2"):
+        plant.reset(seeds=seeds)
+    plant.reset(seeds=np.array([2**63 + 1, 1], np.uint64))
+
+
+def test_a_plant_is_made_of_a_robot_by_name_and_by_content():
+    for robot in ("nominal", {"base": "nominal", "name": "x"}):
+        assert make_plant("gibbs_appell", robot, 1).robot.body == ROBOT.body
+    with pytest.raises(InputError, match="did you mean 'nominal'"):
+        make_plant("gibbs_appell", "nominl", 1)
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ("nomodule:Cls", "BACKENDS['x'] = 'nomodule:Cls': no module 'nomodule'; expected 'module:class'"),
+        ("json.nomodule:Cls", "no module 'json.nomodule'"),
+        ("fractions:Fractoin", "did you mean 'Fraction'"),
+    ],
+)
+def test_a_backend_that_leads_nowhere_is_refused(monkeypatch, entry, words):
+    monkeypatch.setitem(BACKENDS, "x", entry)
+    with pytest.raises(InputError, match=re.escape(words)):
+        make_plant("x", ROBOT, 1)
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5])

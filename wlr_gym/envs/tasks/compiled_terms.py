@@ -5,13 +5,14 @@ Weights, parameters and the robot's numbers are run-time inputs: changing them c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.signals import PRESENCE, START, Signals, Value
 from wlr_gym.envs.tasks.task import Task
 from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
@@ -92,12 +93,40 @@ def not_finite(task: Task, scores: Scores, row: int) -> list[str]:
 def computed_expressions(task: Task, read: Callable[[str], Value]) -> dict[str, Value]:
     """Return the computed observations by element for signals read by ``read``."""
     signals = Signals(read)
-    terms = [COMPUTED[name] for name in task.computed_terms]
-    return {element: value for term in terms for element, value in zip(term.elements, term.function(signals), strict=True)}
+    outputs: dict[str, Value] = {}
+    for name in task.computed_terms:
+        elements = COMPUTED[name].elements
+        result = _result(f"observation term '{name}'", COMPUTED[name].function, signals)
+        values = list(result) if isinstance(result, Iterable) else None
+        if values is None or len(values) != len(elements):
+            got = "no list" if values is None else f"{len(values)} of {len(elements)} values"
+            raise InputError(f"observation term '{name}' returned {got}: expected [{', '.join(elements)}]")
+        outputs |= zip(elements, values, strict=True)
+    return outputs
 
 
 def _value(signals: Signals, read: Callable[[str], Value], kind: str, term: Any) -> Value:
-    return term.function(signals, **{name: read(f"{kind}.{term.name}.{name}") for name in term.parameters})
+    parameters = {name: read(f"{kind}.{term.name}.{name}") for name in term.parameters}
+    value = _result(f"{kind} '{term.name}'", term.function, signals, **parameters)
+    if value is None or isinstance(value, list | tuple | dict | str):
+        raise InputError(f"{kind} '{term.name}' returned {type(value).__name__}: expected a single number")
+    return value
+
+
+def _result(term: str, function: Callable[..., Any], signals: Signals, **parameters: Value) -> Any:
+    """Return what a term's function returns; Python and numpy can do less with a value that is traced than ``ops``."""
+    try:
+        return function(signals, **parameters)
+    except TypeError as error:
+        if "Node" not in str(error) and "traced value" not in str(error):
+            raise
+        raise InputError(f"{term}: a traced value (Node) cannot do this: {error}; {_INSTEAD}") from error
+
+
+_INSTEAD = (
+    "use + - * / and the functions of wlr_gym.physics.codegen.ops: ops.where_positive for if and comparisons, x * x for x**2, "
+    "ops.absolute for abs, ops.exp for np.exp"
+)
 
 
 def constants(task: Task) -> Mapping[str, float]:

@@ -111,7 +111,7 @@ def accept(
     Args:
         policy: one policy or agent, as :func:`wlr_gym.learning.evaluation.scoring.evaluate` takes it.
         env_id: id of the environment; None = the one the policy was trained in.
-        references: None = :func:`references_of` the policy.
+        references: None = :func:`references_of` the policy. The policy itself is none.
         floors: randomisations; None = those of the task's card.
         episodes: per seed. seeds: blocks of episodes.
         largest_loss: % of the tracking error.
@@ -125,7 +125,8 @@ def accept(
     environment = env_id or trained_environment(subject.sources[0]) or "WLR-Velocity-v0"
     task = task_name_of(environment)
     chosen = FAMILIES.get(task, ("nominal",)) if floors is None else tuple(floors)
-    against = references_of(subject.sources[0], environment) if references is None else tuple(references)
+    given = references_of(subject.sources[0], environment) if references is None else references
+    against = tuple(one for one in given if read_subjects([one])[0] != subject)
     if not against:
         raise InputError(f"policy '{policy}': nothing to compare it with; expected a reference")
     losses: list[Loss] = []

@@ -59,7 +59,8 @@ def evaluate(
             such as ``out/trials/lr=1e-3-*``, a folder that holds run folders, or ``NAME=POLICY,POLICY,...``: trainings of one
             recipe that differ in the seed. All play all episodes; intervals contain training-seed variance.
         env_id: id of the environment; None = the one the policy was trained in, else ``WLR-Velocity-v0``.
-        baselines: what to compare with, as the policy; None = ``do_nothing`` and ``pid`` as far as they fit the task.
+        baselines: what to compare with, given as the policy is; None = ``do_nothing`` and ``pid`` as far as they fit the task.
+            The policy itself is not played twice.
         episodes: per seed. seeds: blocks of episodes.
         seed: of the first episode; the others count up from it, each further block from 10000 above the last one.
         backend: ``gibbs_appell``, ``mujoco``, or ``both`` (the second for the main table only).

@@ -10,9 +10,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.envs.core import make_task
+from wlr_gym.envs.registry import plain_id, task_source_of
+from wlr_gym.envs.settings import read_settings
+from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.learning.evaluation.training_seeds import by_seed, common_name, expand
-from wlr_gym.policy import agent_names, environment_for, find_policy, load_agent_config, make_policy, policy_environment
+from wlr_gym.policy import (
+    agent_names,
+    environment_for,
+    find_policy,
+    load_agent_config,
+    make_policy,
+    policy_environment,
+    trained_environment,
+)
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
@@ -48,7 +60,7 @@ class Subject:
 
 
 def read_subjects(given: Sequence[Source | Sequence[Source]]) -> tuple[Subject, ...]:
-    """Return subjects; a repeated one counts once.
+    """Return subjects; a repeated subject counts once.
 
     Args:
         given: for each subject ``SOURCE`` or ``NAME=SOURCE``, and for trainings of one recipe that differ in the seed
@@ -56,7 +68,8 @@ def read_subjects(given: Sequence[Source | Sequence[Source]]) -> tuple[Subject, 
             holds nothing but their run folders.
 
     Raises:
-        InputError: no source, two subjects of the same name, or policies of one subject that are not trainings of one recipe.
+        InputError: no source, two subjects of the same name, or policies of one subject that are not
+            different trainings of one recipe.
     """
     subjects = list(dict.fromkeys(_subject([one] if isinstance(one, str | Path) else one) for one in given))
     for index, subject in enumerate(subjects):
@@ -68,9 +81,12 @@ def read_subjects(given: Sequence[Source | Sequence[Source]]) -> tuple[Subject, 
 def _subject(given: Sequence[Source]) -> Subject:
     texts = [str(text) for text in given]
     found = [_named(text) for text in texts]
-    sources = tuple(dict.fromkeys(source for _, several in found for source in several))
+    sources = tuple(source for _, several in found for source in several)
     if not sources:
         raise InputError("no policy given")
+    for index, source in enumerate(sources):
+        if source in sources[:index]:
+            raise InputError(f"policy '{source}' is given twice: expected each training of a recipe once")
     name = next((name for name, _ in found if name), texts[0] if len(texts) == 1 else common_name(texts))
     if len(sources) == 1:
         return Subject(name, sources)
@@ -130,6 +146,14 @@ def make_player(environment: str, source: str | Path, episodes: int, keywords: M
     Raises:
         InputError: unknown environment, policy or keyword, or a policy that does not fit the environment.
     """
+    try:
+        return _player(environment, source, episodes, keywords)
+    except InputError:
+        _refuse_another_task(environment, source)
+        raise
+
+
+def _player(environment: str, source: str | Path, episodes: int, keywords: Mapping[str, Any]) -> tuple[Core, Policy]:
     core = make_core(environment, episodes, environment_for(source, keywords))
     try:
         policy = make_policy(source, core.contract())
@@ -139,3 +163,14 @@ def make_player(environment: str, source: str | Path, episodes: int, keywords: M
     except BaseException:
         core.close()
         raise
+
+
+def _refuse_another_task(environment: str, source: str | Path) -> None:
+    """Say where a policy was trained, if it fits an environment under no conditions at all."""
+    trained, task = trained_environment(source), task_source_of(environment)
+    if trained is None or plain_id(trained) == plain_id(environment):
+        return
+    try:
+        make_policy(source, contract(make_task(task, read_settings(environment_for(source, {}))), {}))
+    except InputError as error:
+        raise InputError(f"'{source}' was trained in {trained}, not {environment}: {error}") from None

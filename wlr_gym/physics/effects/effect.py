@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.physics.effects.search import Search
 from wlr_gym.robot.parameters import Parameters
 
@@ -75,6 +75,10 @@ class Effect:
     stage: str = "addition"
     search: Search | None = None
 
+    def __post_init__(self) -> None:
+        if self.stage not in STAGES:
+            raise unknown_name("stage", self.stage, STAGES, f"effect '{self.name}'")
+
 
 @dataclass(frozen=True)
 class PatchEffect:
@@ -114,7 +118,7 @@ def add(target: str, parameter: str) -> Apply:
 
     def apply(parameters: Parameters, where: Sequence[str], values: Values) -> None:
         for element in _elements(target, where, parameters):
-            parameters[element] += values[parameter]
+            parameters[element] += _value(values, parameter)
 
     return apply
 
@@ -124,7 +128,7 @@ def multiply(target: str, parameter: str) -> Apply:
 
     def apply(parameters: Parameters, where: Sequence[str], values: Values) -> None:
         for element in _elements(target, where, parameters):
-            parameters[element] *= values[parameter]
+            parameters[element] *= _value(values, parameter)
 
     return apply
 
@@ -134,7 +138,7 @@ def put(target: str, parameter: str) -> Apply:
 
     def apply(parameters: Parameters, where: Sequence[str], values: Values) -> None:
         for element in _elements(target, where, parameters):
-            parameters[element] = values[parameter]
+            parameters[element] = _value(values, parameter)
 
     return apply
 
@@ -143,7 +147,7 @@ def add_vector(target: str, names: Sequence[str]) -> Apply:
     """Add the effect's parameters ``names`` to the elements of ``target``."""
 
     def apply(parameters: Parameters, where: Sequence[str], values: Values) -> None:
-        parameters[target] += np.array([values[name] for name in names])
+        parameters[target] += np.array([_value(values, name) for name in names])
 
     return apply
 
@@ -156,6 +160,12 @@ def together(*parts: Apply) -> Apply:
             part(parameters, where, values)
 
     return apply
+
+
+def _value(values: Values, parameter: str) -> float:
+    if parameter not in values:
+        raise unknown_name("parameter of the effect", parameter, values)
+    return values[parameter]
 
 
 def _elements(target: str, where: Sequence[str], parameters: Parameters) -> list[str]:

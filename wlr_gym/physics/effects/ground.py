@@ -158,7 +158,7 @@ def _edges(values: Sequence[float]) -> dict[str, float]:
 EFFECTS: tuple[Effect, ...] = (
     Effect(
         "friction_level",
-        "friction coefficient of the floor, all wheels",
+        "friction coefficient of the floor outside its patches, all wheels",
         "mu_x = mu_y = mu",
         ("ground",),
         {"mu": _mu(0.25, "absolute coefficient")},
@@ -168,7 +168,7 @@ EFFECTS: tuple[Effect, ...] = (
     ),
     Effect(
         "friction_asymmetry",
-        "friction coefficient of the named wheels; the others keep theirs",
+        "friction coefficient of the named wheels outside the floor's patches; the others keep theirs",
         "mu_x = mu_y = mu of these wheels",
         WHEELS,
         {"mu": _mu(0.25, "absolute coefficient")},

@@ -13,7 +13,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.physics.plants.base import Plant, PlantOptions
 from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.robot_options import RobotOptions
-from wlr_gym.robot import Robot
+from wlr_gym.robot import RobotSource, load_robot
 
 #: Backend -> "module:class", imported when it is first made.
 BACKENDS = {
@@ -28,7 +28,7 @@ SIMULATORS = tuple(name for name in BACKENDS if name not in REAL)
 
 def make_plant(
     backend: str,
-    robot: Robot,
+    robot: RobotSource,
     count: int,
     options: PlantOptions | None = None,
     forces: Sequence[Force] = (),
@@ -38,7 +38,7 @@ def make_plant(
 
     Args:
         backend: one of :data:`BACKENDS`.
-        robot: the robot.
+        robot: the robot, its name in ``configs/robot/``, its file or that file's content.
         count: number of robots.
         options: step sizes, precision, threads.
         forces: formula forces that act on every robot (simulators only).
@@ -48,14 +48,29 @@ def make_plant(
         InputError: unknown backend (the message lists the valid ones), impossible robot, bad options.
     """
     check_backend(backend)
-    module, _, name = BACKENDS[backend].partition(":")
+    made_by = _class_of(backend)
     given: dict[str, Any] = {"forces": tuple(forces)} if forces else {}
     if hardware is not None:
         given["hardware"] = hardware
     for word, fits in (("forces", SIMULATORS), ("hardware", REAL)):
         if word in given and backend not in fits:
             raise InputError(f"backend '{backend}' takes no {word}; {', '.join(fits)} would")
-    return getattr(importlib.import_module(module), name)(robot, count, options, **given)
+    return made_by(load_robot(robot, check=False), count, options, **given)  # a plant refuses what it cannot simulate
+
+
+def _class_of(backend: str) -> Any:
+    entry = BACKENDS[backend]
+    module, _, name = entry.partition(":")
+    where = f"BACKENDS['{backend}'] = '{entry}'"
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if not f"{module}.".startswith(f"{error.name}."):  # one that the module itself needs
+            raise
+        raise InputError(f"{where}: no module '{error.name}'; expected 'module:class'") from None
+    if not hasattr(found, name):
+        raise unknown_name("class", name, [one for one, kind in vars(found).items() if isinstance(kind, type)], where)
+    return getattr(found, name)
 
 
 def robot_file(hardware: RobotOptions) -> str | None:

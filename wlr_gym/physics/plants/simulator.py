@@ -113,6 +113,8 @@ class Simulator(ABC):
     ) -> Sensors:
         """Start robots anew; see :meth:`wlr_gym.physics.plants.base.Plant.reset`."""
         rows = self._rows(mask)
+        if seeds is not None:
+            seeds = _checked(seeds, self._count)
         if parameters is not None:
             self._take_parameters(parameters, rows)
         start = standing_state(self.robot, self.parameters) if state is None else state
@@ -260,3 +262,13 @@ def check_contact_resolution(parameters: Parameters, step: float) -> None:
             f"stiff for a physics step of {step:g} s and a body of {parameters['body.mass'][robot]:g} kg: shorten physics_step "
             f"below {step / worst[robot] ** 0.5:.2g} s or soften the contact"
         )
+
+
+def _checked(seeds: Any, count: int) -> NDArray[np.uint64]:
+    try:
+        found = np.asarray(seeds, np.uint64)
+    except (OverflowError, TypeError, ValueError):
+        found = None
+    if found is None or found.shape != (count,) or not np.array_equal(found, seeds):
+        raise InputError(f"seeds = {seeds!r}: expected whole numbers from 0 on, one for each robot, here {count}")
+    return found
