@@ -88,7 +88,9 @@ class RobotProblem:
         self.disagreement, self.misfit = DISAGREEMENT, MISFIT
         self.thorough, self.held_out = False, ()
         seen = any("cam_x" in run for run in runs)
-        self.motions = {name: motion for name, motion in shown_by().items() if seen or not name.startswith("camera_")}
+        self.motions: Mapping[str, str] = {
+            name: motion for name, motion in shown_by().items() if seen or not name.startswith("camera_")
+        }
         self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
             wheel: (f"joint_position[{wheel}]", (*(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff")), *ROCKING))
             for wheel in WHEELS
