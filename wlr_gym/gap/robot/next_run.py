@@ -177,7 +177,8 @@ def _told(difference: Array, columns: Array) -> float:
 def _own_uncertainty(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
     """How explanations' own numbers may still move, each (numbers, numbers): rows are independent, of unit variance."""
     columns = _own_columns(problem, result, explanations)
-    return [np.linalg.inv(np.linalg.cholesky(np.eye(len(own)) + own @ own.T)) for own in columns]
+    found = (np.linalg.inv(np.linalg.cholesky(np.eye(len(own)) + own @ own.T)) for own in columns)
+    return [np.asarray(one, np.float64) for one in found]
 
 
 def _own_columns(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
