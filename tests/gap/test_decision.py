@@ -14,8 +14,9 @@ from wlr_gym.data.read import read_run
 from wlr_gym.data.record import record_simulation
 from wlr_gym.gap import Budget, Recorded, decide
 from wlr_gym.gap.report.entries import Result
-from wlr_gym.gap.report.explanations import explanations
+from wlr_gym.gap.report.explanations import Explanation, explanations
 from wlr_gym.gap.robot import next_run
+from wlr_gym.physics.effects import PatchEffect
 from wlr_gym.robot import load_robot
 
 decision = importlib.import_module("wlr_gym.gap.decision")
@@ -120,6 +121,16 @@ def test_what_calibration_takes_up_does_not_tell():
     assert next_run._told(np.array([3.0, 0.0]), columns) == pytest.approx(9.0 / (1.0 + 4.0))
     assert next_run._told(np.array([0.0, 2.0]), columns) == pytest.approx(4.0)
     assert next_run._told(np.array([0.0, 2.0]), columns[:0]) == pytest.approx(4.0)
+
+
+def test_own_numbers_are_moved_towards_no_effect_and_those_that_say_nothing_are_not():
+    values = {"mu": 0.3, "x_min": -1000.0, "x_max": 0.5, "y_min": -1000.0, "y_max": 1000.0}
+    patch = Explanation("friction_patch", 0.5, (PatchEffect("friction_patch", ("ground",), values),))
+    moved = [dict(own.parameters) for (own,) in next_run._own_moved(patch)]
+    assert moved == [{**values, "mu": pytest.approx(0.24)}, {**values, "x_min": -800.0}, {**values, "x_max": 0.4}]
+    weak = Explanation("weak_motor", 0.5, (PatchEffect("weak_motor", ("wheel_lf",), {"scale": 0.8}),))
+    assert [own.parameters["scale"] for (own,) in next_run._own_moved(weak)] == [pytest.approx(0.84)]
+    assert next_run._own_moved(Explanation("nothing", 0.5, ())) == []
 
 
 @pytest.mark.slow

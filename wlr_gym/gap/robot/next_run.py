@@ -31,7 +31,7 @@ from wlr_gym.gap.report.entries import AdequacyEntry, Result
 from wlr_gym.gap.report.explanations import NOTHING, Explanation
 from wlr_gym.gap.robot.candidates import shown_by
 from wlr_gym.gap.robot.problem import RobotProblem
-from wlr_gym.physics.effects import PatchEffect, Source
+from wlr_gym.physics.effects import EFFECTS, PatchEffect, Source
 from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
@@ -42,8 +42,8 @@ LEAST_WEIGHT = 1e-6
 TELLS = 2.0 * math.log(19.0)
 #: Half of a 95 % interval, in standard deviations.
 _HALF_95 = 1.96
-#: Relative change of an explanation's own number for finite differences: large, for friction that sticks and slips answers
-#: small ones by chance. Before any run the number is unknown by its whole value.
+#: Change of an explanation's own number for finite differences, towards where the effect vanishes and as a share of how far that
+#: is: large, for friction that sticks and slips answers small ones by chance. Before any run the number is unknown by all of it.
 STEP = 0.2
 #: Share of rows in which a run of an excitation has its setpoints.
 ALIKE = 0.9
@@ -182,7 +182,7 @@ def _own_uncertainty(problem: RobotProblem, result: Result, explanations: Sequen
 
 
 def _own_columns(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
-    """Change of the weighted predictions per relative change of explanations' own numbers, each (numbers, rows)."""
+    """Change of the weighted predictions if explanations' own numbers vanished, each (numbers, rows), from :data:`STEP` of it."""
     values, _ = _calibrated(problem, result)
     moved = [_own_moved(one) for one in explanations]
     settings = [
@@ -197,8 +197,10 @@ def _own_moved(one: Explanation) -> list[tuple[PatchEffect, ...]]:
     if one.name == NOTHING:
         return []
     *before, own = one.effects
-    numbers = [name for name, value in own.parameters.items() if value]
-    moved = [{**own.parameters, name: own.parameters[name] * (1.0 + STEP)} for name in numbers]
+    known = EFFECTS[own.name].parameters if own.name in EFFECTS else {}
+    neutral = {name: parameter.neutral for name, parameter in known.items() if isinstance(parameter.neutral, float | int)}
+    ways = {name: value - neutral.get(name, 0.0) for name, value in own.parameters.items()}
+    moved = [{**own.parameters, name: own.parameters[name] - STEP * way} for name, way in ways.items() if way]
     return [(*before, replace(own, parameters=parameters)) for parameters in moved]
 
 
