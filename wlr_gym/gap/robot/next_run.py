@@ -42,8 +42,8 @@ LEAST_WEIGHT = 1e-6
 TELLS = 2.0 * math.log(19.0)
 #: Half of a 95 % interval, in standard deviations.
 _HALF_95 = 1.96
-#: Change of an explanation's own number for finite differences, towards where the effect vanishes and as a share of how far that
-#: is: large, for friction that sticks and slips answers small ones by chance. Before any run the number is unknown by all of it.
+#: Change of an explanation's own number for finite differences, a share of the way to where the effect vanishes: large, for
+#: friction that sticks and slips answers small ones by chance. Before any run the number is unknown by the whole way.
 STEP = 0.2
 #: Share of rows in which a run of an excitation has its setpoints.
 ALIKE = 0.9
@@ -182,7 +182,7 @@ def _own_uncertainty(problem: RobotProblem, result: Result, explanations: Sequen
 
 
 def _own_columns(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
-    """Change of the weighted predictions if explanations' own numbers vanished, each (numbers, rows), from :data:`STEP` of it."""
+    """Change of the weighted predictions per way of an explanation's own numbers (see :data:`STEP`), each (numbers, rows)."""
     values, _ = _calibrated(problem, result)
     moved = [_own_moved(one) for one in explanations]
     settings = [
