@@ -45,8 +45,12 @@ def frozen(joint, since):
     return spoil
 
 
-def turned(channel):
-    return lambda table: table.assign(**{channel: -table[channel]})
+def turned(*channels):
+    return lambda table: table.assign(**{channel: -table[channel] for channel in channels})
+
+
+def all_of(joint):
+    return [f"{kind}_{joint}" for kind in ("pos", "vel", "eff")]
 
 
 def late(seconds, since):
@@ -75,6 +79,9 @@ FAULTS = {
     "dead wheel": (frozen("wheel_lr", 0), "pos_wheel_lr", "dead", None),
     "wheel that dies": (frozen("wheel_rf", 120), "pos_wheel_rf", "dead", (2.4, 4.5)),
     "leg that dies": (frozen("leg_lr", 120), "pos_leg_lr", "dead", (2.4, 4.5)),
+    "wheel of the wrong sign": (turned(*all_of("wheel_lf")), "pos_wheel_lf", "mirrored", None),
+    "wheel angle of the wrong sign": (turned("pos_wheel_lf"), "pos_wheel_lf", "mirrored", None),
+    "leg of the wrong sign": (turned(*all_of("leg_rf")), "pos_leg_rf", "mirrored", None),
     "wheel effort of the wrong sign": (turned("eff_wheel_rr"), "eff_wheel_rr", "mirrored", None),
     "clock that jumps": (late(5.0, 150), "t", "clock", (2.97, 2.99)),
     "clock that jumps a little": (late(0.1, 150), "t", "clock", (2.97, 2.99)),

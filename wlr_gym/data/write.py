@@ -80,8 +80,17 @@ def check_meta(folder: str | Path, meta: RunMeta) -> None:
         InputError: the ``meta.yaml`` that is there says something else (it holds for all runs of the folder).
     """
     path = Path(folder) / META_FILE
-    if path.is_file() and read_meta(folder) != meta:
-        raise InputError(f"{path}: says something else than the meta data of the new run; write it to another folder")
+    there = read_meta(folder) if path.is_file() else meta
+    differ = [key for key in RunMeta.model_fields if getattr(there, key) != getattr(meta, key)]
+    if differ:
+        told = "; ".join(f"{key} is {_said(there, key)} there, {_said(meta, key)} for the new run" for key in differ)
+        raise InputError(f"{path}: says something else than the meta data of the new run: {told}; write it to another folder")
+
+
+def _said(meta: RunMeta, key: str) -> str:
+    """A value of meta data as its file says it."""
+    value = meta.model_dump(mode="json")[key]
+    return "not stated" if value is None else repr(value)
 
 
 def write_csv(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
