@@ -108,13 +108,28 @@ def test_a_fault_of_one_run_is_named(fault, good, tmp_path):
     assert time is None or (named.time is not None and time[0] <= named.time <= time[1])
 
 
-def test_a_fault_of_all_runs_is_one_also_where_a_run_cannot_show_it(good, tmp_path):
-    straight = good.copy()
-    for name in straight:
+@pytest.fixture
+def straight(good):
+    """A run in which the legs stand."""
+    run = good.copy()
+    for name in run:
         if name.startswith(("pos_leg", "cmd_leg")):
-            straight[name] = 1.4
+            run[name] = 1.4
         if name.startswith("eff_leg"):
-            straight[name] = 0.1 + 0.01 * np.sin(np.arange(len(straight)))
+            run[name] = 0.1 + 0.01 * np.sin(np.arange(len(run)))
+    return run
+
+
+def test_a_leg_of_the_wrong_sign_is_not_called_dead_where_it_stands(good, straight, tmp_path):
+    wrong = turned(*all_of("leg_rf"))
+    found = findings([wrong(good.copy()), wrong(straight)], tmp_path)
+    assert {(one.run, one.channel, one.kind) for one in found} == {
+        ("run_01", "pos_leg_rf", "mirrored"),
+        ("run_02", "pos_leg_rf", "mirrored"),
+    }
+
+
+def test_a_fault_of_all_runs_is_one_also_where_a_run_cannot_show_it(good, straight, tmp_path):
     dead = frozen("leg_rf", 0)
     found = findings([good, straight], tmp_path)
     assert not found

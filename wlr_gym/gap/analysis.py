@@ -196,6 +196,7 @@ class GapFigures:
 
     ``reduction`` is the share of what calibration leaves above the noise floor that the effects remove on held-out runs: 1 at
     most, negative if they make it worse, NaN where calibration leaves nothing; so is its interval, which is NaN of few runs.
+    ``cap``: units that a reading counts at most, so that an error of as many may be any larger one.
     """
 
     metric: str
@@ -207,6 +208,7 @@ class GapFigures:
     noise_floor: float
     reduction: float
     reduction_ci95: tuple[float, float]
+    cap: float = math.inf
 
 
 @dataclass(frozen=True)
