@@ -127,10 +127,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Equivalent:
-    """Effects that these data cannot distinguish, and the discriminating experiment."""
+    """Effects that these data cannot distinguish, and the discriminating experiment; ``where``: places of the first."""
 
     names: tuple[str, ...]
     separating_run: str
+    where: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

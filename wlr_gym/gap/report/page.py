@@ -198,9 +198,9 @@ def _errors(one: RunGap | ChannelGap, gap: GapFigures) -> tuple[str, str, str]:
 def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
     added = f", {capped(gap.heldout_after, gap)} with the effects" if analysis.added else ""
     text = (
-        f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: {capped(gap.fit_before, gap)} "
-        f"before, {capped(gap.fit_after, gap)} after. Held-out runs: {capped(gap.heldout_before, gap)} as given, "
-        f"{capped(gap.heldout_calibrated, gap)} calibrated{added}; noise floor {error(gap.noise_floor)}.</p>"
+        f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: "
+        f"{capped(gap.fit_before, gap)} before, {capped(gap.fit_after, gap)} after. Held-out runs: "
+        f"{capped(gap.heldout_before, gap)} as given, {capped(gap.heldout_calibrated, gap)} calibrated{added}; noise floor {error(gap.noise_floor)}.</p>"
     )
     if not analysis.added:
         return text
