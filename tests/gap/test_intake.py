@@ -7,7 +7,9 @@ from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 from wlr_gym.data import Run
 from wlr_gym.data.write import write_run
 from wlr_gym.gap import analyse
+from wlr_gym.gap.analysis import NO_PROFILE
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
+from wlr_gym.gap.robot.open import open_robot
 
 
 def lively(t):
@@ -170,6 +172,17 @@ def test_an_analysis_says_at_once_which_runs_it_leaves_out(good, tmp_path):
     assert [stage.split()[2] for stage in left_out] == ["run_01", "run_02", "run_03"]
     assert "eff_wheel_rr at " in left_out[0]
     assert "turn the sign of the column" in left_out[0]
+
+
+@pytest.mark.parametrize("meta", [META, None], ids=["stated", "open"])
+def test_a_servo_profile_that_is_not_stated_is_noted(meta, good, tmp_path):
+    for number in (1, 2, 3):
+        write_run(tmp_path / f"run_{number:02d}.parquet", good, meta)
+    problem, found = open_robot(tmp_path)
+    told = [one for one in found if one.kind == NO_PROFILE]
+    assert problem is not None
+    assert [one.fatal for one in told] == ([] if meta else [False])
+    assert all("does not state the servo profile (profile): none is assumed" in one.text for one in told)
 
 
 def test_lost_rows_frames_and_a_noisier_or_scaled_sensor_are_no_fault(good, tmp_path):

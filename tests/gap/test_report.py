@@ -15,6 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.text import number
 from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.gap.analysis import (
+    NO_PROFILE,
     Analysis,
     ChannelGap,
     Equivalent,
@@ -101,6 +102,12 @@ def test_verdict_comes_first_in_one_sentence(analysis, tmp_path):
     assert "\n" not in line
     body = page.text.partition(analysis.data)[2]  # after the title
     assert body.index(line) < body.index("Data:")
+
+
+def test_an_open_servo_profile_is_said_under_the_verdict(tmp_path):
+    assumed = IntakeFinding("", "", NO_PROFILE, "meta.yaml does not state the servo profile")
+    page = page_of(replace(examples.EFFECT_FOUND, intake=(assumed,)), tmp_path)
+    assert page.text.index(f"{assumed.text}.") < page.text.index("Where")
 
 
 def test_order_of_the_sections(tmp_path):

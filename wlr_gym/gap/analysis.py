@@ -27,6 +27,8 @@ TOO_LITTLE = "too little"
 FAILS_CROSS_VALIDATION = "fails cross-validation"
 REMOVED = "removed"
 REJECTED = "rejected at screening"
+#: Kind of the finding that the data do not say which servo profile they were recorded with.
+NO_PROFILE = "servo_profile"
 
 
 @dataclass(frozen=True)

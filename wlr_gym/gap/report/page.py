@@ -16,6 +16,7 @@ from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
+    NO_PROFILE,
     NOT_EXCITED,
     NOTHING_MISSING,
     UNKNOWN,
@@ -116,7 +117,8 @@ def _header(analysis: Analysis) -> str:
     known = [str(effect.get("name", "")) for effect in analysis.known_effects]
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
-    left = "".join(f"<p>{escape(text)}</p>\n" for text in (made_worse(analysis), closure(analysis)) if text)
+    assumed = [f"{one.text}." for one in analysis.intake if one.kind == NO_PROFILE]
+    left = "".join(f"<p>{escape(text)}</p>\n" for text in (*assumed, made_worse(analysis), closure(analysis)) if text)
     return (
         f'<header>\n<p class="label">{escape(title(analysis))}</p>\n<h1>{escape(sentence(analysis))}</h1>\n{left}'
         f'<p class="small">{"; ".join(facts)}.</p>\n</header>\n{_tiles(analysis)}'
@@ -200,7 +202,8 @@ def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
     text = (
         f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: "
         f"{capped(gap.fit_before, gap)} before, {capped(gap.fit_after, gap)} after. Held-out runs: "
-        f"{capped(gap.heldout_before, gap)} as given, {capped(gap.heldout_calibrated, gap)} calibrated{added}; noise floor {error(gap.noise_floor)}.</p>"
+        f"{capped(gap.heldout_before, gap)} as given, {capped(gap.heldout_calibrated, gap)} calibrated{added}; "
+        f"noise floor {error(gap.noise_floor)}.</p>"
     )
     if not analysis.added:
         return text
