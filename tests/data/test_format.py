@@ -206,6 +206,12 @@ def test_wrong_unit_in_a_whole_kind(tmp_path, table, kind):
     refused(write_raw(tmp_path / "run_01.csv", table), f"'{kind}_", "degrees")
 
 
+@pytest.mark.parametrize("column", ["cmd_wheel_lf", "vel_wheel_lf", "vel_leg_rr"])
+def test_one_value_of_a_rate_does_not_tell_degrees_from_rpm(tmp_path, table, column):
+    table[column] = np.full(len(table["t"]), 30.0)
+    refused(write_raw(tmp_path / "run_01.csv", table), f"'{column}': 30", "degrees per second (57.3 times) or rpm (9.55 times)")
+
+
 def test_everything_in_degrees(tmp_path, table):
     for name in table:
         if COLUMNS[name].unit.startswith("rad"):
@@ -359,8 +365,9 @@ def test_writing_refuses_what_reading_refuses(tmp_path, table):
 def test_writing_does_not_overwrite_other_meta_data(tmp_path, table):
     write_run(tmp_path / "run_01.csv", table, RunMeta(ground="mat"))
     write_run(tmp_path / "run_02.csv", table, RunMeta(ground="mat"))
-    with pytest.raises(InputError, match="says something else"):
-        write_run(tmp_path / "run_03.csv", table, RunMeta(ground="tiles"))
+    told = "says something else .*: ground is 'mat' there, 'tiles' for the new run; notes is not stated there, 'wet' for the"
+    with pytest.raises(InputError, match=told):
+        write_run(tmp_path / "run_03.csv", table, RunMeta(ground="tiles", notes="wet"))
 
 
 def test_a_broken_write_leaves_the_old_file(tmp_path, table, monkeypatch):

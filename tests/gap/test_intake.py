@@ -7,7 +7,9 @@ from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 from wlr_gym.data import Run
 from wlr_gym.data.write import write_run
 from wlr_gym.gap import analyse
+from wlr_gym.gap.analysis import NO_PROFILE
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
+from wlr_gym.gap.robot.open import open_robot
 
 
 def lively(t):
@@ -45,8 +47,12 @@ def frozen(joint, since):
     return spoil
 
 
-def turned(channel):
-    return lambda table: table.assign(**{channel: -table[channel]})
+def turned(*channels):
+    return lambda table: table.assign(**{channel: -table[channel] for channel in channels})
+
+
+def all_of(joint):
+    return [f"{kind}_{joint}" for kind in ("pos", "vel", "eff")]
 
 
 def late(seconds, since):
@@ -75,6 +81,9 @@ FAULTS = {
     "dead wheel": (frozen("wheel_lr", 0), "pos_wheel_lr", "dead", None),
     "wheel that dies": (frozen("wheel_rf", 120), "pos_wheel_rf", "dead", (2.4, 4.5)),
     "leg that dies": (frozen("leg_lr", 120), "pos_leg_lr", "dead", (2.4, 4.5)),
+    "wheel of the wrong sign": (turned(*all_of("wheel_lf")), "pos_wheel_lf", "mirrored", None),
+    "wheel angle of the wrong sign": (turned("pos_wheel_lf"), "pos_wheel_lf", "mirrored", None),
+    "leg of the wrong sign": (turned(*all_of("leg_rf")), "pos_leg_rf", "mirrored", None),
     "wheel effort of the wrong sign": (turned("eff_wheel_rr"), "eff_wheel_rr", "mirrored", None),
     "clock that jumps": (late(5.0, 150), "t", "clock", (2.97, 2.99)),
     "clock that jumps a little": (late(0.1, 150), "t", "clock", (2.97, 2.99)),
@@ -101,13 +110,28 @@ def test_a_fault_of_one_run_is_named(fault, good, tmp_path):
     assert time is None or (named.time is not None and time[0] <= named.time <= time[1])
 
 
-def test_a_fault_of_all_runs_is_one_also_where_a_run_cannot_show_it(good, tmp_path):
-    straight = good.copy()
-    for name in straight:
+@pytest.fixture
+def straight(good):
+    """A run in which the legs stand."""
+    run = good.copy()
+    for name in run:
         if name.startswith(("pos_leg", "cmd_leg")):
-            straight[name] = 1.4
+            run[name] = 1.4
         if name.startswith("eff_leg"):
-            straight[name] = 0.1 + 0.01 * np.sin(np.arange(len(straight)))
+            run[name] = 0.1 + 0.01 * np.sin(np.arange(len(run)))
+    return run
+
+
+def test_a_leg_of_the_wrong_sign_is_not_called_dead_where_it_stands(good, straight, tmp_path):
+    wrong = turned(*all_of("leg_rf"))
+    found = findings([wrong(good.copy()), wrong(straight)], tmp_path)
+    assert {(one.run, one.channel, one.kind) for one in found} == {
+        ("run_01", "pos_leg_rf", "mirrored"),
+        ("run_02", "pos_leg_rf", "mirrored"),
+    }
+
+
+def test_a_fault_of_all_runs_is_one_also_where_a_run_cannot_show_it(good, straight, tmp_path):
     dead = frozen("leg_rf", 0)
     found = findings([good, straight], tmp_path)
     assert not found
@@ -148,6 +172,17 @@ def test_an_analysis_says_at_once_which_runs_it_leaves_out(good, tmp_path):
     assert [stage.split()[2] for stage in left_out] == ["run_01", "run_02", "run_03"]
     assert "eff_wheel_rr at " in left_out[0]
     assert "turn the sign of the column" in left_out[0]
+
+
+@pytest.mark.parametrize("meta", [META, None], ids=["stated", "open"])
+def test_a_servo_profile_that_is_not_stated_is_noted(meta, good, tmp_path):
+    for number in (1, 2, 3):
+        write_run(tmp_path / f"run_{number:02d}.parquet", good, meta)
+    problem, found = open_robot(tmp_path)
+    told = [one for one in found if one.kind == NO_PROFILE]
+    assert problem is not None
+    assert [one.fatal for one in told] == ([] if meta else [False])
+    assert all("does not state the servo profile (profile): none is assumed" in one.text for one in told)
 
 
 def test_lost_rows_frames_and_a_noisier_or_scaled_sensor_are_no_fault(good, tmp_path):

@@ -14,7 +14,19 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.text import number
 from wlr_gym.data.format import CHANNELS, COLUMNS
-from wlr_gym.gap.analysis import Analysis, ChannelGap, Evidence, FoundEffect, HeatMap, IntakeFinding, ParameterEstimate, Place
+from wlr_gym.gap.analysis import (
+    NO_PROFILE,
+    Analysis,
+    ChannelGap,
+    Equivalent,
+    Evidence,
+    FoundEffect,
+    HeatMap,
+    IntakeFinding,
+    ParameterEstimate,
+    Place,
+    Threshold,
+)
 from wlr_gym.gap.report import folder
 from wlr_gym.gap.report.folder import check_folder, save_analysis
 from wlr_gym.gap.report.page import report
@@ -92,6 +104,12 @@ def test_verdict_comes_first_in_one_sentence(analysis, tmp_path):
     assert body.index(line) < body.index("Data:")
 
 
+def test_an_open_servo_profile_is_said_under_the_verdict(tmp_path):
+    assumed = IntakeFinding("", "", NO_PROFILE, "meta.yaml does not state the servo profile")
+    page = page_of(replace(examples.EFFECT_FOUND, intake=(assumed,)), tmp_path)
+    assert page.text.index(f"{assumed.text}.") < page.text.index("Where")
+
+
 def test_order_of_the_sections(tmp_path):
     page = page_of(examples.EFFECT_FOUND, tmp_path)
     assert page.headings == [
@@ -140,14 +158,33 @@ def test_every_candidate_is_shown_with_why_it_lost(tmp_path):
         if one.outcome == "rejected at screening":
             assert one.reason in [row[3] for row in page.rows if len(row) == 4 and row[0] == plain(one.name)]
         else:
-            mine = [row for row in page.rows if len(row) == 7 and row[0] == plain(one.name) and row[5] == one.outcome]
-            assert all(row[6] == one.reason for row in mine)
+            mine = [row for row in page.rows if len(row) == 8 and row[0] == plain(one.name) and row[6] == one.outcome]
+            assert all(row[7] == one.reason for row in mine)
             assert [number(one.gain), number(one.screened)] in [row[3:5] for row in mine if row[1] == places(one.where)]
     backlash = next(row for row in page.rows if row[0] == "backlash")
     assert backlash[1] == "left front leg; less at 7 other places"
-    assert [row[5] for row in page.rows if "5312" in row] == ["selected"]
+    assert [row[6] for row in page.rows if "5312" in row] == ["selected"]
     selected = [value for tag, name, value in page.attributes if (tag, name) == ("tr", "class") and value == "selected"]
     assert len(selected) == 1
+
+
+def test_candidates_and_none_of_them_have_their_probability(tmp_path):
+    first, *others = examples.EFFECT_FOUND.evidence
+    likely = (replace(first, probability=0.87), *others)
+    page = page_of(replace(examples.EFFECT_FOUND, evidence=likely, thresholds=(Threshold(1, 16.0, 9.0, 0.04),)), tmp_path)
+    assert [row[5] for row in page.rows if len(row) == 8 and row[4] == number(first.screened)] == ["87 %"]
+    assert "Probability that none of them is missing: 4 %." in page.text
+
+
+def test_an_error_as_large_as_counts_is_shown_as_at_least_that(tmp_path):
+    first = examples.EFFECT_FOUND.channel_gaps[0]
+    channels = (replace(first, before=50.0, calibrated=49.9, after=3.0, worse=True),)
+    far = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, cap=50.0, heldout_before=50.0), channel_gaps=channels)
+    page = page_of(far, tmp_path)
+    assert ["50 or more", "49.9", "3.00"] in [row[3:] for row in page.rows if row and row[0] == first.channel]
+    assert "Held-out runs: 50 or more as given" in page.text
+    assert result_of(far).gap.cap == 50.0
+    assert "50 or more" not in page_of(examples.EFFECT_FOUND, tmp_path).text
 
 
 def test_without_effects_nothing_is_said_of_effects(tmp_path):
@@ -256,6 +293,10 @@ def test_sentences_say_what_was_found():
     assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=())).startswith(
         "The model lacks 2 effects: rolling resistance (both front wheels) and payload (body); added, they remove 95 %"
     )
+    doubts = (*examples.EFFECT_FOUND.equivalent, Equivalent(("payload", "com_offset", "floor_slope"), ""))
+    assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=doubts)).endswith(
+        "; these data do not distinguish rolling resistance from coulomb friction, nor payload from com offset or floor slope."
+    )
 
 
 def test_what_is_left_without_a_name_is_not_called_nothing():
@@ -288,8 +329,13 @@ def test_what_is_left_is_said_with_every_verdict_and_where(verdict, tmp_path):
 
 
 def test_groups_of_channels_have_words():
-    groups = {COLUMNS[name].group for name in CHANNELS} | {"position"}  # the rig's
-    assert groups <= set(_GROUPS)
+    assert {COLUMNS[name].group for name in CHANNELS} <= set(_GROUPS)
+
+
+def test_a_column_of_a_system_of_ones_own_keeps_its_name():
+    gap = ChannelGap("position: 0.5 s", "m", 1.0, 5.0, 5.0, 3.0, "position")
+    far = replace(examples.NOTHING_MISSING, gap=replace(examples.GAP, heldout_after=3.0), channel_gaps=(gap,))
+    assert closure(far).endswith("100 % of it is in position.")
 
 
 @pytest.mark.parametrize(

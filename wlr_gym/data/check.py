@@ -60,12 +60,15 @@ class _UnitLimit:
     rate: bool = False
 
 
+#: Rates of servos, by how much larger they then are: one value does not tell which.
+_SERVO_RATE = "degrees per second (57.3 times) or rpm (9.55 times)"
+
 _UNIT_LIMITS = (
     _UnitLimit("cmd_leg", 0.5, 2 * math.pi, "degrees"),
     _UnitLimit("pos_leg", 0.5, 2 * math.pi, "degrees"),
-    _UnitLimit("cmd_wheel", 1.0, 25.0, "degrees per second"),  # the goal register ends at 1023 x 0.229 rpm = 24.5 rad/s
-    _UnitLimit("vel_leg", 0.95, 25.0, "degrees per second"),
-    _UnitLimit("vel_wheel", 0.95, 25.0, "degrees per second"),
+    _UnitLimit("cmd_wheel", 1.0, 25.0, _SERVO_RATE),  # the goal register ends at 1023 x 0.229 rpm = 24.5 rad/s
+    _UnitLimit("vel_leg", 0.95, 25.0, _SERVO_RATE),
+    _UnitLimit("vel_wheel", 0.95, 25.0, _SERVO_RATE),
     _UnitLimit("gyro", 0.95, 25.0, "degrees per second"),
     _UnitLimit("flow", 0.95, 25.0, "degrees per second"),
     _UnitLimit("cam_xy", 0.8, 5.0, "millimetres", rate=True),

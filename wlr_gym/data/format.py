@@ -130,3 +130,8 @@ class RunMeta(SettingsModel):
     ground: str | None = None
     marker_offset: Vector3 = (0.0, 0.0, 0.0)
     notes: str | None = None
+
+    @property
+    def states_profile(self) -> bool:
+        """Whether the servo profile was given; where not, it is assumed that there is none."""
+        return "profile" in self.model_fields_set

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,8 +58,8 @@ def write_run(
     return path
 
 
-def write_meta(folder: str | Path, meta: RunMeta) -> Path:
-    """Write ``meta.yaml``; one that is there and says the same is left alone.
+def write_meta(folder: str | Path, meta: RunMeta, leave_out: Collection[str] = ()) -> Path:
+    """Write ``meta.yaml``, without the keys of ``leave_out``; one that is there and says the same is left alone.
 
     Raises:
         InputError: the one that is there says something else (it holds for all runs of the folder).
@@ -68,7 +68,9 @@ def write_meta(folder: str | Path, meta: RunMeta) -> Path:
     check_meta(folder, meta)
     if path.is_file():
         return path
-    text = yaml.safe_dump(meta.model_dump(mode="json", exclude_none=True), sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump(
+        meta.model_dump(mode="json", exclude_none=True, exclude={*leave_out}), sort_keys=False, allow_unicode=True
+    )
     write_text(path, text)
     return path
 
@@ -80,8 +82,17 @@ def check_meta(folder: str | Path, meta: RunMeta) -> None:
         InputError: the ``meta.yaml`` that is there says something else (it holds for all runs of the folder).
     """
     path = Path(folder) / META_FILE
-    if path.is_file() and read_meta(folder) != meta:
-        raise InputError(f"{path}: says something else than the meta data of the new run; write it to another folder")
+    there = read_meta(folder) if path.is_file() else meta
+    differ = [key for key in RunMeta.model_fields if getattr(there, key) != getattr(meta, key)]
+    if differ:
+        told = "; ".join(f"{key} is {_said(there, key)} there, {_said(meta, key)} for the new run" for key in differ)
+        raise InputError(f"{path}: says something else than the meta data of the new run: {told}; write it to another folder")
+
+
+def _said(meta: RunMeta, key: str) -> str:
+    """A value of meta data as its file says it."""
+    value = meta.model_dump(mode="json")[key]
+    return "not stated" if value is None else repr(value)
 
 
 def write_csv(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:

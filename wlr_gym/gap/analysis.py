@@ -27,6 +27,8 @@ TOO_LITTLE = "too little"
 FAILS_CROSS_VALIDATION = "fails cross-validation"
 REMOVED = "removed"
 REJECTED = "rejected at screening"
+#: Kind of the finding that the data do not say which servo profile they were recorded with.
+NO_PROFILE = "servo_profile"
 
 
 @dataclass(frozen=True)
@@ -127,10 +129,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Equivalent:
-    """Effects that these data cannot distinguish, and the discriminating experiment."""
+    """Effects that these data cannot distinguish, and the discriminating experiment; ``where``: places of the first."""
 
     names: tuple[str, ...]
     separating_run: str
+    where: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -196,6 +199,7 @@ class GapFigures:
 
     ``reduction`` is the share of what calibration leaves above the noise floor that the effects remove on held-out runs: 1 at
     most, negative if they make it worse, NaN where calibration leaves nothing; so is its interval, which is NaN of few runs.
+    ``cap``: units that a reading counts at most, so that an error of as many may be any larger one.
     """
 
     metric: str
@@ -207,6 +211,7 @@ class GapFigures:
     noise_floor: float
     reduction: float
     reduction_ci95: tuple[float, float]
+    cap: float = math.inf
 
 
 @dataclass(frozen=True)

@@ -211,7 +211,7 @@ def analyse_problem(
         run_gaps=run_gaps,
         channel_gaps=channel_gaps,
         detectable=shown,
-        recommendations=recommend(search.rounds[-1], [group.names for group in groups], verdict, problem.motions),
+        recommendations=recommend(search.rounds[-1], groups, verdict, problem.motions),
         adequacy=adequacy,
         turning=turned,
         known_effects=tuple(effect.content() for effect in load_patch(known).effects),
@@ -316,8 +316,8 @@ def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...
         swapped = search.swaps.get(one.candidate.label)
         others = equivalents(*swapped) if swapped else look.equivalents
         if others:
-            names = (one.candidate.name, *(other.candidate.name for other in others))
-            groups.append(Equivalent(names, separating_run(names, problem.motions)))
+            names, where = (one.candidate.name, *(other.candidate.name for other in others)), one.candidate.where
+            groups.append(Equivalent(names, separating_run(names, problem.motions, where), where))
     return tuple(groups)
 
 

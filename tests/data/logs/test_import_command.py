@@ -23,14 +23,27 @@ def test_suggest_then_import(bag, tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "sure" in said
     assert "topic '/chassis/joints', in deg" in said
+    assert "meta.profile" in said
     assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == OK
     said = capsys.readouterr().out
     assert "as recorded" in said
     assert "interpolated" in said
+    assert "does not state the servo profile (meta.profile): none is assumed" in " ".join(said.split())
     (run,) = read_dataset("runs").runs
     assert run.meta.robot == "wlr-nominal"
+    assert not run.meta.states_profile
     record = read_yaml("runs/import.yaml")["run_01"]
     assert record["channels"]["gyro_x"]["rate"] == pytest.approx(200.0)
+
+
+@pytest.mark.parametrize("profile", ["{leg_velocity: 1.4}", "{leg_velocity: 0}"], ids=["one", "none"])
+def test_a_profile_that_the_map_states_is_not_called_open(bag, tmp_path, monkeypatch, capsys, profile):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(f"meta: {{profile: {profile}}}\n")
+    assert main(["import", str(bag), "--suggest", "--map", "mine.yaml"]) == OK
+    assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == OK
+    assert "meta.profile" not in capsys.readouterr().out
+    assert read_dataset("runs").meta.states_profile
 
 
 def test_a_map_that_is_there_is_not_overwritten(bag, tmp_path, monkeypatch, capsys):

@@ -38,7 +38,8 @@ def test_units_axes_signs_and_clocks_are_found(proposal):
     assert found.clocks["imu"].offset == pytest.approx(EPOCH - UPTIME + 0.002, abs=0.01)  # it is received 2 ms after joints
     assert found.clocks["optitrack"].offset == pytest.approx(0.08, abs=0.01)
     assert {reason.what for reason in proposal.reasons if reason.sure == "guess"} == {
-        f"joints.{joint}" for joint in JOINTS if joint not in WHEELS
+        "meta.profile",
+        *(f"joints.{joint}" for joint in JOINTS if joint not in WHEELS),
     }
 
 

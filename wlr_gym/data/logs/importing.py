@@ -20,7 +20,7 @@ from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_table
 from wlr_gym.data.logs.exported import read_exported
-from wlr_gym.data.logs.map import LogMap, Resolved, map_text, read_map, resolve
+from wlr_gym.data.logs.map import NO_PROFILE, LogMap, Resolved, map_text, read_map, resolve
 from wlr_gym.data.logs.messages import RUN
 from wlr_gym.data.logs.open import first_messages, quiet, read_logs, read_recordings
 from wlr_gym.data.logs.parts import runs_of, write_samples
@@ -122,10 +122,11 @@ def import_log(
         if not made:
             raise InputError(f"{log}: nothing in it")
         write_map(out / MAP_FILE, map)
-        write_meta(out, meta)
+        write_meta(out, meta, () if meta.states_profile else ("profile",))
+        open_ends = () if meta.states_profile else (NO_PROFILE,)
         imported = []
         for one in made:
-            imported.append(_moved(one, next_run(out, suffix)))
+            imported.append(_moved(replace(one, notes=(*one.notes, *open_ends)), next_run(out, suffix)))
             record[imported[-1].path.stem] = _entry(imported[-1])
             _write_record(out, record)  # with each run: whatever stops this, it knows all that are there
     return imported

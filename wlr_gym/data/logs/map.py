@@ -64,6 +64,13 @@ class JointSource(SettingsModel):
     zero: float = 0.0
 
 
+#: Said where a map is proposed or used that leaves the servo profile open.
+NO_PROFILE = (
+    "the map does not state the servo profile (meta.profile): none is assumed, and wlr gap takes that as true; a profile that "
+    "was set then looks like a command delay or a slow servo"
+)
+
+
 class TopicClock(SettingsModel):
     """When a topic's messages were measured: by their ``header`` or as the ``log`` received them, and s to add to that."""
 
@@ -164,7 +171,10 @@ def _plain(given: Mapping[str, Any]) -> dict[str, Any]:
 
 def content(found: LogMap) -> dict[str, Any]:
     """Return what a map file says: all that is not as it would be without it."""
-    return found.model_dump(mode="json", exclude_defaults=True)
+    said = found.model_dump(mode="json", exclude_defaults=True)
+    if found.meta.states_profile:  # also where it says that there is none
+        said.setdefault("meta", {}).setdefault("profile", found.meta.profile.model_dump(mode="json"))
+    return said
 
 
 def map_text(found: LogMap) -> str:

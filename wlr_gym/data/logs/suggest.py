@@ -13,7 +13,7 @@ from wlr_gym.base.settings import parse_config
 from wlr_gym.data.format import CAMERA, COLUMNS
 from wlr_gym.data.logs.candidates import FieldCandidate, find_candidates, is_unnamed
 from wlr_gym.data.logs.clocks import set_clocks
-from wlr_gym.data.logs.map import GROUPS, ChannelSource, JointSource, LogMap, combine
+from wlr_gym.data.logs.map import GROUPS, NO_PROFILE, ChannelSource, JointSource, LogMap, combine
 from wlr_gym.data.logs.signals import GUESS, SURE, LogSignals, Reason, roughly_one_clock
 from wlr_gym.data.logs.suggest_body import find_imu, find_pose, wheel_motion
 from wlr_gym.data.logs.suggest_joints import JointFindings, find_joints
@@ -64,6 +64,8 @@ def propose(log: Log, robot: Robot, given: Mapping[str, Any] | None = None) -> P
     set_clocks(look, body, wheels, imu.heading, imu.pushed)
     units = dict(imu.units)
     _voltage(look, units)
+    if not known.meta.states_profile:
+        look.note("meta.profile", GUESS, NO_PROFILE)
     proposed = LogMap.model_validate(_content(look, joints, units))
     used = {one.topic for one in look.chosen.values()}
     unused = tuple(name for name in log.topics if name not in used)

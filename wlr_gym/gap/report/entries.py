@@ -84,7 +84,7 @@ class GapEntry(_Entry):
 
     ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
     calibration leaves nothing to remove and in results of versions without it. The interval is that of
-    ``reduction_signed``, null where held-out runs are too few.
+    ``reduction_signed``, null where held-out runs are too few. ``cap``: what a reading counts at most.
     """
 
     metric: str
@@ -97,6 +97,7 @@ class GapEntry(_Entry):
     reduction: Share
     reduction_signed: Annotated[float | None, Field(le=1.0), BeforeValidator(finite)] = None
     reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
+    cap: MaybeNumber = None
 
 
 class RelationEntry(_Entry):

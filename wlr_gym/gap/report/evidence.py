@@ -23,14 +23,17 @@ def evidence_section(analysis: Analysis, picture: str) -> str:
     if analysis.evidence:
         rounds = sorted({one.round for one in analysis.evidence})
         parts += [heading("Candidates compared"), _COMPARED, picture]
-        parts += [_evidence([one for one in analysis.evidence if one.round == turn], turn) for turn in rounds]
+        none = {one.round: one.none for one in analysis.thresholds}
+        for turn in rounds:
+            parts.append(_evidence([one for one in analysis.evidence if one.round == turn], turn, none.get(turn, math.nan)))
     return section("What", *parts)
 
 
 _COMPARED = """<p>Every candidate was scored by its <i>predicted</i> improvement of the calibrated model (score test, a linear
 estimate). The best were added and refitted together with all calibrated parameters: their <i>gain</i> is the fall of minus two
-log posterior, of which chance alone gives about 1 for each fitted number. One effect is selected per round, then the search
-starts again.</p>"""
+log posterior, of which chance alone gives about 1 for each fitted number. Their
+<i>probability</i> is among all that were refitted and none of them. One effect is selected per round, then the search starts
+again.</p>"""
 
 
 def _effect(effect: FoundEffect) -> str:
@@ -59,18 +62,28 @@ def _tried(validity: Mapping[str, Range]) -> str:
     return escape(listed(texts, "and"))
 
 
-def _evidence(evidence: Sequence[Evidence], turn: int) -> str:
+def _evidence(evidence: Sequence[Evidence], turn: int, none: float) -> str:
+    """The candidates of one round; ``none``: probability that none of them is missing."""
     fitted = sorted((one for one in evidence if one.outcome != REJECTED), key=_rank)
     rows = [
-        (plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), one.outcome, one.reason)
+        (
+            plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), percent(one.probability),
+            one.outcome, one.reason,
+        )
         for one in fitted
-    ]
+    ]  # fmt: skip
     rejected = [_rejected(alike) for alike in _by_name([one for one in evidence if one.outcome == REJECTED])]
     classes = ["selected" if one.outcome == SELECTED else "" for one in fitted]
     return "\n".join(
         [
             heading(f"Round {turn}: {counted(len(evidence), 'candidate')} compared"),
-            table(("candidate", "where", "values", "gain", "predicted", "outcome", "reason"), rows, {3, 4}, classes),
+            table(
+                ("candidate", "where", "values", "gain", "predicted", "probability", "outcome", "reason"),
+                rows,
+                {3, 4, 5},
+                classes,
+            ),
+            f"<p>Probability that none of them is missing: {percent(none)}.</p>" if math.isfinite(none) else "",
             folded(
                 f"{counted(len(rejected), 'effect')} rejected at screening",
                 table(("effect", "where", "predicted", "reason"), rejected, {2}),

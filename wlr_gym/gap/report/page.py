@@ -16,6 +16,7 @@ from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
+    NO_PROFILE,
     NOT_EXCITED,
     NOTHING_MISSING,
     UNKNOWN,
@@ -34,6 +35,7 @@ from wlr_gym.gap.report.recommendation import record_commands
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of
 from wlr_gym.gap.report.text import (
     adequacy,
+    capped,
     channel,
     closure,
     error,
@@ -115,7 +117,8 @@ def _header(analysis: Analysis) -> str:
     known = [str(effect.get("name", "")) for effect in analysis.known_effects]
     if known:
         facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
-    left = "".join(f"<p>{escape(text)}</p>\n" for text in (made_worse(analysis), closure(analysis)) if text)
+    assumed = [f"{one.text}." for one in analysis.intake if one.kind == NO_PROFILE]
+    left = "".join(f"<p>{escape(text)}</p>\n" for text in (*assumed, made_worse(analysis), closure(analysis)) if text)
     return (
         f'<header>\n<p class="label">{escape(title(analysis))}</p>\n<h1>{escape(sentence(analysis))}</h1>\n{left}'
         f'<p class="small">{"; ".join(facts)}.</p>\n</header>\n{_tiles(analysis)}'
@@ -130,9 +133,10 @@ def _tiles(analysis: Analysis) -> str:
     gap = analysis.gap
     if gap is None:
         return ""
-    tiles = [(error(gap.heldout_before), "error of the model as given"), (error(gap.heldout_calibrated), "after calibration")]
+    before, calibrated, after = (capped(one, gap) for one in (gap.heldout_before, gap.heldout_calibrated, gap.heldout_after))
+    tiles = [(before, "error of the model as given"), (calibrated, "after calibration")]
     if analysis.added:
-        tiles.append((error(gap.heldout_after), "with the effects added"))
+        tiles.append((after, "with the effects added"))
     tiles.append((error(gap.noise_floor), "noise floor: what a perfect model reaches"))
     if analysis.added:
         tiles.append((percent(gap.reduction), f"of the avoidable error removed; {interval(analysis)}"))
@@ -172,11 +176,11 @@ def _how_much(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     headings = ("as given", "calibrated", "with effects")[: 3 if analysis.added else 2]
     of_runs = (*headings, "removed") if analysis.added else headings
     runs = [
-        (one.run, "held out" if one.heldout else "fitted", *(*_errors(one), percent(one.reduction))[: len(of_runs)])
+        (one.run, "held out" if one.heldout else "fitted", *(*_errors(one, gap), percent(one.reduction))[: len(of_runs)])
         for one in analysis.run_gaps
     ]
     channels = [
-        (one.channel, channel(one.channel), f"{number(one.noise)}{unit_of(one.unit)}", *_errors(one)[: len(headings)])
+        (one.channel, channel(one.channel), f"{number(one.noise)}{unit_of(one.unit)}", *_errors(one, gap)[: len(headings)])
         for one in analysis.channel_gaps
     ]
     return section(
@@ -189,16 +193,17 @@ def _how_much(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     )
 
 
-def _errors(gap: RunGap | ChannelGap) -> tuple[str, str, str]:
-    return error(gap.before), error(gap.calibrated), error(gap.after)
+def _errors(one: RunGap | ChannelGap, gap: GapFigures) -> tuple[str, str, str]:
+    return capped(one.before, gap), capped(one.calibrated, gap), capped(one.after, gap)
 
 
 def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
-    added = f", {error(gap.heldout_after)} with the effects" if analysis.added else ""
+    added = f", {capped(gap.heldout_after, gap)} with the effects" if analysis.added else ""
     text = (
-        f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: {error(gap.fit_before)} "
-        f"before, {error(gap.fit_after)} after. Held-out runs: {error(gap.heldout_before)} as given, "
-        f"{error(gap.heldout_calibrated)} calibrated{added}; noise floor {error(gap.noise_floor)}.</p>"
+        f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: "
+        f"{capped(gap.fit_before, gap)} before, {capped(gap.fit_after, gap)} after. Held-out runs: "
+        f"{capped(gap.heldout_before, gap)} as given, {capped(gap.heldout_calibrated, gap)} calibrated{added}; "
+        f"noise floor {error(gap.noise_floor)}.</p>"
     )
     if not analysis.added:
         return text

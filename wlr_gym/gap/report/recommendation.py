@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.data.format import Profile
-from wlr_gym.gap.analysis import EFFECT_FOUND, Recommendation
+from wlr_gym.gap.analysis import EFFECT_FOUND, Equivalent, Recommendation
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.search import Round
+from wlr_gym.robot import LEGS
 
 _FRICTION = frozenset({"coulomb_friction", "viscous_friction", "stribeck_friction", "load_dependent_friction"})
 _PULL = frozenset({"floor_slope", "external_force", "tether"})
@@ -75,50 +76,71 @@ _SEPARATED_BY: Sequence[tuple[frozenset[str], frozenset[str], str, str]] = (
         "several steady speeds, one of them near zero",
     ),
 )
+#: Excitations in which no leg moves, or none at the front.
+_LEGS_STAND, _FRONT_STANDS = ("straight", "turns", "s_curve", "stop_and_go"), ("rear_legs",)
+#: Why an excitation separates effects at legs, where it is not for the reason that holds at wheels.
+_AT_LEGS = {
+    "several steady speeds, one of them near zero": "legs swing at a steady speed, stop and reverse; all_legs has half of it"
+}
 
 
-def separation(chosen: str, other: str, motions: Mapping[str, str]) -> tuple[str, str] | None:
+def motion_for(excitation: str, where: Collection[str]) -> str:
+    """Return the excitation, or where all places are legs and stand in it, one in which they move."""
+    if not where or not set(where) <= set(LEGS):
+        return excitation
+    if excitation in _LEGS_STAND:
+        return "posture"
+    return "all_legs" if excitation in _FRONT_STANDS and set(where) & set(LEGS[:2]) else excitation
+
+
+def separation(chosen: str, other: str, motions: Mapping[str, str], where: Collection[str] = ()) -> tuple[str, str] | None:
     """Return the excitation that distinguishes two effects, and why it does; None where none is known.
 
     Args:
         chosen, other: names of effects.
         motions: effect -> motion of the system that shows it best; empty = it has no named motions.
+        where: places of the chosen one.
     """
     for one, two, excitation, why in _SEPARATED_BY if motions else ():
         if (chosen in one and other in two) or (chosen in two and other in one):
-            return excitation, why
-    return (motions[chosen], f"the motion in which {chosen} shows best") if chosen in motions else None
+            motion = motion_for(excitation, where)
+            return motion, why if motion == excitation else _AT_LEGS.get(why, why)
+    if chosen not in motions:
+        return None
+    return motion_for(motions[chosen], where), f"the motion in which {chosen} shows best"
 
 
-def separating_run(names: Iterable[str], motions: Mapping[str, str]) -> str:
+def separating_run(names: Iterable[str], motions: Mapping[str, str], where: Collection[str] = ()) -> str:
     """Return the discriminating experiment in words: the run that distinguishes the chosen effect from the others."""
     chosen, *others = names
-    found = dict.fromkeys(filter(None, (separation(chosen, other, motions) for other in others)))
+    found = dict.fromkeys(filter(None, (separation(chosen, other, motions, where) for other in others)))
     texts = [f"{excitation} ({EXCITATIONS[excitation].doc}): {why}" for excitation, why in found]
     return "; ".join(texts) or "more runs, of other kinds and at other loads"
 
 
 def recommend(
-    last: Round, equivalent: Sequence[Sequence[str]], verdict: str, motions: Mapping[str, str]
+    last: Round, equivalent: Sequence[Equivalent], verdict: str, motions: Mapping[str, str]
 ) -> tuple[Recommendation, ...]:
     """Return runs worth recording: to distinguish equivalent effects, then to show what these data would have missed.
 
     Args:
         last: the last round of the search.
-        equivalent: groups of names that the data cannot distinguish.
+        equivalent: groups of effects that the data cannot distinguish.
         verdict: of the analysis.
         motions: effect -> motion of the system that shows it best.
     """
     found: dict[str, str] = {}
-    for names in equivalent:
-        for other in names[1:]:
-            apart = separation(names[0], other, motions)
+    for group in equivalent:
+        chosen, *others = group.names
+        for other in others:
+            apart = separation(chosen, other, motions, group.where)
             if apart is not None:
-                found.setdefault(apart[0], f"distinguishes {names[0]} from {other}: {apart[1]}")
+                found.setdefault(apart[0], f"distinguishes {chosen} from {other}: {apart[1]}")
     for hypothesis in last.hypotheses:
-        name = hypothesis.candidate.name
+        name, where = hypothesis.candidate.name, hypothesis.candidate.where
         if name in motions and shown_by_some_runs_only(hypothesis, last.threshold):
-            found.setdefault(motions[name], f"{name} fails cross-validation: runs left out of the fit do not show it")
+            why = f"{name} fails cross-validation: runs left out of the fit do not show it"
+            found.setdefault(motion_for(motions[name], where), why)
     if verdict != EFFECT_FOUND:
         visible: dict[str, bool] = {}
         for score in last.scores:

@@ -17,6 +17,7 @@ from wlr_gym.gap.analysis import (
     Analysis,
     ChannelGap,
     FoundEffect,
+    GapFigures,
     ParameterEstimate,
     Statistic,
     Turning,
@@ -52,7 +53,7 @@ _GROUPS = {
     "pos_leg": "the angles of the legs", "pos_wheel": "the angles of the wheels", "vel_leg": "the speeds of the legs",
     "vel_wheel": "the speeds of the wheels", "eff_leg": "the motor torques of the legs", "gyro": "the turning rates",
     "eff_wheel": "the motor torques of the wheels", "acc": "the accelerations", "volt": "the supply voltage",
-    "cam_xy": "the camera's position", "cam_yaw": "the camera's heading", "position": "the angle",
+    "cam_xy": "the camera's position", "cam_yaw": "the camera's heading",
     "cam_z": "the camera's height", "cam_pitch": "the camera's pitch",
 }  # fmt: skip
 _PLACES = {"ground": "floor", "sensor": "sensors"}
@@ -120,6 +121,12 @@ def listed(words: Sequence[str], last: str = "and") -> str:
 def error(value: float) -> str:
     """Return an error in units of noise, with as many decimals as one can care for."""
     return f"{value:.{2 if value < 9.995 else 1 if value < 99.95 else 0}f}" if math.isfinite(value) else "-"
+
+
+def capped(value: float, gap: GapFigures | None) -> str:
+    """Return an error of replayed runs; one that is as large as counts may be any larger one."""
+    cap = math.inf if gap is None else gap.cap
+    return f"{cap:g} or more" if value > 0.999 * cap else error(value)
 
 
 def percent(share: float) -> str:
@@ -206,7 +213,8 @@ def made_worse(analysis: Analysis) -> str:
     if not worse:
         return ""
     worst = sorted(worse, key=lambda one: one.calibrated**2 - one.after**2)[:MOST_WORSE]
-    shown = listed([f"{channel(one.channel)} ({error(one.calibrated)} to {error(one.after)})" for one in worst])
+    steps = [(channel(one.channel), *(capped(value, analysis.gap) for value in (one.calibrated, one.after))) for one in worst]
+    shown = listed([f"{name} ({before} to {after})" for name, before, after in steps])
     more = f", and {len(worse) - len(worst)} more" if len(worse) > len(worst) else ""
     which = "One channel gets" if len(worse) == 1 else f"{len(worse)} of {len(analysis.channel_gaps)} channels get"
     return f"{which} significantly worse in the held-out runs: {shown}{more}."
@@ -279,9 +287,15 @@ def _effect_found(analysis: Analysis) -> str:
         for effect in analysis.effects
     ]
     lost = names[0] if len(names) == 1 else f"{len(names)} effects: {listed(names)}"
-    others = [_others(group.names, analysis.effects) for group in analysis.equivalent]
-    doubt = f"; these data do not distinguish it from {listed([name for name in others if name], 'or')}" if any(others) else ""
-    return f"The model lacks {lost}{_improvement(analysis)}{doubt}."
+    return f"The model lacks {lost}{_improvement(analysis)}{_doubt(analysis)}."
+
+
+def _doubt(analysis: Analysis) -> str:
+    """Which other names these data leave possible, each beside the effect that it may stand for."""
+    doubts = [(plain(group.names[0]), _others(group.names, analysis.effects)) for group in analysis.equivalent]
+    several = len(analysis.effects) > 1
+    told = [f"{chosen if several else 'it'} from {others}" for chosen, others in doubts if others]
+    return f"; these data do not distinguish {', nor '.join(told)}" if told else ""
 
 
 def _unknown(analysis: Analysis) -> str:

@@ -80,7 +80,10 @@ class OwnRigProblem:
             for column in rig.columns
         )
         lengths = " and ".join(f"{length:g} s" for length in rig.windows)
-        self.metric: str = f"RMS over columns of measured minus replayed, in units of sensor noise, windows of {lengths}"
+        self.metric: str = (
+            f"RMS over columns of measured minus replayed, in units of sensor noise ({CAP:g} at most per reading), "
+            f"windows of {lengths}"
+        )
         self._noise = np.array([signal.noise for signal in self.signals])
         self._runs, self._compiled = tuple(runs), compiled
         self._begun = [np.stack([_state(run, rig, name) for name in rig.states], axis=1) for run in runs]

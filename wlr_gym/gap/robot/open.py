@@ -6,7 +6,7 @@ from pathlib import Path
 
 from wlr_gym.data.read import read_dataset
 from wlr_gym.data.replay import robot_of
-from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
 from wlr_gym.gap.robot.problem import RobotProblem
 from wlr_gym.physics.effects import Source
@@ -17,6 +17,10 @@ LEAST_RUNS = 3
 MANY_ROWS = 20_000
 #: GB; eight runs of 20 s need 1.4 GB.
 MEMORY_PER_ROW = 1.8e-4
+_NO_PROFILE = (
+    "meta.yaml does not state the servo profile (profile): none is assumed. A profile that was set looks like a command delay "
+    "or a slow servo: state it, if there was one, and analyse again"
+)
 
 
 def open_robot(
@@ -31,8 +35,11 @@ def open_robot(
     Raises:
         InputError: files that are not in the measured-run format, an unknown robot, backend or effect.
     """
-    runs = read_dataset(data).runs
+    read = read_dataset(data)
+    runs = read.runs
     findings = [IntakeFinding(run.name, found.column, found.kind, found.message) for run in runs for found in run.findings]
+    if not read.meta.states_profile:
+        findings.append(IntakeFinding("", "", NO_PROFILE, _NO_PROFILE))
     findings += findings_of(runs, CHECKS, robot_of(runs[0], robot))
     good = [run for run in runs if not any(f.fatal and f.run == run.name for f in findings)]
     if len(good) < LEAST_RUNS:

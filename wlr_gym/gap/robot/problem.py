@@ -81,7 +81,10 @@ class RobotProblem:
     ) -> None:
         if not runs:
             raise InputError("no runs to analyse")
-        self.metric: str = f"RMS over channels of measured minus replayed, in units of sensor noise, windows of {window:g} s"
+        self.metric: str = (
+            f"RMS over channels of measured minus replayed, in units of sensor noise ({CAP:g} at most per reading), "
+            f"windows of {window:g} s"
+        )
         if any(run.meta.profile != runs[0].meta.profile for run in runs):
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
         self.cap, self.steps, self.tempering = CAP, STEPS, TEMPERING

@@ -141,6 +141,7 @@ def compare_models(
         floor,
         min(reduction(squares[1][outside], squares[2][outside], floor), 1.0),
         _interval(squares[1][outside], squares[2][outside], floor),
+        problem.cap,
     )
     gaps = tuple(
         RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=closed)

@@ -65,22 +65,31 @@ def findings_of(runs: Sequence[Run], checks: Sequence[IntakeCheck], robot: Robot
     """Return what the checks find, run by run.
 
     What stands at one place (a joint's encoder, its rate and effort) is not looked at further once a check has found a fault
-    there: later checks compare with it. Nor is anything else of a run with a fault as a whole. A run in which a channel
-    cannot be judged has the fault of the others if no run shows that the channel is right: a unit, a sign and a broken wire
-    are the recording's, not the run's.
+    there: later checks compare with it, and the first fault counts. Nor is anything else of a run with a fault as a whole. A
+    run in which a channel cannot be judged has the fault of the others if no run shows that the channel is right: a unit, a
+    sign and a broken wire are the recording's, not the run's.
     """
     outcomes = [_of_one(run, checks, robot) for run in runs]
     found = []
     for run, outcome in zip(runs, outcomes, strict=True):
-        told = {channel for (_, channel), seen in outcome.items() if isinstance(seen, ChannelFault)}
+        told = set[str]()
         for (check, channel), seen in outcome.items():
-            if isinstance(seen, ChannelFault):
-                found.append(_finding(run, check.kind, channel, seen))
-            elif channel not in told and seen is Sound.UNDECIDED and (first := _only_faults(runs, outcomes, check, channel)):
+            fault = _shared(runs, outcomes, check, channel) if seen is Sound.UNDECIDED else seen
+            if channel not in told and isinstance(fault, ChannelFault):
                 told.add(channel)
-                text = f"the run does not show whether it is right, and it is {check.kind} in {first[0]}"
-                found.append(_finding(run, check.kind, channel, ChannelFault(None, text, first[1].expected, first[1].remedy)))
+                found.append(_finding(run, check.kind, channel, fault))
     return found
+
+
+def _shared(
+    runs: Sequence[Run], outcomes: Sequence[dict[tuple[IntakeCheck, str], Outcome]], check: IntakeCheck, channel: str
+) -> ChannelFault | None:
+    """The fault that a run which does not show it has like the others; None where one shows that the channel is right."""
+    first = _only_faults(runs, outcomes, check, channel)
+    if first is None:
+        return None
+    text = f"the run does not show whether it is right, and it is {check.kind} in {first[0]}"
+    return ChannelFault(None, text, first[1].expected, first[1].remedy)
 
 
 def _of_one(run: Run, checks: Sequence[IntakeCheck], robot: Robot) -> dict[tuple[IntakeCheck, str], Outcome]:
