@@ -183,7 +183,7 @@ def test_an_error_as_large_as_counts_is_shown_as_at_least_that(tmp_path):
     page = page_of(far, tmp_path)
     assert ["50 or more", "49.9", "3.00"] in [row[3:] for row in page.rows if row and row[0] == first.channel]
     assert "Held-out runs: 50 or more as given" in page.text
-    assert result_of(far).gap.cap == 50.0
+    assert vars(result_of(far).gap)["cap"] == 50.0
     assert "50 or more" not in page_of(examples.EFFECT_FOUND, tmp_path).text
 
 
