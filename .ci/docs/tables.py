@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import json
 import re
 import sys
 import tempfile
@@ -41,6 +42,7 @@ from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.studies.bench.adapt_study import read_lines
 from wlr_gym.studies.bench.adapt_table import markdown as markdown_of_cases
+from wlr_gym.studies.bench.decide_table import markdown as markdown_of_decisions
 from wlr_gym.studies.bench.gap import Plan, read_answers, run_blind_test
 from wlr_gym.studies.bench.gap_score_table import markdown
 from wlr_gym.studies.paper.verdicts import verdict_table
@@ -138,6 +140,11 @@ def ablation_table() -> list[str]:
 def adapt_table() -> list[str]:
     """Return the cases of ``wlr bench adapt`` that were run."""
     return markdown_of_cases(read_lines(DATA / "adapt.jsonl")).strip().splitlines()
+
+
+def decide_table() -> list[str]:
+    """Return the robots of ``wlr bench decide`` that were run."""
+    return markdown_of_decisions(json.loads((DATA / "decide.json").read_text(encoding="utf-8"))).strip().splitlines()
 
 
 def keyword_table() -> list[str]:
@@ -300,6 +307,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     **{name: partial(lambda name: performance.made()[name], name) for name in ("speed", "batch", "machines", "engine")},
     "equations": verdict_table,
     "adapt": adapt_table,
+    "decide": decide_table,
     "ablations": ablation_table,
     "scripts": script_table,
     "blind_test": blind_test_table,
