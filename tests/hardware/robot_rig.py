@@ -30,8 +30,8 @@ DRIVE = np.array([1.5, 1.6, 1.5, 1.6, 3.0, 3.0, 3.0, 3.0])
 
 #: Safety limits for real time: a busy computer must not fail a test that is about something else than deadlines.
 PATIENT = {
-    "patience": 1.0, "read_time": 5.0, "late": 10000, "late_share": 1.0, "silence": 9.0, "coast": 8.0, "imu_silence": 9.0,
-    "watchdog": 2.5, "heartbeat": 30.0,
+    "patience": 1.0, "read_time": 1.0, "late": 250, "late_share": 1.0, "silence": 3.0, "coast": 1.0, "imu_silence": 3.0,
+    "watchdog": 2.5, "heartbeat": 10.0,
 }  # fmt: skip
 
 

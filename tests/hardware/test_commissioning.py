@@ -177,6 +177,18 @@ def test_a_rubbing_wheel_and_a_slow_adapter_are_told_on_the_command_line(tmp_pat
     assert load_hardware(tmp_path / "out" / "hardware.yaml").measured.adapter_latency["legs"].value > 0.01
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_wheel_that_does_not_turn_has_no_load(tmp_path, capsys):
+    words = ["commission", "--emulated", "--yes", "--tests", "load", "--out", str(tmp_path)]
+    assert main([*words, "--fault", "slow_servo wheel_lf"]) == 1
+    result = results_of(tmp_path)["load"]
+    assert result["state"] == "failed"
+    assert "wheel_lf turns at 0." in result["reason"]
+    assert "expected 1 within 20%" in result["reason"]
+    assert "wheel_rf" not in result["reason"]
+    assert "as expected" not in capsys.readouterr().out
+
+
 def test_a_joint_mounted_the_other_way_and_a_wrong_zero_are_found(tmp_path):
     mounted = find.with_mountings(NOMINAL, {"leg_rf": Mounting(sign=1, zero=1024), "wheel_lr": Mounting(sign=-1, zero=0)})
     results = make(tmp_path, EmulatedStand(ROBOT, mounted), "joints")
@@ -454,7 +466,7 @@ def test_how_the_body_is_to_be_turned():
     assert all(way in text and "within 3 s" in text for way, text in zip(ways, asked, strict=True))
 
 
-def test_the_way_out_is_always_open(monkeypatch, tmp_path):
+def test_the_way_out_is_always_open(monkeypatch, tmp_path, capsys):
     emulated = EmulatedStand(ROBOT, NOMINAL)
     beside(monkeypatch, emulated)
     for word, made in (("Latency", 0), ("leg_lf (left front): swing", 2)):
@@ -463,6 +475,24 @@ def test_the_way_out_is_always_open(monkeypatch, tmp_path):
         assert run(options, Human(emulated, **{word: "q", "Write": "n"})) == 1
         states = [result["state"] for result in results_of(out).values()]
         assert states == ["done"] * made + ["stopped"]
+        shown = capsys.readouterr().out
+        assert f"Not tested: {', '.join(['latency', 'silent_servo', 'joints'][made:])}." in shown
+        assert ("values of the other tests as expected" in shown) == bool(made)
+
+
+def test_a_signal_during_the_comparison_stops_everything_too(monkeypatch, tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    made = []
+
+    def interrupted(test, stand, person):
+        made.append(person)
+        if len(made) == 2:  # the emulated robot that the readings are compared with
+            raise QuitError("SIGINT")
+        return run_test(test, stand, person)
+
+    monkeypatch.setattr(runner, "run_test", interrupted)
+    (result,) = make(tmp_path, emulated, "latency", "silent_servo").values()
+    assert (result.test, result.state, result.reason, result.findings) == ("latency", "stopped", "SIGINT", ())
 
 
 # ---- a computer that is busy -----------------------------------------------------------------------------------------
@@ -563,7 +593,7 @@ def test_over_serial_ports(tmp_path, monkeypatch):
     emulated = EmulatedStand(ROBOT, NOMINAL, options=MachineOptions(timing=NO_TIME))
     with Server(emulated.machine, real_time=False) as server:
         monkeypatch.setattr("wlr_gym.hardware.link.MonotonicClock", lambda: ServedClock(server))
-        mine = hardware_file(tmp_path, server.ports, patience=10.0, watchdog=NOMINAL.safety.watchdog)
+        mine = hardware_file(tmp_path, server.ports, patience=1.0, watchdog=NOMINAL.safety.watchdog)
         words = ["--hardware", str(mine), "--yes", "--out", str(tmp_path), "--tests", "watchdog", "velocity_step"]
         assert main(["commission", *words]) == 0
         assert motors_on(emulated.machine) == []

@@ -265,6 +265,16 @@ def test_command_line_says_why_it_stopped(tmp_path, capsys):
     assert "alert: wheel_rr has a hardware error" in capsys.readouterr().out
 
 
+def test_command_line_drives_no_leg_that_is_out_of_its_range(tmp_path, capsys):
+    assert run_command("deploy", words(tmp_path, "--fault", "encoder_jump leg_lf value=2")) == FAILED
+    assert "leg_lf     position: 3.57 rad" in capsys.readouterr().out
+
+
+def test_command_line_ends_in_an_overheated_servo_with_its_stop_reason(tmp_path, capsys):
+    assert run_command("deploy", words(tmp_path, "--fault", "overheat leg_lf value=500")) == FAILED
+    assert "temperature: leg_lf has" in capsys.readouterr().out
+
+
 def test_command_line_dry_run(tmp_path):
     assert run_command("deploy", words(tmp_path, "--dry-run")) == OK
     assert read_run(tmp_path / "run_01.csv").meta.notes == "dry run"

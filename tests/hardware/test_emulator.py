@@ -544,6 +544,14 @@ def test_overheating_is_a_ramp_that_ends_in_a_shutdown():
     assert machine.servos["wheel_rf"]["hardware_error_status"] == 0
 
 
+def test_a_temperature_ends_where_its_register_ends():
+    machine = make()
+    machine.inject("overheat leg_lf value=100")
+    machine.advance(4.0)
+    assert machine.servos["leg_lf"]["present_temperature"] == 255
+    assert "255 degC" in run_command(machine, "status")
+
+
 def test_faults_start_and_end_on_time():
     machine = make()
     machine.inject("dead leg_lf after=0.02 duration=0.01")

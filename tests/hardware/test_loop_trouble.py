@@ -296,6 +296,32 @@ def test_a_deadman_that_never_acts_is_refused(deadman):
         RobotPlant(ROBOT, 1, PlantOptions(), RobotOptions(emulated=True, deadman=deadman))
 
 
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_a_leg_that_leaves_its_range_after_preflight_is_not_driven(tmp_path, monkeypatch, dry_run):
+    rig = Rig(tmp_path, dry_run=dry_run)
+    limiter = rig.loop._limiter
+    prepare, on, step = limiter.prepare, [], rig.machine.step
+
+    def jump():
+        prepare()
+        rig.inject("encoder_jump leg_lf value=2")
+        rig.machine.advance(0.02)
+
+    def watched():
+        on.append(rig.torque().any())
+        step()
+
+    monkeypatch.setattr(limiter, "prepare", jump)
+    monkeypatch.setattr(rig.machine, "step", watched)
+    with pytest.raises(StoppedError, match=r"^preflight: FAULT +leg_lf +position: 3.57 rad .*turn it back by hand"):
+        rig.loop.start()
+    rig.loop.close()
+    assert on
+    assert not any(on)
+    assert not rig.loop.ended_well
+    assert "preflight: " in read_events(tmp_path / "run_01.csv")[-1]["reason"]
+
+
 def test_gains_of_another_program_are_set_back(rig):
     for joint in JOINTS:
         for item in ("position_i_gain", "position_d_gain", "feedforward_1st_gain", "feedforward_2nd_gain"):

@@ -1,6 +1,8 @@
 """``wlr record``: runs from the emulated robot and from simulators, motions as files, what is refused."""
 
 import io
+import json
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,8 +84,32 @@ def test_a_robot_that_stops_leaves_its_log_and_code_1(tmp_path, monkeypatch, cap
     assert 20 < len(run.table) < 300
     text = capsys.readouterr().out
     assert "of 300 steps driven" in text
-    assert "turns" not in text
+    assert "turns: " not in text
+    assert "not driven: turns" in text
     assert not any(servo["torque_enable"] for servo in machine.servos.values() if not servo.dead)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_an_interrupted_record_says_what_it_did_not_drive(tmp_path, monkeypatch, capsys, name):
+    machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
+    step, signals = machine.step, [getattr(signal, name)]
+
+    def interrupted_step():
+        step()
+        if machine.time > 5.0 and signals:
+            signal.raise_signal(signals.pop())
+
+    monkeypatch.setattr(machine, "step", interrupted_step)
+    assert recorded(tmp_path, excitation=("straight", "turns", "s_curve"), seconds=9.0, json=True) == 130
+    text = capsys.readouterr().out
+    assert "not driven: turns, s_curve" in text
+    first, *others = json.loads(text[text.index("[\n") :])
+    assert name in first["reason"]
+    assert [(other["motion"], other["reason"], other["well"]) for other in others] == [
+        ("turns", "not driven", False),
+        ("s_curve", "not driven", False),
+    ]
 
 
 def test_effects_make_an_emulated_robot_another_one(tmp_path):

@@ -168,6 +168,17 @@ def test_setpoints_brake_before_the_leg_limit():
     assert all(later <= earlier + 1e-12 for earlier, later in itertools.pairwise(steps))
 
 
+def test_an_inverted_range_drives_no_leg_past_its_end():
+    """Clipping to a range from high to low gives one of its ends: a margin of 3 rad would lie far outside the leg's limits."""
+    limits = LIMITS.model_copy(update={"leg_margin": 3.0})
+    low, high = ROBOT.leg_limits
+    setpoints = HOME
+    for _ in range(200):
+        setpoints, _ = rules.limit_setpoints(limits, RATINGS, HOME, setpoints, setpoints, 1.0)
+        assert (setpoints[:4] >= low).all()
+        assert (setpoints[:4] <= high).all()
+
+
 def test_a_blocked_leg_winds_up_no_setpoint():
     setpoints = HOME.copy()
     for _ in range(50):

@@ -88,7 +88,7 @@ def _commission(
 ) -> int:
     from wlr_gym.base.files import write_json
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.commissioning.runner import Commissioning, content_of
+    from wlr_gym.hardware.commissioning.runner import DONE, Commissioning, content_of
 
     robot, hardware = options.load()
     link, person = _robot(options, robot, hardware, ask)
@@ -109,6 +109,8 @@ def _commission(
         print_json([content_of(one) for one in results])
     else:
         _print_table(findings, console)
+    made = {result.test for result in results if result.state == DONE}
+    _print_end(findings, [test.name for test in tests if test.name not in made], console)
     if findings:
         _save(options, out, findings, ask, console)
     return OK if all(result.is_good for result in results) else FAILED
@@ -175,8 +177,16 @@ def _print_table(findings: Sequence[StandFinding], console: Console) -> None:
         console.print(
             f"{finding.where}, {finding.quantity.name}: {finding.quantity.doc}. {finding.quantity.remedy}", style="bold"
         )
-    if findings and not wrong:
-        console.print(f"All {len(findings)} values as expected.", style="bold green")
+
+
+def _print_end(findings: Sequence[StandFinding], untested: Sequence[str], console: Console) -> None:
+    """Say what was not tested, and whether all that was is as expected."""
+    is_good = bool(findings) and all(finding.is_expected for finding in findings)
+    if untested:
+        console.print(f"Not tested: {', '.join(untested)}.", style="bold yellow")
+    if is_good:
+        rest = " of the other tests" if untested else ""
+        console.print(f"All {len(findings)} values{rest} as expected.", style="" if untested else "bold green")
 
 
 def _row(group: Sequence[StandFinding]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli import FAILED, INTERRUPTED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import CameraOption, confirm
@@ -60,7 +60,7 @@ class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
 
 
 def run(options: RecordOptions) -> int:
-    """Record; 0 when every motion was driven to its end or stopped by the operator, 1 when something stopped the robot.
+    """Record; 0 when every motion was driven to its end, 1 when something stopped the robot, 130 when it was interrupted.
 
     Raises:
         InputError: unknown motion, backend, robot or patch, options that make no sense, ports that cannot be opened.
@@ -126,7 +126,8 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
     from wlr_gym.hardware.driving import drive_robot
 
     assert options.out is not None
-    well, found = True, []
+    found: list[dict[str, object]] = []
+    code = OK
     for motion in motions:
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
@@ -136,11 +137,14 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
         found.append(
             {"motion": motion.name, "run": drive.run, "reason": drive.reason, "well": drive.well, "ticks": drive.ticks}
         )
-        well = well and drive.well
-        if drive.reason:
+        if drive.reason or not drive.well:
+            code = INTERRUPTED if drive.well else FAILED
             break
+    if left := [motion.name for motion in motions[len(found) :]]:
+        console.print(f"not driven: {', '.join(left)}", style="red")
+    found += [{"motion": name, "run": None, "reason": "not driven", "well": False, "ticks": 0} for name in left]
     _results(options, found)
-    return OK if well else FAILED
+    return code
 
 
 def _results(options: RecordOptions, found: Sequence[dict[str, object]]) -> None:

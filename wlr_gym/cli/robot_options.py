@@ -96,9 +96,11 @@ class RobotOption(HardwareOption):
 
     def load(self) -> tuple[Robot, Hardware]:
         """Return the robot and its hardware, with the ports of ``--port``; see :meth:`load_hardware`."""
+        from wlr_gym.hardware.config import require_leg_range
         from wlr_gym.robot import load_robot
 
         robot, hardware = load_robot(self.robot_name(self.robot)), self.load_hardware()
+        require_leg_range(hardware, robot, self.hardware)
         if self.emulated:
             from wlr_gym.hardware.emulator.link import with_flow_port
 

@@ -13,7 +13,7 @@ from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, load_table
 from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.measured import Measured
-from wlr_gym.robot import JOINTS, LEGS, Vector3
+from wlr_gym.robot import JOINTS, LEGS, Robot, Vector3
 
 #: What the EEPROM of all servos must hold: directions and zeros stand in the hardware file, torque comes on when asked for.
 FIXED_REGISTERS = {"drive_mode": 0, "homing_offset": 0, "startup_configuration": 0}
@@ -185,9 +185,15 @@ class Hardware(SettingsModel):
 
     @model_validator(mode="after")
     def _every_joint_is_wired_once(self) -> Hardware:
+        places = {f"buses.{name}.joints": bus.joints for name, bus in self.buses.items()} | {"joints": tuple(self.joints)}
+        for where, joint in ((where, joint) for where, joints in places.items() for joint in joints):
+            if joint not in JOINTS:
+                raise unknown_name("joint", joint, JOINTS, where)
         wired = [joint for bus in self.buses.values() for joint in bus.joints]
-        if sorted(wired) != sorted(JOINTS) or set(self.joints) != set(JOINTS):
-            raise ValueError(f"buses and joints must name each of {', '.join(JOINTS)} once")
+        for joint in JOINTS:
+            if wired.count(joint) != 1 or joint not in self.joints:
+                found = f"{wired.count(joint)} times in buses, {int(joint in self.joints)} times in joints"
+                raise InputError(f"{joint} is named {found}: they must name each of {', '.join(JOINTS)} once")
         return self
 
     @model_validator(mode="after")
@@ -224,6 +230,17 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
     if hardware.robot is None:
         return hardware
     return hardware.model_copy(update={"robot": str(named_in(where, hardware.robot))})
+
+
+def require_leg_range(hardware: Hardware, robot: Robot, where: object) -> None:
+    """Raise :class:`InputError` where ``leg_margin`` at both ends leaves nothing of a robot's ``leg_limits``."""
+    low, high = robot.leg_limits
+    margin, largest = hardware.safety.leg_margin, (high - low) / 2.0
+    if not margin < largest:
+        raise InputError(
+            f"{where}: safety.leg_margin = {margin:g} rad: expected below {largest:g} rad: twice it must leave a range within "
+            f"leg_limits, {low:g} to {high:g} rad, of robot '{robot.name}'"
+        )
 
 
 def _with_servo_files(data: Any, where: str) -> Any:

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from pydantic import Field, model_validator
+from typing import Any
 
+from pydantic import Field, ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import SettingsModel
+
+
+def _limit(default: float | None, unit: str, *, le: float, **low: Any) -> Any:
+    """Return the field of a limit; ``le`` is far above what anyone sets on purpose: a value beyond it has another unit."""
+    return Field(default=default, le=le, json_schema_extra={"unit": unit}, **low)
 
 
 class SafetyLimits(SettingsModel):
@@ -40,57 +49,76 @@ class SafetyLimits(SettingsModel):
         off_time: s to go on trying to switch torque off where servos do not confirm it.
     """
 
-    leg_margin: float = Field(default=0.05, ge=0.0)
-    leg_taper: float = Field(default=0.1, gt=0.0)
-    leg_speed: float = Field(default=8.0, gt=0.0)
-    leg_lead: float = Field(default=0.45, gt=0.0)
-    wheel_speed: float = Field(default=6.4, gt=0.0)
-    wheel_acceleration: float = Field(default=200.0, gt=0.0)
-    load: float = Field(default=0.7, gt=0.0, le=1.0)
-    load_time: float = Field(default=1.0, gt=0.0)
-    current: float = Field(default=10.0, gt=0.0)
-    current_time: float = Field(default=0.5, gt=0.0)
-    tilt: float = Field(default=0.7, gt=0.0, le=1.6)
-    tilt_time: float = Field(default=0.1, ge=0.0)
-    tilt_horizon: float = Field(default=0.2, ge=0.0)
-    warm: float = 62.0
-    hot: float = 68.0
-    low_voltage: float = Field(default=10.2, gt=0.0)
-    low_voltage_time: float = Field(default=0.5, ge=0.0)
-    coast: float = Field(default=0.06, ge=0.0)
-    silence: float = Field(default=0.4, gt=0.0)
-    imu_silence: float = Field(default=0.1, gt=0.0)
-    imu_frozen: float = Field(default=0.1, gt=0.0)
-    jump_speed: float = Field(default=1.5, ge=1.0)
-    jump_noise: float = Field(default=0.03, ge=0.0)
-    frozen_leg: float = Field(default=0.03, gt=0.0)
-    frozen_wheel: float = Field(default=0.5, gt=0.0)
-    leg_error: float = Field(default=0.2, gt=0.0)
-    leg_error_time: float = Field(default=0.3, gt=0.0)
-    wheel_error: float = Field(default=2.0, gt=0.0)
-    wheel_error_time: float = Field(default=0.5, gt=0.0)
-    late: int = Field(default=5, ge=1)
-    late_share: float = Field(default=0.1, gt=0.0, le=1.0)
-    deadman: float | None = Field(default=None, gt=0.0)
-    watchdog: float = Field(default=0.2, ge=0.02, le=2.54)
-    heartbeat: float = Field(default=0.8, gt=0.0)
-    patience: float = Field(default=0.004, gt=0.0)
-    read_time: float = Field(default=0.014, gt=0.0)
-    start_speed: float = Field(default=1.0, gt=0.0)
-    start_error: float = Field(default=0.3, gt=0.0)
-    stop_time: float = Field(default=0.6, ge=0.0)
-    off_time: float = Field(default=2.0, ge=0.0)
+    leg_margin: float = _limit(0.05, "rad", ge=0.0, le=0.5)
+    leg_taper: float = _limit(0.1, "rad", gt=0.0, le=1.0)
+    leg_speed: float = _limit(8.0, "rad/s", gt=0.0, le=20.0)
+    leg_lead: float = _limit(0.45, "rad", gt=0.0, le=1.6)
+    wheel_speed: float = _limit(6.4, "rad/s", gt=0.0, le=40.0)
+    wheel_acceleration: float = _limit(200.0, "rad/s2", gt=0.0, le=2000.0)
+    load: float = _limit(0.7, "of stall torque", gt=0.0, le=1.0)
+    load_time: float = _limit(1.0, "s", gt=0.0, le=5.0)
+    current: float = _limit(10.0, "A", gt=0.0, le=100.0)
+    current_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
+    tilt: float = _limit(0.7, "rad", gt=0.0, le=1.6)
+    tilt_time: float = _limit(0.1, "s", ge=0.0, le=2.0)
+    tilt_horizon: float = _limit(0.2, "s", ge=0.0, le=2.0)
+    warm: float = _limit(62.0, "degC", le=80.0)
+    hot: float = _limit(68.0, "degC", le=80.0)
+    low_voltage: float = _limit(10.2, "V", gt=0.0, le=30.0)
+    low_voltage_time: float = _limit(0.5, "s", ge=0.0, le=5.0)
+    coast: float = _limit(0.06, "s", ge=0.0, le=1.0)
+    silence: float = _limit(0.4, "s", gt=0.0, le=3.0)
+    imu_silence: float = _limit(0.1, "s", gt=0.0, le=3.0)
+    imu_frozen: float = _limit(0.1, "s", gt=0.0, le=3.0)
+    jump_speed: float = _limit(1.5, "of no-load speed", ge=1.0, le=10.0)
+    jump_noise: float = _limit(0.03, "rad", ge=0.0, le=0.5)
+    frozen_leg: float = _limit(0.03, "rad", gt=0.0, le=0.5)
+    frozen_wheel: float = _limit(0.5, "rad", gt=0.0, le=6.3)
+    leg_error: float = _limit(0.2, "rad", gt=0.0, le=1.6)
+    leg_error_time: float = _limit(0.3, "s", gt=0.0, le=5.0)
+    wheel_error: float = _limit(2.0, "rad/s", gt=0.0, le=10.0)
+    wheel_error_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
+    late: int = _limit(5, "ticks", ge=1, le=250)
+    late_share: float = _limit(0.1, "of the ticks", gt=0.0, le=1.0)
+    deadman: float | None = _limit(None, "s", gt=0.0, le=10.0)
+    watchdog: float = _limit(0.2, "s", ge=0.02, le=2.54)
+    heartbeat: float = _limit(0.8, "s", gt=0.0, le=10.0)
+    patience: float = _limit(0.004, "s", gt=0.0, le=1.0)
+    read_time: float = _limit(0.014, "s", gt=0.0, le=1.0)
+    start_speed: float = _limit(1.0, "rad/s", gt=0.0, le=10.0)
+    start_error: float = _limit(0.3, "rad", gt=0.0, le=1.0)
+    stop_time: float = _limit(0.6, "s", ge=0.0, le=5.0)
+    off_time: float = _limit(2.0, "s", ge=0.0, le=10.0)
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _refusals_tell_the_unit(cls, value: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        try:
+            return check(value)
+        except ValidationError as error:
+            context = {"reason": error.errors()[0]["msg"], "unit": unit_of(str(info.field_name))}
+            raise PydanticCustomError("limit", "{reason} ({unit})", context) from None
 
     @model_validator(mode="after")
     def _limits_are_in_order(self) -> SafetyLimits:
-        if not self.coast < self.silence:
-            raise ValueError(f"coast {self.coast:g} s must be shorter than silence {self.silence:g} s")
-        if not self.leg_error < self.leg_lead:
-            raise ValueError(
-                f"leg_error {self.leg_error:g} rad must be below leg_lead {self.leg_lead:g} rad, or it never shows"
-            )
-        if not self.watchdog < self.heartbeat:
-            raise ValueError(f"watchdog {self.watchdog:g} s must be shorter than heartbeat {self.heartbeat:g} s")
-        if not self.warm < self.hot:
-            raise ValueError(f"warm {self.warm:g} degC must be below hot {self.hot:g} degC")
+        for low, high, why in _ORDER:
+            below, above = getattr(self, low), getattr(self, high)
+            if not below < above:
+                unit = unit_of(low)
+                raise InputError(f"safety.{low} = {below:g} {unit}: expected below {high} = {above:g} {unit}{why}")
         return self
+
+
+#: Limits of which the first must be below the second, and why where it does not go without saying.
+_ORDER = (
+    ("coast", "silence", ""),
+    ("leg_error", "leg_lead", ", or it never shows"),
+    ("watchdog", "heartbeat", ""),
+    ("warm", "hot", ""),
+)
+
+
+def unit_of(limit: str) -> str:
+    """Return the unit of a limit."""
+    extra = SafetyLimits.model_fields[limit].json_schema_extra
+    return str(extra["unit"]) if isinstance(extra, dict) else ""

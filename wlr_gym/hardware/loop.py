@@ -35,11 +35,11 @@ from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunRecorder, origin_of, sensors_of
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.ramp import legs_away, make_ramp, ramp_speed, start_pose
+from wlr_gym.hardware.safety.check import NotReadyError
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import resting
 from wlr_gym.hardware.safety.state import REQUESTS, Level, RobotStatus, Verdict
 from wlr_gym.hardware.safety.watchdog import Guard
-from wlr_gym.hardware.sensing import NotReadyError
 from wlr_gym.hardware.step import ControlStep
 from wlr_gym.hardware.timing import Clock, Pacer
 from wlr_gym.physics.plants.base import Sensors
@@ -328,6 +328,7 @@ class ControlLoop:
         """Bring the robot to rest and raise :class:`StoppedError`."""
         self.reason = reason
         if not self._limiter.armed:  # nothing was switched on, and what another program holds up must not be dropped
+            self._guard.release()
             self._note_end(not is_fault)
             self.recorder.end(self.reason, self.statistics())
         elif is_off or self.phase is Phase.TORQUE_OFF:

@@ -12,7 +12,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.camera.config import load_camera_file
-from wlr_gym.hardware.config import Hardware, load_hardware, with_ports
+from wlr_gym.hardware.config import Hardware, load_hardware, require_leg_range, with_ports
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors, Truth
@@ -66,6 +66,7 @@ class RobotPlant:
         chosen = hardware or RobotOptions()
         self.capabilities: Capabilities = Capabilities("dynamixel", has_truth=False, can_set_state=False, real_time=True)
         description = with_ports(load_hardware(chosen.hardware), dict(chosen.ports))
+        require_leg_range(description, robot, chosen.hardware)
         if chosen.deadman is not None:
             if not 0.0 < chosen.deadman < np.inf:
                 raise InputError(f"deadman {chosen.deadman:g}: expected seconds, more than 0")

@@ -13,6 +13,7 @@ from wlr_gym.hardware.imu.driver import Imu, ImuReading
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.safety.camera import CameraWatch
+from wlr_gym.hardware.safety.check import NotReadyError
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.rules import VERTICAL_BAND, next_up, tilt_of
 from wlr_gym.hardware.safety.state import Mask, RobotStatus
@@ -27,10 +28,6 @@ HEALTH_STEPS = 5
 ATTITUDE_AGE = 0.1
 #: s the IMU may take until its first reading.
 IMU_TIME = 0.5
-
-
-class NotReadyError(RuntimeError):
-    """The robot is not as it must be before it is driven; the message says what is wrong."""
 
 
 class Sensing:

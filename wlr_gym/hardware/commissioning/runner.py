@@ -160,7 +160,11 @@ class Commissioning:
             state, reason = STOPPED, str(error)
         except _TROUBLE as error:
             state, reason = FAILED, str(error)
-        expected = run_test(test, self._model, self._model_person) if readings else []
+        expected: list[Reading] = []
+        try:
+            expected = run_test(test, self._model, self._model_person) if readings else []
+        except QuitError as asked:  # a signal, while the emulated robot was put through it
+            state, reason, readings = STOPPED, str(asked) or "asked to", []
         findings = tuple(compare(test, readings, expected))
         result = StandResult(test.name, state, reason, findings, self._log_run(), repeated)
         write_json(self._folder / f"{test.name}.json", content_of(result) | {"samples": self._stand.samples})

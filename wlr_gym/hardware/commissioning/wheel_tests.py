@@ -15,6 +15,8 @@ from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS
 _STEP, _STEP_TIME, _FITTED = 3.0, 2.0, (0.3, 0.9)
 #: rad/s at which the load is read, s until a wheel turns evenly, rows that are averaged.
 _SPEEDS, _EVEN, _ROWS = (1.0, 2.0, 3.0), 1.4, 10
+#: Part of the speed asked for that a wheel may be off it then.
+_OFF_SPEED = 0.2
 #: s that a held wheel pulls, and of it the part that is averaged; rad/s below which it counts as held.
 _HELD_TIME, _HELD_ROWS, _HELD_SPEED = 1.2, 20, 0.1
 _LOOP = "The servo's velocity loop is not the file's: gains in its registers, firmware, or the robot file's numbers for it."
@@ -85,18 +87,34 @@ VELOCITY_STEP = StandTest(
 def _measure_load(stand: Stand, person: Person) -> list[Reading]:
     stand.prepare(WHEELS)
     stand.switch_on(WHEELS)
-    loads, pwms = np.empty((len(_SPEEDS), len(WHEELS))), np.empty((len(_SPEEDS), len(WHEELS)))
+    loads, pwms = np.empty((2, len(_SPEEDS), len(WHEELS)))
     for row, speed in enumerate(_SPEEDS):
         stand.spin(dict.fromkeys(WHEELS, speed))
         stand.run(_EVEN)
-        seen = [(stand.load(stand.step().effort)[WHEEL_SLICE], stand.pwm()[WHEEL_SLICE]) for _ in range(_ROWS)]
-        loads[row], pwms[row] = np.nanmean(np.array(seen), axis=0)
+        seen = []
+        for _ in range(_ROWS):
+            readings = stand.step()
+            values = readings.velocity, stand.load(readings.effort), stand.pwm()
+            seen.append([value[WHEEL_SLICE] for value in values])
+        reached, loads[row], pwms[row] = np.nanmean(np.array(seen), axis=0)
+        _require_speed(speed, reached)
     found = []
     for k, wheel in enumerate(WHEELS):
         stand.samples |= {f"load_{wheel}": loads[:, k].tolist(), f"pwm_{wheel}": pwms[:, k].tolist()}
         slope = float(np.polyfit(pwms[:, k], loads[:, k], 1)[0])
         found += [Reading("load_per_pwm", wheel, slope), Reading("running_load", wheel, float(loads[:, k].mean()))]
     return found
+
+
+def _require_speed(asked: float, reached: NDArray[np.float64]) -> None:
+    """Raise :class:`TroubleError` where wheels are not at their speed: what they load then says nothing."""
+    slow = [f"{wheel} turns at {speed:.2f}" for wheel, speed in zip(WHEELS, reached, strict=True)]
+    slow = [text for text, speed in zip(slow, reached, strict=True) if abs(speed - asked) > _OFF_SPEED * asked]
+    if slow:
+        raise TroubleError(
+            f"{', '.join(slow)} rad/s after {_EVEN:g} s, expected {asked:g} within {_OFF_SPEED:.0%}: it does not follow; "
+            "does something hold it, is its motor weak, its servo's PWM limited?"
+        )
 
 
 LOAD = StandTest(

@@ -31,6 +31,8 @@ BOOT_TIME = 0.3
 #: Distance from Goal Position that counts as arrived, counts.
 IN_POSITION = 16
 
+#: Highest temperature that its register holds, degC.
+HOTTEST = 255
 #: One count of Bus Watchdog, s.
 _WATCHDOG_UNIT = 0.02
 _KEPT = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}
@@ -322,7 +324,7 @@ class EmulatedServo:
             "velocity_trajectory": lambda: self._frame.direction * round(shaft.reference()[1] / speed),
             "position_trajectory": lambda: self._frame.count(shaft.reference()[0]),
             "present_input_voltage": lambda: max(0, round(shaft.voltage / volt)),
-            "present_temperature": lambda: round(self.health.temperature),
+            "present_temperature": lambda: min(round(self.health.temperature), HOTTEST),
             "moving": lambda: int(abs(round(shaft.velocity / speed)) > self._get("moving_threshold")),
             "moving_status": self._moving_status,
             "led": lambda: int(self._clock) % 2 if self._shut_down else self._get("led"),

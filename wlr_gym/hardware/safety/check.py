@@ -1,8 +1,12 @@
-"""The result of a look at the robot before it moves."""
+"""The result of a look at the robot before it moves, and what is raised where it must not."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+
+class NotReadyError(RuntimeError):
+    """The robot is not as it must be before it is driven; the message says what is wrong."""
 
 
 class Check(NamedTuple):

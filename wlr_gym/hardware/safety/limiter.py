@@ -18,7 +18,7 @@ from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError
 from wlr_gym.hardware.safety import preflight, registers, rules
-from wlr_gym.hardware.safety.check import Check
+from wlr_gym.hardware.safety.check import Check, NotReadyError
 from wlr_gym.hardware.safety.rules import Decision, Memory
 from wlr_gym.hardware.safety.state import Level, RobotStatus
 from wlr_gym.hardware.servos import JointReadings, Servos
@@ -151,10 +151,13 @@ class CommandLimiter:
         """Ask for no motion, switch torque on, arm the watchdog; :meth:`prepare` comes first.
 
         Raises:
+            NotReadyError: a leg has left its range since it was checked. Torque is off.
             NoAnswerError, RefusedError, BusGoneError: a servo did not take it. Torque may be on: call :meth:`off`.
         """
+        position = self._positions()
+        self._check_legs(position)
         self._armed = True
-        self.setpoints = rules.resting(self._positions())
+        self.setpoints = rules.resting(position)
         self.torque_on[:] = True
         if self.dry_run:
             self.__servos.set_patience(self.limits.patience)
@@ -166,6 +169,14 @@ class CommandLimiter:
             servos.set(joint, "torque_enable", 1)
         self.__servos.set_patience(self.limits.patience)
         self._arm_watchdogs()
+
+    def _check_legs(self, position: Array) -> None:
+        joint_map = self.__servos.joint_map
+        counts = joint_map.setpoint_counts(rules.resting(position)).tolist()
+        legs = list(zip(LEGS, counts, strict=False))
+        checks = [preflight.check_leg(joint_map, self.robot, self.hardware, leg, count) for leg, count in legs]
+        if wrong := "\n".join(str(check) for check in checks if not check.ok):
+            raise NotReadyError(f"preflight: {wrong}")
 
     def _arm_watchdogs(self) -> None:
         """Arm all watchdogs at once, and see that they are: where one bus is waited for, those of the other one would trip."""

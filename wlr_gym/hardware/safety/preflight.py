@@ -23,7 +23,7 @@ from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.ports import PortInUseError, is_pseudo_terminal
 from wlr_gym.hardware.safety.check import Check
 from wlr_gym.hardware.safety.registers import REPAIR, REQUIRED, check_answers, check_registers, expected_count
-from wlr_gym.hardware.servos import Servos
+from wlr_gym.hardware.servos import JointMap, Servos
 from wlr_gym.hardware.timing import processor_share
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
@@ -141,7 +141,7 @@ def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -
         found = list(check_registers(servos, bus, bus_name, joint))
         yield from found
         if joint in LEGS and all(check.ok for check in found if check.what in REQUIRED):  # else its angle is another one
-            yield _check_leg(servos, robot, hardware, bus, joint)
+            yield check_leg(servos.joint_map, robot, hardware, joint, servos.get(joint, "present_position"))
         yield from _check_state(servos, hardware, bus, joint)
     except (NoAnswerError, RefusedError) as error:
         yield Check(joint, "reading", False, str(error), "answers", "The line is bad: check cable, termination and ground.")
@@ -174,13 +174,13 @@ def _check_state(servos: Servos, hardware: Hardware, bus: Bus, joint: str) -> It
     yield Check(joint, "torque", not on, "on" if on else "off", "off", remedy)
 
 
-def _check_leg(servos: Servos, robot: Robot, hardware: Hardware, bus: Bus, joint: str) -> Check:
-    """Is the leg inside its range and its servo's turn? One that is not went past something: it is not driven back."""
-    count = servos.get(joint, "present_position")
-    angle = float(servos.joint_map.position(np.full(len(JOINTS), count))[JOINTS.index(joint)])
+def check_leg(joint_map: JointMap, robot: Robot, hardware: Hardware, joint: str, count: int) -> Check:
+    """Is a leg inside its range and its servo's turn? One that is not went past something: it is not driven back."""
+    bus = next(bus for bus in hardware.buses.values() if joint in bus.joints)
+    angle = float(joint_map.position(np.full(len(JOINTS), count))[JOINTS.index(joint)])
     low, high = expected_count(bus, "min_position_limit"), expected_count(bus, "max_position_limit")
     first, last = robot.leg_limits
-    ends = [int(servos.joint_map.setpoint_counts(np.full(len(JOINTS), end))[JOINTS.index(joint)]) for end in (first, last)]
+    ends = [int(joint_map.setpoint_counts(np.full(len(JOINTS), end))[JOINTS.index(joint)]) for end in (first, last)]
     if not low <= min(ends) <= max(ends) <= high:
         found, expected = f"{min(ends)} to {max(ends)} counts", f"within {low} to {high}"
         remedy = "Sign or zero in the hardware file are wrong: wlr calibrate joints."

@@ -155,7 +155,7 @@ def limit_setpoints(
     """
     low = np.where(_IS_LEG, ratings.leg_limits[0] + limits.leg_margin, -limits.wheel_speed * wheel_share)
     high = np.where(_IS_LEG, ratings.leg_limits[1] - limits.leg_margin, limits.wheel_speed * wheel_share)
-    low, high = np.maximum(low, ratings.low), np.minimum(high, ratings.high)
+    low, high = _in_order(np.maximum(low, ratings.low), np.minimum(high, ratings.high))
     inside = np.clip(setpoints, low, high)
     near = np.clip(inside, position - limits.leg_lead, position + limits.leg_lead)
     near = np.where(_IS_LEG, np.clip(near, low, high), inside)
@@ -171,6 +171,12 @@ def limit_setpoints(
     final = np.where(_IS_LEG & (previous >= low) & (previous <= high), tapered, slewed)
     changes = {"limit": setpoints != inside, "lead": inside != near, "slew": near != slewed, "taper": final != slewed}
     return final, {rule: mask for rule, mask in changes.items() if mask.any()}
+
+
+def _in_order(low: Array, high: Array) -> tuple[Array, Array]:
+    """Return the ends of ranges, both at the middle of one that is inverted: clipping to it would pass a leg's end."""
+    middle = (low + high) / 2.0
+    return np.minimum(low, middle), np.maximum(high, middle)
 
 
 def slow_down(limits: SafetyLimits, status: RobotStatus) -> float:
