@@ -14,7 +14,7 @@ pytest.importorskip("serial")
 
 from robot_rig import ROBOT, Phase, Rig, StoppedError, machine_of
 
-from wlr_gym.cli import FAILED, OK, record, replay, run_command
+from wlr_gym.cli import FAILED, INTERRUPTED, OK, record, replay, run_command
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.deployment import deploy, loop_of
@@ -204,7 +204,7 @@ def test_a_stop_in_the_last_motion_tick_starts_no_other(tmp_path, monkeypatch):
 
     monkeypatch.setattr("wlr_gym.hardware.driving.drive_robot", drive)
     options = record.RecordOptions(excitation=("straight", "turns"), out=tmp_path, emulated=True, seconds=0.2)
-    assert record.run(options) == OK
+    assert record.run(options) == INTERRUPTED
     assert driven == ["straight"]
 
 

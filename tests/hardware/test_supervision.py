@@ -191,5 +191,5 @@ def test_an_imu_that_repeats_its_values_is_frozen():
 
 
 def test_an_error_that_the_lead_limit_never_lets_happen_is_refused():
-    with pytest.raises(ValueError, match=r"leg_error 0\.5 rad must be below leg_lead"):
+    with pytest.raises(ValueError, match=r"safety\.leg_error = 0\.5 rad: expected below leg_lead"):
         SafetyLimits(leg_error=0.5)

@@ -110,8 +110,7 @@ class ControlLoop:
         self.phase: Phase = Phase.TORQUE_OFF
         self.reason, self.ended_well = "", True
         self.clock: Clock = link.clock
-        self.operator: Operator = Operator(link.clock)
-        self.pacer: Pacer = Pacer(link.clock, period)
+        self.operator, self.pacer = Operator(link.clock), Pacer(link.clock, period)
         self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot, has_camera=link.camera is not None)
         self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
