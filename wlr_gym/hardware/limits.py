@@ -78,7 +78,7 @@ class SafetyLimits(SettingsModel):
     leg_error_time: float = _limit(0.3, "s", gt=0.0, le=5.0)
     wheel_error: float = _limit(2.0, "rad/s", gt=0.0, le=10.0)
     wheel_error_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
-    late: int = _limit(5, "ticks", ge=1, le=250)
+    late: int = _limit(5, "ticks", ge=1, le=10_000)
     late_share: float = _limit(0.1, "of the ticks", gt=0.0, le=1.0)
     deadman: float | None = _limit(None, "s", gt=0.0, le=10.0)
     watchdog: float = _limit(0.2, "s", ge=0.02, le=2.54)

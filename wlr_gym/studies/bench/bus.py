@@ -47,8 +47,8 @@ sys.exit(main(["deploy", "--emulated", "--hardware", file, "--seconds", seconds,
 """
 #: Safety limits that let a drive on a busy computer go on: an answer that comes late makes a tick late, and is counted there.
 _PATIENT = {
-    "patience": 0.2, "read_time": 5.0, "late": 10**6, "late_share": 1.0, "silence": 9.0, "coast": 8.0, "imu_silence": 9.0,
-    "watchdog": 2.5, "heartbeat": 30.0,
+    "patience": 0.2, "read_time": 1.0, "late": 10_000, "late_share": 1.0, "silence": 3.0, "coast": 1.0, "imu_silence": 3.0,
+    "watchdog": 2.5, "heartbeat": 10.0,
 }  # fmt: skip
 Cycle = Callable[[], None]
 
