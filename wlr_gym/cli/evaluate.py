@@ -216,8 +216,8 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
         if len(fitting) < len(names):
             print(f"no baseline here, made for other tasks: {', '.join(name for name in names if name not in fitting)}")
         chosen["baselines"] = (*fitting, *(_shipped_for(environment) if full else ()))
-    elif read_subjects([options.policy])[0] in read_subjects(options.baselines):
-        print(f"no baseline, the policy itself: {read_subjects([options.policy])[0].name}")
+    elif (subject := read_subjects([options.policy])[0]) in read_subjects(options.baselines):
+        print(f"no baseline, the policy itself: {subject.name}")
     return replace(options, **{name: value for name, value in chosen.items() if getattr(options, name) is None})
 
 

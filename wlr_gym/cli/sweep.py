@@ -97,7 +97,6 @@ def _settings(words: tuple[str, ...]) -> Mapping[str, Any]:
     """Return what ``--set`` says: a setting with one value is for all trials, others span the grid."""
     settings: dict[str, Any] = {}
     space: dict[str, list[Any]] = {}
-    given: set[str] = set()
     for word in words:
         name, equals, text = word.partition("=")
         try:
@@ -106,9 +105,8 @@ def _settings(words: tuple[str, ...]) -> Mapping[str, Any]:
             values = None
         if not values:
             raise InputError(f"--set {word}: expected key=value or key=value,value, such as learning_rate=1e-3,2e-3")
-        if name in given:
+        if name in settings or name in space:
             raise InputError(f"--set: '{name}' is given twice; all its values go behind one: {name}=VALUE,VALUE")
-        given.add(name)
         if len(values) > 1:
             space[name] = values
         else:

@@ -122,11 +122,11 @@ def import_log(
         if not made:
             raise InputError(f"{log}: nothing in it")
         write_map(out / MAP_FILE, map)
-        write_meta(out, meta, () if meta.states_profile else ("profile",))
-        open_ends = () if meta.states_profile else (NO_PROFILE,)
+        left_out, said = ((), ()) if meta.states_profile else (("profile",), (NO_PROFILE,))
+        write_meta(out, meta, left_out)
         imported = []
         for one in made:
-            imported.append(_moved(replace(one, notes=(*one.notes, *open_ends)), next_run(out, suffix)))
+            imported.append(_moved(replace(one, notes=(*one.notes, *said)), next_run(out, suffix)))
             record[imported[-1].path.stem] = _entry(imported[-1])
             _write_record(out, record)  # with each run: whatever stops this, it knows all that are there
     return imported

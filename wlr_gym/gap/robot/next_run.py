@@ -152,16 +152,14 @@ def _promise(
     """What a motion promises; ``free``: see :func:`_own_uncertainty`; None: if no number took up anything, the most it can."""
     values, deviations = _calibrated(problem, result)
     moved = [] if free is None else [values + step for step in np.diag(_inside(problem, values, deviations))]
-    settings = [*(Setting(values, one.effects) for one in explanations), Setting(values), *map(Setting, moved)]
-    rows = _rows(problem, result, settings)
-    predicted, bare, columns = rows[: len(explanations)], rows[len(explanations)], rows[len(explanations) + 1 :]
-    own = [columns[:0]] * len(explanations)
-    if free is not None:
-        own = [share @ slopes for share, slopes in zip(free, _own_columns(problem, result, explanations), strict=True)]
+    bare, *calibrated = _rows(problem, result, [Setting(values), *map(Setting, moved)])
+    columns = np.array(calibrated).reshape(-1, len(bare)) - bare
+    predicted, slopes = _predicted(problem, result, explanations, with_own=free is not None)
+    own = slopes if free is None else [share @ own for share, own in zip(free, slopes, strict=True)]
     weights = np.maximum([one.probability for one in explanations], LEAST_WEIGHT)
     pairs = list(itertools.combinations(range(len(explanations)), 2))
     shares = np.array([weights[i] * weights[j] for i, j in pairs])
-    told = np.array([_told(predicted[i] - predicted[j], np.vstack([columns - bare, own[i], own[j]])) for i, j in pairs])
+    told = np.array([_told(predicted[i] - predicted[j], np.vstack([columns, own[i], own[j]])) for i, j in pairs])
     best = tuple(explanations[k].name for k in pairs[int(np.argmax(told))])
     return Promise(motion, float(shares @ told / shares.sum()), float(told.max()), (best[0], best[1]))
 
@@ -176,20 +174,21 @@ def _told(difference: Array, columns: Array) -> float:
 
 def _own_uncertainty(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
     """How explanations' own numbers may still move, each (numbers, numbers): rows are independent, of unit variance."""
-    columns = _own_columns(problem, result, explanations)
+    _, columns = _predicted(problem, result, explanations)
     found = (np.linalg.inv(np.linalg.cholesky(np.eye(len(own)) + own @ own.T)) for own in columns)
     return [np.asarray(one, np.float64) for one in found]
 
 
-def _own_columns(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
-    """Change of the weighted predictions per way of an explanation's own numbers (see :data:`STEP`), each (numbers, rows)."""
+def _predicted(
+    problem: RobotProblem, result: Result, explanations: Sequence[Explanation], *, with_own: bool = True
+) -> tuple[list[Array], list[Array]]:
+    """Weighted predictions (rows) of explanations, and their change per way of their own numbers (see :data:`STEP`), each
+    (numbers, rows); none of them unless ``with_own``."""
     values, _ = _calibrated(problem, result)
-    moved = [_own_moved(one) for one in explanations]
-    settings = [
-        Setting(values, effects) for one, own in zip(explanations, moved, strict=True) for effects in (one.effects, *own)
-    ]
-    parts = np.split(_rows(problem, result, settings), np.cumsum([1 + len(own) for own in moved])[:-1])
-    return [(part[1:] - part[0]) / STEP for part in parts]
+    models = [(one.effects, *(_own_moved(one) if with_own else ())) for one in explanations]
+    rows = _rows(problem, result, [Setting(values, effects) for tried in models for effects in tried])
+    parts = np.split(rows, np.cumsum([len(tried) for tried in models])[:-1])
+    return [part[0] for part in parts], [(part[1:] - part[0]) / STEP for part in parts]
 
 
 def _own_moved(one: Explanation) -> list[tuple[PatchEffect, ...]]:
