@@ -76,8 +76,9 @@ def test_plain_stable_baselines_loads_the_model(run):
 def test_killed_run_resumes_exactly(run, tmp_path):
     """kill -9 at an arbitrary moment after the first checkpoint; the resumed run ends as the uninterrupted one."""
     folder = tmp_path / "killed"
-    changes = [f"{key}={value}" for key, value in SETTINGS.items() if key != "environment"]
-    changes += ["environment.episode_length=0.2", "final_learning_rate=0.001", "total_steps=100000000"]
+    settings = {**SETTINGS, "final_learning_rate": 0.001, "total_steps": 100_000_000}
+    changes = [f"{key}={value}" for key, value in settings.items() if key != "environment"]
+    changes.append("environment.episode_length=0.2")
     blank = tmp_path / "blank.yaml"
     blank.write_text("{}\n")
     command = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "train", ENVIRONMENT]
