@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -50,7 +51,9 @@ def markdown(lines: Sequence[Line]) -> str:
     header = ["case", "shared law", *(f"{CONTENDERS[name]}" for name in CONTENDERS), "found", "kept", "regained (%)"]
     header += ["driven for it (s)", "took (min)"]
     rows = [_row(name, case) for name, case in table.items()]
-    text = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header), *("| " + " | ".join(row) + " |" for row in rows)]
+    commits = Counter(line["commit"] for line in lines)
+    text = [f"Contenders driven by commit: {', '.join(f'{name} {count}' for name, count in commits.items())}.", ""]
+    text += ["| " + " | ".join(header) + " |", "|" + "---|" * len(header), *("| " + " | ".join(row) + " |" for row in rows)]
     return "\n".join([*text, "", *summary(table), ""])
 
 
