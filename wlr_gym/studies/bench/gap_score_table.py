@@ -42,6 +42,8 @@ def lines(report: Mapping[str, Any]) -> list[ScoreLine]:
         _coverage(single["interval_coverage"]),
         _median("median gap reduction, where found", single["gap_reduction"], least=0.9),
         _median("median gap reduction, misses as 0", single["gap_reduction_of_all"], least=0.9),
+        _median("median error left, noise floors: named rightly, severity >= 2", report["left"]["named"]),
+        _median("median error left, noise floors: nothing hidden", report["left"]["nothing hidden"]),
         _none("gap grew, interval below 0", single["gap_grew_surely"]),
         _none("gap grew by more than 2 %", single["gap_grew"]),
         _at_least("outside the library: formula or unknown, no name", outside["unknown"], 0.95),

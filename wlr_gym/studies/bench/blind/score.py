@@ -198,6 +198,7 @@ def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[st
         },
         "by_recording": _by_recording(nulls, clear),
         "single": _single(of["effect"], clear),
+        "left": {"named": _left([pair for pair in clear if _top(*pair)]), "nothing hidden": _left(nulls)},
         "pairs": _pairs(of["pair"]),
         "outside": _outside(of["stranger"]),
         "bad_data": _share(at_least, [_refused(result) for _, result in of["bad"]]),
@@ -251,11 +252,9 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
     by_severity = {}
     for severity in severities:
         chosen = [pair for pair in pairs if pair[0]["severity"] == severity]
-        by_severity[str(severity)] = {
-            "found": _share(at_least, [_alarm(result) for _, result in chosen]),
-            "top1": _share(at_least, [_top(truth, result) for truth, result in chosen]),
-            "in_set": _share(at_least, [_in_set(truth, result) for truth, result in chosen]),
-        }
+        hits = {"found": [_alarm(r) for _, r in chosen], "top1": [_top(t, r) for t, r in chosen]}
+        hits["in_set"] = [_in_set(t, r) for t, r in chosen]
+        by_severity[str(severity)] = {key: _share(at_least, hit) for key, hit in hits.items()}
     matched = [match for truth, result in clear for match in _matched(truth, result)]
     shapes = [error for true, found in matched if (error := shape_error(true, found)) is not None]
     orders = [right for true, found in matched if (right := order_found(true, found)) is not None]
@@ -281,6 +280,12 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
         "gap_grew": _share(at_most, [_grew(gap) for gap in gaps]),
         "confidence": _calibration(clear),
     }
+
+
+def _left(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
+    """Errors of held-out runs that the final model leaves, over the noise floor."""
+    gaps = [result.get("gap") or {} for _, result in pairs]
+    return _quantiles([gap["heldout_after"] / gap["noise_floor"] for gap in gaps if gap.get("heldout_after")])
 
 
 def _by_recording(
