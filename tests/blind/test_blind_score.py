@@ -311,3 +311,15 @@ def test_a_wheel_keeps_its_own_friction_whatever_the_level():
     pair = [effect("friction_asymmetry", ["wheel_rf"], mu=0.2), effect("friction_level", ["ground"], mu=0.4)]
     for order in (pair, pair[::-1]):
         assert list(hide(order, nominal(robot)).wheel_mu) == [0.4, 0.2, 0.4, 0.4]
+
+
+def test_what_a_patch_leaves_is_counted_in_noise_floors_beside_what_no_effect_leaves():
+    hidden = effect("coulomb_friction", torque=0.1)
+    truths = {"a": truth("a", "effect", 2.0, hidden), "n": truth("n", "none", 0.0)}
+    results = {
+        "a": found(hidden, gap={"heldout_after": 3.0, "noise_floor": 1.5}),
+        "n": {**NOTHING, "gap": {"heldout_after": 1.8, "noise_floor": 1.5}},
+    }
+    left = scoring.score(results, truths)["left"]
+    assert left["named"]["median"] == pytest.approx(2.0)
+    assert left["nothing hidden"]["median"] == pytest.approx(1.2)
