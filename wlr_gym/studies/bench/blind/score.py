@@ -284,8 +284,8 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
 
 def _left(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
     """Errors of held-out runs that the final model leaves, over the noise floor."""
-    gaps = [gap for _, result in pairs if (gap := result.get("gap") or {}).get("noise_floor")]
-    return _quantiles([gap["heldout_after"] / gap["noise_floor"] for gap in gaps])
+    levels = [(gap.get("heldout_after"), gap.get("noise_floor")) for _, result in pairs if (gap := result.get("gap"))]
+    return _quantiles([left / floor for left, floor in levels if left and floor])
 
 
 def _by_recording(
