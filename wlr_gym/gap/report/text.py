@@ -23,6 +23,7 @@ from wlr_gym.gap.analysis import (
     Turning,
 )
 from wlr_gym.gap.selection.screening import LEAST_GAIN
+from wlr_gym.gap.validation.misfit import most_in, most_left
 from wlr_gym.physics.effects import UNKNOWN_EFFECT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.robot import CORNER_NAMES, CORNERS, LEGS, WHEELS
@@ -312,11 +313,12 @@ def _misfit(analysis: Analysis) -> str:
     gap = analysis.gap
     if gap is None or not analysis.localisation:
         return ""
+    left, run = most_left(gap.fit_after, analysis.run_gaps)
+    replayed = f"to within {capped(left, gap)} times the sensor noise, where a complete model reaches {error(gap.noise_floor)}"
+    if run:
+        return f"{run}, which no fit has used, is replayed {replayed}; worst is {channel(most_in(analysis.channel_gaps))}"
     most = analysis.localisation[0]
-    return (
-        f"the fitted runs are replayed to within {error(gap.fit_after)} times the sensor noise, where a complete model reaches "
-        f"{error(gap.noise_floor)}; {percent(most.share)} of what is left is in {channel(most.name)}"
-    )
+    return f"the fitted runs are replayed {replayed}; {percent(most.share)} of what is left is in {channel(most.name)}"
 
 
 def turned(turning: Turning) -> str:
