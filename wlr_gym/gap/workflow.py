@@ -182,8 +182,8 @@ def analyse_problem(
     shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
     left = [residual[0] for residual in problem.residuals([search.fit.model.setting], every)]
     turned = turning(problem, left, features)  # few runs turn far, and held-out ones may be those
-    place = most_in(channel_gaps) if worst else places[0].name
-    effects = _effects(problem, search, fitted) or _turned(turned) or (_somewhere(problem, place) if nameless else ())
+    somewhere = _somewhere(problem, most_in(channel_gaps) if worst else places[0].name) if nameless else ()
+    effects = _effects(problem, search, fitted) or _turned(turned) or somewhere
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
     verdict, groups = _verdict(search, effects), _equivalent(problem, search)
     clock.stop()
