@@ -46,9 +46,9 @@ TEMPERING = 3.0
 ROCKING = ("gyro_x", "gyro_y")
 #: Two simulators of one robot found sizes that differed by so much (root mean square over eight development sets).
 DISAGREEMENT = 0.04
-#: Error of the fitted runs, or of one held-out run, in noise floors, that no simulator's own errors explain: of simulators unlike
-#: the engine, 109 sets without an effect leave at most 2.2 and 2.3 (earlier 2.4 and 3.2); four whose effect was missed left 5.9
-#: to 11 in the fitted runs.
+#: Error of the fitted runs, or of one held-out run, in noise floors, that no simulator's own errors explain: 109 sets without
+#: an effect, of three simulators unlike the engine, leave 2.2 and 2.3 at most (earlier ones 2.4 and 3.2); four whose effect
+#: was missed left 5.9 to 11 in the fitted runs.
 MISFIT = 3.5
 #: Settings that are worth a replay of their own by a faster kernel.
 WORTH_APART = 12
