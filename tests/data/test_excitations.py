@@ -7,7 +7,8 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_dataset
-from wlr_gym.data.excitations import EXCITATIONS, LEG_MARGIN, REST, TOP_SPEED, excite
+from wlr_gym.data.excitations import CONTROL_PERIOD, EXCITATIONS, GENTLE, LEG_MARGIN, REST, TOP_SPEED, excite
+from wlr_gym.physics.servo import leg_profile_step
 from wlr_gym.robot import load_robot
 
 ROBOT = load_robot()
@@ -45,6 +46,26 @@ def test_period_samples_the_same_motion(name):
     ticks = min(len(coarse.setpoints), len(fine.setpoints[::2]))
     assert np.array_equal(coarse.setpoints[:ticks], fine.setpoints[::2][:ticks], equal_nan=True)
     assert len(excite(name, 1, seconds=3.0).setpoints) == 150
+
+
+@pytest.mark.parametrize("name", ["posture", "random", "chirp"])
+def test_legs_do_not_depend_on_the_last_per_cent_of_their_profile(name):
+    """A servo's profile, here half as fast as usual, makes the same of setpoints to a count if it accelerates 2 % faster."""
+    goals = np.stack([excite(name, seed, ROBOT, seconds=20.0).setpoints[-650:, :4:2] for seed in (1, 2)])
+    acceleration = 0.5 * GENTLE.leg_acceleration * np.array([1.0, 1.02])[:, None, None, None]
+    first, second = _profiled(goals, GENTLE.leg_velocity, acceleration)
+    assert np.abs(first - second).max() < 2 * np.pi / 4096
+
+
+def _profiled(goals, velocity, acceleration, substeps=8):
+    """References (accelerations, ticks, ...) of a leg's profile generator for goals (seeds, ticks, legs) of 20 ms each."""
+    position = np.broadcast_to(goals[:, 0], (len(acceleration), *goals[:, 0].shape))
+    acceleration, rate, path = acceleration[:, 0], np.zeros_like(position), []
+    for goal in goals.swapaxes(0, 1):
+        for _ in range(substeps):
+            position, rate, _, _ = leg_profile_step(position, rate, goal, velocity, acceleration, CONTROL_PERIOD / substeps)
+        path.append(position)
+    return np.stack(path, axis=1)
 
 
 def test_posture_sweep_rolls_the_treads():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toy_problem import CHANNELS, QUANTITIES, STRENGTH, Toy, candidate, sized
+from toy_problem import CHANNELS, NOISE, QUANTITIES, STRENGTH, Toy, candidate, coloured, sized
 
 from wlr_gym.gap.analysis import NOTHING_MISSING, UNKNOWN
 from wlr_gym.gap.estimation.fit import fit
@@ -135,3 +135,15 @@ def test_a_misfit_without_a_name_is_not_passed_over(misfit, verdict):
     assert done.verdict == verdict
     assert [effect.where for effect in done.effects] == ([("body",)] if verdict == UNKNOWN else [])
     assert ("where a complete model reaches 1.0" in sentence(done)) == (verdict == UNKNOWN)
+
+
+@pytest.mark.parametrize(("error", "verdict"), [(6.0, UNKNOWN), (2.0, NOTHING_MISSING)])
+def test_a_misfit_of_one_held_out_run_is_not_passed_over(error, verdict):
+    problem = Toy(rows=400)
+    problem.misfit = 3.5
+    problem._measured[4][:, 1] += np.sqrt(3.0) * error * NOISE[1] * coloured(np.random.default_rng(1), 400, 0.9)
+    done = analyse_problem(problem, "toy", heldout=("run_4", "run_5"))
+    assert done.gap is not None
+    assert (done.gap.fit_after < 1.5, done.verdict) == (True, verdict)
+    said = "run_5, which no fit has used, is replayed to within"
+    assert (said in sentence(done)) == sentence(done).endswith("; worst is torque.") == (verdict == UNKNOWN)

@@ -266,6 +266,17 @@ def test_a_name_that_leaves_far_more_than_simulators_do_is_not_decided(data, tmp
     assert found.history.rounds[1].why == "an error of 5.0 noise floors is left, more than 3.5; shows most effects best"
 
 
+def test_nothing_is_not_decided_where_one_held_out_run_is_far_off(data, tmp_path, answers):
+    errors = dict.fromkeys(("fit_before", "fit_after", "heldout_before", "heldout_calibrated", "heldout_after"), 1.5)
+    gap = {"metric": "RMS", **errors, "noise_floor": 1.0, "reduction": 0.0, "reduction_ci95": None}
+    runs = [{"run": "run_01", "heldout": False, "after": 5.0}, {"run": "run_02", "heldout": True, "after": 4.8}]
+    nothing = result("unknown_effect", (1.0, [])).model_dump() | {"gap": gap}
+    answers["results"] = [Result.model_validate(nothing | {"run_gaps": runs})] * 5
+    history = decide(data, tmp_path / "out", record, Budget(runs=5)).history
+    assert (history.ended, len(history.rounds[-1].runs)) == ("budget", 7)
+    assert history.rounds[-2].why == "an error of 4.8 noise floors is left, more than 3.5; shows most effects best"
+
+
 def test_a_name_that_no_motion_tells_from_an_equivalent_one_is_decided_where_it_has_95_percent(data, tmp_path, answers):
     names = [candidate("coulomb_friction", 0.97, "selected"), candidate("viscous_friction", 0.03, "equivalent")]
     found = result("effect_found", (0.0, names))

@@ -23,6 +23,7 @@ from wlr_gym.gap.report.result import RESULT_FILE, read_result
 from wlr_gym.gap.robot.next_run import TELLS, driven_already, most_shown, motions_to_drive, promises
 from wlr_gym.gap.robot.open import LEAST_RUNS
 from wlr_gym.gap.robot.problem import MISFIT
+from wlr_gym.gap.validation.misfit import most_left
 from wlr_gym.gap.workflow import Tell, analyse
 from wlr_gym.physics.effects import Patch, Source, load_patch
 
@@ -283,11 +284,13 @@ def _doubt(now: DecisionRound, result: Result | None, left: Sequence[Explanation
     """Why the runs do not carry an answer yet, whatever it is; empty: they do."""
     if result is None:
         return ""
-    nothing = not result.effects and any(one.name == NOTHING for one in left[:1])
-    if nothing and len(now.runs) < RUNS_FOR_NOTHING:
+    unnamed = any(one.name == NOTHING for one in left[:1])
+    if unnamed and not result.effects and len(now.runs) < RUNS_FOR_NOTHING:
         return f"{RUNS_FOR_NOTHING} runs or more tell that nothing is missing; "
-    misfit = 0.0 if result.gap is None else (result.gap.fit_after or 0.0) / (result.gap.noise_floor or math.inf)
+    if result.gap is None:
+        return ""
     # where the error is large, a name may be the best of wrong ones
+    misfit = most_left(result.gap.fit_after, result.run_gaps if unnamed else [])[0] / (result.gap.noise_floor or math.inf)
     return f"an error of {misfit:.1f} noise floors is left, more than {MISFIT:g}; " if misfit > MISFIT else ""
 
 

@@ -231,8 +231,8 @@ class Problem(Protocol):
         threads: how many share each piece of work; no result depends on it.
         thorough: runs cost next to nothing: every candidate is fitted in full, not only the shortlist.
         motions: effect -> name of the motion that shows it best, for advice on what to record; may be empty.
-        misfit: error of the fitted runs, in noise floors, from which on something is missing even if no effect explains it;
-            infinite where no simulator's own errors are known.
+        misfit: error of the fitted runs, or of one held-out run, in noise floors, from which on something is missing even if no
+            effect explains it; infinite where no simulator's own errors are known.
         held_out: names of the runs to hold out, where the problem knows better than a general rule; else empty.
         turning: joints without end, whose angle alone changes nothing: name -> its feature, and the signals that would show it.
     """

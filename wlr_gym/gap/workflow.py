@@ -26,7 +26,6 @@ from wlr_gym.gap.analysis import (
     FoundEffect,
     IntakeFinding,
     ParameterEstimate,
-    Place,
     Threshold,
     Turning,
 )
@@ -47,6 +46,7 @@ from wlr_gym.gap.selection.threshold import chance
 from wlr_gym.gap.validation.data_split import informative_split, named_split
 from wlr_gym.gap.validation.held_out import compare_models, confirmed, noise_floor
 from wlr_gym.gap.validation.localisation import localise
+from wlr_gym.gap.validation.misfit import most_in, most_left
 from wlr_gym.gap.validation.residual_tests import adequacy_of
 from wlr_gym.gap.validation.traces import informative_traces
 from wlr_gym.gap.validation.turning import turning
@@ -167,7 +167,8 @@ def analyse_problem(
     models = (nominal_model(problem), base.model, search.fit.model)
     floor = noise_floor(problem, search.fit.model.setting, held_out)
     gap, run_gaps, channel_gaps = compare_models(problem, fitted, held_out, models, floor)
-    nameless = not search.fit.model.effects and gap.fit_after > problem.misfit * gap.noise_floor
+    error, worst = most_left(gap.fit_after, run_gaps)
+    nameless = not search.fit.model.effects and error > problem.misfit * gap.noise_floor
     every = range(len(problem.runs))
     features = problem.features(base.model.setting, every)
     places, maps = localise(
@@ -181,7 +182,8 @@ def analyse_problem(
     shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
     left = [residual[0] for residual in problem.residuals([search.fit.model.setting], every)]
     turned = turning(problem, left, features)  # few runs turn far, and held-out ones may be those
-    effects = _effects(problem, search, fitted) or _turned(turned) or (_somewhere(problem, places) if nameless else ())
+    somewhere = _somewhere(problem, most_in(channel_gaps) if worst else places[0].name) if nameless else ()
+    effects = _effects(problem, search, fitted) or _turned(turned) or somewhere
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
     verdict, groups = _verdict(search, effects), _equivalent(problem, search)
     clock.stop()
@@ -304,9 +306,9 @@ def _expected(problem: Problem, found: Fit, *, is_incomplete: bool) -> Array:
     return np.where(np.isfinite(left), 1.0, np.nan) if is_incomplete else left
 
 
-def _somewhere(problem: Problem, places: Sequence[Place]) -> tuple[FoundEffect, ...]:
+def _somewhere(problem: Problem, worst: str) -> tuple[FoundEffect, ...]:
     """An effect without name or formula, at what the worst signal tells of."""
-    where = next(signal.place for signal in problem.signals if signal.name == places[0].name)
+    where = next(signal.place for signal in problem.signals if signal.name == worst)
     return (FoundEffect(UNKNOWN, (where,), {}, 1.0, math.nan),)
 
 

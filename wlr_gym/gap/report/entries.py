@@ -109,6 +109,14 @@ class RelationEntry(_Entry):
     gain: Number
 
 
+class RunGapEntry(_Entry):
+    """Error of one run after all effects."""
+
+    run: str
+    heldout: bool
+    after: MaybeNumber
+
+
 class RunsEntry(_Entry):
     """Names of the runs that were fitted to, and of the held-out ones."""
 
@@ -216,6 +224,7 @@ class Result(_Entry):
     localisation: dict[str, LocalisationEntry]
     relations: list[RelationEntry] = Field(default_factory=list)
     gap: GapEntry | None
+    run_gaps: list[RunGapEntry] = Field(default_factory=list)
     runs: RunsEntry
     patch: str
     detectable: dict[str, DetectableEntry] = Field(default_factory=dict)

@@ -23,6 +23,7 @@ from wlr_gym.gap.analysis import (
     Turning,
 )
 from wlr_gym.gap.selection.screening import LEAST_GAIN
+from wlr_gym.gap.validation.misfit import most_in, most_left
 from wlr_gym.physics.effects import UNKNOWN_EFFECT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.robot import CORNER_NAMES, CORNERS, LEGS, WHEELS
@@ -310,13 +311,14 @@ def _unknown(analysis: Analysis) -> str:
 def _misfit(analysis: Analysis) -> str:
     """What is left where nothing that has a name explains it."""
     gap = analysis.gap
-    if gap is None or not analysis.localisation:
+    if gap is None:
         return ""
-    most = analysis.localisation[0]
-    return (
-        f"the fitted runs are replayed to within {error(gap.fit_after)} times the sensor noise, where a complete model reaches "
-        f"{error(gap.noise_floor)}; {percent(most.share)} of what is left is in {channel(most.name)}"
-    )
+    left, run = most_left(gap.fit_after, analysis.run_gaps)
+    replayed = f"to within {capped(left, gap)} times the sensor noise, where a complete model reaches {error(gap.noise_floor)}"
+    if run and analysis.channel_gaps:
+        return f"{run}, which no fit has used, is replayed {replayed}; worst is {channel(most_in(analysis.channel_gaps))}"
+    most = [f"; {percent(one.share)} of what is left is in {channel(one.name)}" for one in analysis.localisation[:1]]
+    return f"the fitted runs are replayed {replayed}{''.join(most)}"
 
 
 def turned(turning: Turning) -> str:
