@@ -143,7 +143,6 @@ def test_training_goes_on_with_the_policy_s_recipe_on_the_stated_robots(tmp_path
     ("stated", "elsewhere", "stops", "kept"),
     [
         (-3.0, 2.0, 6, "new"),
-        (1.0, -9.0, 6, "new"),
         (1.0, 2.0, 6, "velocity_slip_aware"),
         (-3.0, 6.0, 6, "velocity_slip_aware"),
         (-3.0, 2.0, 30, "velocity_slip_aware"),

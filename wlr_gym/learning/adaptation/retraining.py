@@ -15,7 +15,7 @@ from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
 from wlr_gym.learning.adaptation.supervised import more_often, stopped_episodes
-from wlr_gym.learning.adaptation.uncertainty import TRAINED_SHARE, Family, Uncertainty
+from wlr_gym.learning.adaptation.uncertainty import STATED, TRAINED_SHARE, Family, Uncertainty
 from wlr_gym.learning.evaluation.acceptance import (
     LARGEST_LOSS,
     Acceptance,
@@ -212,19 +212,19 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
         tests.append(read_acceptance(path))
     losses = tuple(loss for test in tests for loss in test.losses)
     worse = [loss for loss in losses if not loss.bound <= LARGEST_LOSS]
-    better = any(loss.bound < 0.0 for loss in losses)  # the fault as found is one of many that the runs allow
+    better = next(loss for loss in losses if loss.floors == STATED).bound < 0.0
     stopped, stopped_before = (watched(progress, found, own, policy) for policy in (new, asked.policy))
     stops_more = more_often(stopped, stopped_before)
     is_new = better and not worse and not stops_more
     if is_new:
-        verdict = "The new policy is kept: better on some of the robots that the result allows, and worse on none."
+        verdict = "The new policy is kept: better on the robot as the result states it, and nowhere worse."
     elif worse:
         verdict = f"The old policy is kept: the new one may be worse in '{worse[0].floors}' (by up to {worse[0].bound:.1f} %)."
     elif stops_more:
         shares = f"{stopped.mean():.0%} of episodes, not {stopped_before.mean():.0%}"
         verdict = f"The old policy is kept: the supervision would stop the new one more often (in {shares})."
     else:
-        verdict = "The old policy is kept: the new one is nowhere better beyond the interval."
+        verdict = "The old policy is kept: the new one is not better beyond the interval."
     numbers = {
         "kept": "new" if is_new else "old",
         "policy": export_trained(progress) if is_new else asked.policy,
