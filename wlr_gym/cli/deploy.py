@@ -142,8 +142,6 @@ def _check(options: DeployOptions) -> dict[str, float]:
     """Return the held command, from options that make sense."""
     if not 0.0 < options.seconds < float("inf"):
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.deadman is not None and not 0.0 < options.deadman < float("inf"):
         raise InputError(f"--deadman {options.deadman:g}: expected more than 0")
     if not options.emulated and (options.stepped or options.fault):
