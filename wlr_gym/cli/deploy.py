@@ -72,7 +72,7 @@ class DeployOptions(JsonOption, PatchOption):
     seed: int = 0
     """Seed of the drawn commands."""
     deadman: float | None = None
-    """Stop the wheels when no key was pressed for so many seconds; with --gamepad, its dead-man button (default: 0.2)."""
+    """Stop the wheels when no key was pressed for so many seconds (10 at most); with --gamepad: its dead-man button (0.2)."""
     gamepad: str | None = None
     """Steer with a gamepad, such as /dev/input/js0, while its dead-man button is held; buttons: the hardware file's gamepad."""
     realtime: int | None = None
@@ -140,10 +140,12 @@ def run(options: DeployOptions) -> int:
 
 def _check(options: DeployOptions) -> dict[str, float]:
     """Return the held command, from options that make sense."""
+    from wlr_gym.hardware.limits import require_deadman
+
     if not 0.0 < options.seconds < float("inf"):
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
-    if options.deadman is not None and not 0.0 < options.deadman < float("inf"):
-        raise InputError(f"--deadman {options.deadman:g}: expected more than 0")
+    if options.deadman is not None:
+        require_deadman("--deadman", options.deadman)
     if not options.emulated and (options.stepped or options.fault):
         raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
     if options.stepped and options.realtime is not None:
