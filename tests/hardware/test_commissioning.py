@@ -660,6 +660,21 @@ def test_a_second_commissioning_keeps_what_it_did_not_measure(tmp_path):
     assert text.count("measured:") == text.count("by wlr commission") == 1
 
 
+def test_tests_made_again_leave_the_results_of_the_others(tmp_path, capsys):
+    words = ["commission", "--emulated", "--force", "--out", str(tmp_path), "--tests"]
+    assert main([*words, "latency", "silent_servo"]) == 0
+    first = results_of(tmp_path)
+    assert main([*words, "silent_servo"]) == 0
+    second = results_of(tmp_path)
+    assert second["latency"] == first["latency"]
+    assert set(second) == set(first)
+    measured = load_hardware(tmp_path / "hardware.yaml").measured
+    assert set(measured.adapter_latency) == set(measured.answers_behind_fast) == set(NOMINAL.buses)
+    assert main([*words, "latency", "--fault", "delay legs value=0.015"]) == 2
+    assert "silent_servo is of robot 'wlr-emanual', hardware 'nominal', emulated, not of" in capsys.readouterr().err
+    assert results_of(tmp_path) == second
+
+
 def test_a_copy_of_the_hardware_file_still_finds_its_robot(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/robot.yaml").write_text("base: emanual\nname: mine\n")
