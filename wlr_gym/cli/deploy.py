@@ -70,7 +70,7 @@ class DeployOptions(JsonOption, PatchOption):
     command: tuple[str, ...] = ()
     """What to follow: linear_velocity_x=0.1 yaw_rate=0; default: drawn anew every few seconds, as in training."""
     seed: int = 0
-    """Seed of the drawn commands."""
+    """Seed of the drawn commands, and of an emulated robot's noise."""
     deadman: float | None = None
     """Stop the wheels when no key was pressed for so many seconds (10 at most); with --gamepad: its dead-man button (0.2)."""
     gamepad: str | None = None
@@ -237,6 +237,7 @@ def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> 
         "poses": None if poses is None else Path(poses),
         "dry_run": options.dry_run,
         "log": options.out,
+        "seed": options.seed,
         "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
     }
 
@@ -295,7 +296,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
         links = Path(folder) / "ports"
-        words = ["--links", str(links), "--hardware", options.hardware]
+        words = ["--links", str(links), "--hardware", options.hardware, "--seed", str(options.seed)]
         if options.camera is not None:
             words += ["--poses", str(Path(folder) / _POSES)]
         if robot is not None:

@@ -51,9 +51,10 @@ def parse(kind: type, program: str, arguments: Sequence[str], description: str) 
             raise InputError(f"{_first_words(said.getvalue(), program)}; see: {program} --help") from None
         print(_wrapped(shown.getvalue()), end="")
         raise
-    seed = getattr(found, "seed", None)
-    if seed is not None and not 0 <= seed <= LARGEST_SEED:
-        raise InputError(f"--seed {seed}: expected 0 to {LARGEST_SEED}")
+    for name in ("seed", "noise_seed"):
+        seed = getattr(found, name, None)
+        if seed is not None and not 0 <= seed <= LARGEST_SEED:
+            raise InputError(f"--{name.replace('_', '-')} {seed}: expected 0 to {LARGEST_SEED}")
     return found
 
 

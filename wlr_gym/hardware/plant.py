@@ -175,4 +175,5 @@ def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: Plant
         return serial_link(robot, hardware, camera, chosen.poses)
     from wlr_gym.hardware.emulator.link import emulated_robot  # with the simulators, which a real robot does not need
 
-    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise, camera=camera)
+    noise = options.sensor_noise
+    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=noise, camera=camera, seed=chosen.seed)
