@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from wlr_gym.base.errors import unknown_name
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
@@ -70,8 +68,7 @@ class EmulatedStand:
 
     def straighten(self, leg: str) -> None:
         """Hold a leg straight down, torque off: the leg itself, whatever its encoder says."""
-        k = JOINTS.index(leg)
-        self.machine.turn(leg, float(np.pi / 2 - self.machine.plant.mechanical_state().joint_position[0, k]))
+        self.machine.straighten(leg)
 
     def tilt(self, **angles: float) -> None:
         """Begin to turn the body to ``roll``, ``pitch`` and ``yaw`` (rad; the others to 0); it gets there in about 2 s."""
