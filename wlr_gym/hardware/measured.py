@@ -38,7 +38,7 @@ class Measured(SettingsModel):
         integral_cycle: s, control cycle of the wheel's servo that this means.
         load_per_pwm: Present Load over PWM from speed to speed of a free wheel: 0 = it is torque, 1 = it is PWM.
         running_load: Present Load of a free wheel, part of stall torque.
-        stall_load: Present Load of a held wheel over PWM and supply.
+        stall_load: load of a held wheel or leg over PWM and supply.
         stall_current: A of a held wheel, at full voltage.
         joint_zero: rad that a leg reads when it hangs straight down, less pi/2.
     """

@@ -36,7 +36,7 @@ PERIOD = 0.02
 TOP_SPEED = 3.0
 #: rad that a leg may be asked to move by, and rad/s it moves with.
 LARGEST_LEAN, LEAN_SPEED = 0.12, 0.5
-#: Part of the supply on a motor whose wheel is held: 0.3 N m, 9 N at the rim.
+#: Part of the supply on a motor that is held: a wheel pulls with 0.3 N m, 9 N at the rim, a leg with 1.5 N m, 11 N at its end.
 LOW_PWM = 0.2
 #: Part of the stall torque above which a motor that should turn freely is blocked, and rows in a row.
 BLOCKED, BLOCKED_ROWS = 0.4, 3
@@ -267,11 +267,11 @@ class Stand:
         if not np.isnan(self._setpoints[k]):
             self._setpoints[k] = value
 
-    def weaken(self, wheel: str) -> float:
+    def weaken(self, joint: str) -> float:
         """Let a motor have a small part of the supply only; return the part."""
-        full = self.servos.table(wheel).counts.full_pwm
+        full = self.servos.table(joint).counts.full_pwm
         count = round(LOW_PWM * full)
-        self.servos.set(wheel, "goal_pwm", count)
+        self.servos.set(joint, "goal_pwm", count)
         return count / full
 
     def pwm(self) -> Array:
