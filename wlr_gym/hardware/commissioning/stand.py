@@ -193,11 +193,15 @@ class Stand:
             reset_tuning(self.servos, joint)
             self.servos.set(joint, "goal_pwm", self.servos.get(joint, "pwm_limit"))
             if joint in LEGS:
-                speed = max(1, round(LEAN_SPEED / self.servos.table(joint).per_count("profile_velocity")))
-                self.servos.set(joint, "profile_velocity", speed)
+                self.slow(joint, LEAN_SPEED)
                 self.servos.set(joint, "goal_position", self.servos.get(joint, "present_position"))
             else:
                 self.servos.set(joint, "goal_velocity", 0)
+
+    def slow(self, leg: str, speed: float) -> None:
+        """Let a leg move at ``speed`` (rad/s) from now on, :data:`LEAN_SPEED` at most."""
+        count = round(min(speed, LEAN_SPEED) / self.servos.table(leg).per_count("profile_velocity"))
+        self.servos.set(leg, "profile_velocity", max(1, count))
 
     def switch_on(self, joints: Iterable[str]) -> None:
         """Switch torque on and arm the watchdogs; the servos' registers say what happens then."""
