@@ -92,7 +92,7 @@ class TerminalPerson:
         """Ask for a hand on a wheel, or at a leg's end."""
         where = "the tyre firmly, away from gears and leg; watch the supply"
         if joint in LEGS:
-            where = "its end firmly, straight down, away from the hip; it will push to the back"
+            where = "its end firmly, away from the hip; it will push to the back"
         self._answer(f"{full_name(joint)}: hold {where}. Then Enter.")
 
     def release(self, joint: str) -> None:

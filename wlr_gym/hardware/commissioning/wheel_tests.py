@@ -108,7 +108,7 @@ def _measure_load(stand: Stand, person: Person) -> list[Reading]:
         stand.samples |= {f"load_{wheel}": loads[:, k].tolist(), f"pwm_{wheel}": pwms[:, k].tolist()}
         slope = float(np.polyfit(pwms[:, k], loads[:, k], 1)[0])
         found += [Reading("load_per_pwm", wheel, slope), Reading("running_load", wheel, float(loads[:, k].mean()))]
-    stand.spin(dict.fromkeys(WHEELS, 0.0))
+    stand.switch_off(WHEELS)  # before the legs are prepared: on a slow line that takes longer than the watchdogs wait
     stand.prepare(LEGS)
     return found + [Reading("running_load", leg, _leg_load(stand, leg)) for leg in LEGS]
 
