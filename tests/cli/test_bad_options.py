@@ -23,13 +23,22 @@ def test_output_that_cannot_be_a_folder(tmp_path, capsys, arguments):
     ("arguments", "words"),
     [
         (["train", "--max-minutes", "-1"], "--max-minutes -1: expected more than 0"),
-        (["evaluate", "do_nothing", "--seed", "-1"], "--seed -1: expected 0 or more"),
+        (["evaluate", "do_nothing", "--seed", "-1"], "--seed -1: expected 0 to 4294967295"),
     ],
 )
 def test_numbers_out_of_range(tmp_path, capsys, arguments, words):
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 2**64])
+@pytest.mark.parametrize(
+    "command", ["adapt pid", "compare --out x", "demo", "deploy pid", "emulate", "evaluate pid", "play", "record", "train"]
+)
+def test_a_seed_out_of_range(capsys, command, seed):
+    assert main([*command.split(), "--seed", str(seed)]) == 2
+    assert f"--seed {seed}: expected 0 to 4294967295" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,14 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import emulate
+from wlr_gym.hardware.calibration import find_sign
+from wlr_gym.hardware.emulator.commands import run_command
+from wlr_gym.robot import JOINTS, LEGS
 
 pytest.importorskip("termios")
 
@@ -46,6 +50,26 @@ def test_effects_are_taken_by_name_and_refused_when_unknown():
     assert emulate.run(options(stepped=True, effects=("tired_battery",))) == 0
     with pytest.raises(InputError, match="did you mean 'tired_battery'"):
         emulate.run(options(stepped=True, effects=("tired_batery",)))
+
+
+def test_a_robot_on_a_stand_keeps_what_hands_did_while_nobody_is_quick():
+    """What practising ``wlr calibrate joints`` takes: on the floor a robot without torque collapses."""
+    machine = emulate.machine_of(options(stand=True, tick=0.002))
+
+    def counts(command=None):
+        if command:
+            run_command(machine, command)
+        machine.advance(5.0)
+        return np.array([machine.servos[joint]["present_position"] for joint in JOINTS])
+
+    for joint in ("leg_rf", "wheel_lr"):
+        before = counts()
+        after = counts(f"turn {joint} 60")
+        assert find_sign(joint, before, after) == machine.hardware.joints[joint].sign
+    for k, leg in enumerate(LEGS):
+        assert counts(f"straighten {leg}")[k] == 2048
+    with pytest.raises(InputError, match="unknown leg 'leg_fl'"):
+        run_command(machine, "straighten leg_fl")
 
 
 @pytest.mark.slow

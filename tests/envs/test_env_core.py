@@ -612,6 +612,14 @@ def test_every_episode_of_a_robot_is_another_one_and_all_repeat_with_the_seed(fa
     assert not np.array_equal(env.reset(seed=6)[0], first[0])
 
 
+def test_a_seed_beyond_64_bits_is_no_small_one(fake):
+    first = [make().reset(seed=seed)[0].tolist() for seed in (0, 2**64, 2**65, 2**200)]
+    assert len({tuple(observation) for observation in first}) == 4
+    assert make().reset(seed=2**64)[0].tolist() == first[1]
+    batch = make_vec(2).reset(seed=2**64 - 1)[0].tolist()
+    assert batch == [make().reset(seed=2**64 - 1)[0].tolist(), first[1]]
+
+
 def test_unseeded_batches_differ_and_tell_their_seed(fake):
     one, two = make_vec(3), make_vec(3)
     observations, _ = one.reset()

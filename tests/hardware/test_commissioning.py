@@ -152,6 +152,8 @@ def found_in(results):
     ("name", "joint", "factor", "test", "quantities"),
     [
         ("servo.stall_torque", "wheel_rf", 0.7, "stall", {"stall_load"}),
+        ("servo.stall_torque", "leg_rf", 0.7, "stall", {"stall_load"}),
+        ("servo.torque_scale", "leg_lr", 0.5, "load", {"running_load"}),
         ("servo.kp", "wheel_lr", 0.7, "velocity_step", {"velocity_loop_time", "integral_cycle"}),
         ("servo.coulomb_friction", "wheel_rr", 2.0, "load", {"running_load"}),
         ("servo.kp", "wheel_lf", 0.4, "watchdog", {"watchdog_stop_time"}),
@@ -161,6 +163,28 @@ def test_a_servo_that_differs_is_found_and_named(tmp_path, name, joint, factor, 
     results = make(tmp_path, EmulatedStand(ROBOT, NOMINAL, parameters=changed(name, joint, factor)), test)
     assert found_in(results) == {(quantity, joint) for quantity in quantities}
     assert not results[test].is_good
+
+
+def test_legs_that_get_a_part_of_their_voltage_are_found(tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    emulated.machine.inject("slow_servo legs value=0.05")
+    results = make(tmp_path, emulated, "load", "stall")
+    assert found_in(results) == {("stall_pwm", leg) for leg in LEGS}
+
+
+def test_a_leg_that_does_not_move_or_is_not_held_has_no_strength(tmp_path):
+    effect = {"name": "weak_motor", "where": ["leg_rf"], "parameters": {"scale": 0.05}}
+    emulated = EmulatedStand(ROBOT, NOMINAL, {"effects": [effect]})
+
+    class Careless(EmulatedPerson):
+        def brake(self, joint):
+            if joint in WHEELS:
+                super().brake(joint)
+
+    results = make(tmp_path, emulated, "load", "stall", person=Careless(emulated))
+    assert [result.state for result in results.values()] == ["failed", "failed"]
+    assert re.match(r"leg_rf moved by 0.0\d+ rad, expected 0.12 within 20%", results["load"].reason)
+    assert re.match(r"leg_lf turned by 0.1\d rad, in the end at 0.00 rad/s: hold it firmly", results["stall"].reason)
 
 
 @pytest.mark.slow
@@ -173,7 +197,7 @@ def test_a_rubbing_wheel_and_a_slow_adapter_are_told_on_the_command_line(tmp_pat
     assert differing(tmp_path / "out") == {("adapter_latency", "legs"), ("running_load", "wheel_rf")}
     shown = capsys.readouterr().out
     assert "legs, adapter_latency: median time of a ping" in shown
-    assert "wheel_rf, running_load: load of the free wheel" in shown
+    assert "wheel_rf, running_load: load of the free wheel, or of the leg" in shown
     assert load_hardware(tmp_path / "out" / "hardware.yaml").measured.adapter_latency["legs"].value > 0.01
 
 
@@ -427,7 +451,7 @@ class Human:
             self.emulated.turn(joint, way * np.deg2rad(float(turned.group(3))))
         elif "straight down" in text and joint in LEGS:
             self.emulated.straighten(joint)
-        elif "hold the tyre" in text:
+        elif "hold the tyre" in text or "hold its end" in text:
             self.emulated.brake(joint)
         elif "let go" in text:
             self.emulated.release(joint)
@@ -451,7 +475,7 @@ def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(monkeypa
     assert [result["state"] for result in results_of(tmp_path / "out").values()] == ["skipped", "done", "done"]
     starts = [text for text in human.asked if "Enter starts, s skips, q ends" in text]
     assert len(starts) == 3
-    assert "Each wheel is to be held by hand" in starts[2]
+    assert "Each wheel, then each leg's end, is to be held by hand" in starts[2]
     found = load_hardware(mine)
     assert found.measured.stall_current["wheel_lf"].value == pytest.approx(emulated.stall_current, rel=0.05)
     assert not found.measured.joint_zero
@@ -658,6 +682,21 @@ def test_a_second_commissioning_keeps_what_it_did_not_measure(tmp_path):
     assert set(found.answers_behind_fast) == set(NOMINAL.buses)
     text = (second / "hardware.yaml").read_text()
     assert text.count("measured:") == text.count("by wlr commission") == 1
+
+
+def test_tests_made_again_leave_the_results_of_the_others(tmp_path, capsys):
+    words = ["commission", "--emulated", "--force", "--out", str(tmp_path), "--tests"]
+    assert main([*words, "latency", "silent_servo"]) == 0
+    first = results_of(tmp_path)
+    assert main([*words, "silent_servo"]) == 0
+    second = results_of(tmp_path)
+    assert second["latency"] == first["latency"]
+    assert set(second) == set(first)
+    measured = load_hardware(tmp_path / "hardware.yaml").measured
+    assert set(measured.adapter_latency) == set(measured.answers_behind_fast) == set(NOMINAL.buses)
+    assert main([*words, "latency", "--fault", "delay legs value=0.015"]) == 2
+    assert "silent_servo is of robot 'wlr-emanual', hardware 'nominal', emulated, not of" in capsys.readouterr().err
+    assert results_of(tmp_path) == second
 
 
 def test_a_copy_of_the_hardware_file_still_finds_its_robot(tmp_path):

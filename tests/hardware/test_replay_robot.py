@@ -30,7 +30,7 @@ ROBOT = load_robot("emanual")
 def run(tmp_path_factory):
     """A run of the emulated robot: 4 s of spins and arcs."""
     out = tmp_path_factory.mktemp("measured")
-    assert record.run(record.RecordOptions(excitation=("turns",), out=out, emulated=True, seconds=4.0)) == 0
+    assert record.run(record.RecordOptions(excitation=("turns",), out=out, emulated=True, noise_seed=0, seconds=4.0)) == 0
     return read_run(out / "run_01.csv")
 
 

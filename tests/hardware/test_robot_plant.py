@@ -100,6 +100,11 @@ def test_there_is_one_robot(count):
         make_plant("dynamixel", ROBOT, count, QUIET, hardware=RobotOptions(emulated=True))
 
 
+def test_a_silence_in_ms_is_refused():
+    with pytest.raises(InputError, match="deadman 300 s: expected more than 0 and at most 10 s"):
+        make_plant("dynamixel", ROBOT, 1, QUIET, hardware=RobotOptions(emulated=True, deadman=300.0))
+
+
 def test_what_a_robot_cannot_do_is_refused():
     plant = robot_plant()
     for ask in (plant.truth, plant.mechanical_state):

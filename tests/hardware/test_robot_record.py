@@ -58,6 +58,25 @@ def test_the_emulated_robot_is_driven_and_logged(tmp_path, capsys):
     assert "straight: 100 of 100 steps driven; to its end" in text
 
 
+def noise_of(folder, run="run_01", **options):
+    """Record a motion; return the accelerometer's rows of a run, and the seed that its events tell."""
+    assert recorded(folder, excitation=("straight",), seconds=0.4, **options) == 0
+    (event,) = [event for event in read_events(folder / f"{run}.csv") if event["event"] == "emulated"]
+    return read_run(folder / f"{run}.csv")["acc_x"].tolist(), event["noise_seed"]
+
+
+def test_every_emulated_run_has_other_noise_and_tells_how_to_repeat_it(tmp_path):
+    first, seed = noise_of(tmp_path / "first")
+    assert noise_of(tmp_path / "second")[0] != first
+    assert noise_of(tmp_path / "again", noise_seed=seed) == (first, seed)
+
+
+def test_the_seed_of_the_motions_decides_the_noise_too(tmp_path):
+    first = noise_of(tmp_path / "first", seed=3)
+    assert noise_of(tmp_path / "second", seed=3) == first
+    assert noise_of(tmp_path / "second", "run_02", seed=3)[0] != first[0]
+
+
 def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
     machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
     monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))

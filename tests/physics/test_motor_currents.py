@@ -72,6 +72,7 @@ def test_no_motor_gives_more_than_it_takes():
     [
         ({"stall_current": None}, r"servo.leg.no_load_current: expected stall_current beside it"),
         ({"no_load_current": None}, r"servo.leg.stall_current: expected no_load_current beside it"),
+        ({"stall_current": 4400}, r"servo.leg.stall_current = 4400 A: expected 100 A at most; is it in mA\?"),
         ({"no_load_current": 4.4}, r"no_load_current = 4.4 A: expected less than stall_current, 4.4 A"),
         ({"stall_current": 1.0}, r"stall_current = 1 A: .* expected at least 1.82 A"),
         ({"stall_current": -1.0}, "greater than 0"),

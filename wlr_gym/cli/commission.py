@@ -6,11 +6,12 @@ file. Exit code 0: all as expected; 1: something differs, or a test could not be
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, OK
@@ -41,7 +42,7 @@ class CommissionOptions(JsonOption, ForceOption, RobotOption, PatchOption):
 
     Attributes:
         out: folder for runs and results; made if it is not there.
-        tests: which tests to make; none = all. See --list.
+        tests: which tests to make; none = all. See --list. With --force, results of the others in --out are kept.
         fault: with --emulated: what goes wrong, as in wlr emulate: "delay legs value=0.015".
         list: show the tests.
         yes: do not ask before each test, and write the hardware file; what hands have to do is asked for all the same.
@@ -83,6 +84,29 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     return _commission(options, options.out, tests, ask or partial(ask_terminal, what="commissioning"), console)
 
 
+def _earlier(report: Path, robot: str, tests: Sequence[StandTest]) -> list[dict[str, Any]]:
+    """Return the results of an earlier session that this one does not replace: those of tests that are not made now.
+
+    Raises:
+        InputError: they are of another robot.
+    """
+    found = json.loads(report.read_text(encoding="utf-8")) if report.is_file() else []
+    made = [test.name for test in tests]
+    kept = [result for result in found if result["test"] not in made]
+    for result in kept:
+        if result.get("robot") != robot:
+            raise InputError(
+                f"{report}: its {result['test']} is of {result.get('robot')}, not of {robot}: choose another --out"
+            )
+    return kept
+
+
+def _named(options: CommissionOptions, robot: Robot) -> str:
+    """Return in words which robot is tested."""
+    words = [f"robot '{robot.name}'", f"hardware '{Path(options.hardware).name}'", *(["emulated"] if options.emulated else [])]
+    return ", ".join([*words, *options.effects, *options.fault])
+
+
 def _commission(
     options: CommissionOptions, out: Path, tests: Sequence[StandTest], ask: Callable[[str], str], console: Console
 ) -> int:
@@ -91,6 +115,8 @@ def _commission(
     from wlr_gym.hardware.commissioning.runner import DONE, Commissioning, content_of
 
     robot, hardware = options.load()
+    named = _named(options, robot)
+    kept = _earlier(out / REPORT, named, tests)
     link, person = _robot(options, robot, hardware, ask)
     meta = RunMeta(robot=robot.name, notes="wlr commission, on a stand")
     results: list[StandResult] = []
@@ -103,7 +129,7 @@ def _commission(
             for reason in result.repeated:
                 console.print(f"{result.test}: made once more: {reason}")
             console.print(f"{result.test}: {result.state}{f': {result.reason}' if result.reason else ''}")
-            write_json(out / REPORT, [content_of(one) for one in results])
+            write_json(out / REPORT, [*kept, *(content_of(one) | {"robot": named} for one in results)])
     findings = [finding for result in results for finding in result.findings]
     if options.json:
         print_json([content_of(one) for one in results])
@@ -112,7 +138,7 @@ def _commission(
     made = {result.test for result in results if result.state == DONE}
     _print_end(findings, [test.name for test in tests if test.name not in made], console)
     if findings:
-        _save(options, out, findings, ask, console)
+        _save(options, out, findings, bool(kept), ask, console)
     return OK if all(result.is_good for result in results) else FAILED
 
 
@@ -132,17 +158,26 @@ def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Ca
 
 
 def _save(
-    options: CommissionOptions, out: Path, findings: Iterable[StandFinding], ask: Callable[[str], str], console: Console
+    options: CommissionOptions,
+    out: Path,
+    findings: Iterable[StandFinding],
+    is_continued: bool,
+    ask: Callable[[str], str],
+    console: Console,
 ) -> None:
-    """Write the hardware file with what was measured: a copy in ``--out``, and, of a real robot, the file itself if wanted."""
+    """Write the hardware file with what was measured: a copy in ``--out``, and, of a real robot, the file itself if wanted.
+
+    The copy keeps what an earlier session measured that this one continues.
+    """
     from wlr_gym.base.paths import find_config
     from wlr_gym.hardware.calibration import save_hardware
     from wlr_gym.hardware.commissioning.comparison import with_measurements
     from wlr_gym.hardware.config import load_hardware
 
     source = find_config("hardware", options.hardware)
-    changed = with_measurements(load_hardware(source), findings)  # what the file says, not ports of the command line
     targets = [out / "hardware.yaml"]
+    earlier = load_hardware(targets[0]).measured if is_continued and targets[0].is_file() else None
+    changed = with_measurements(load_hardware(source), findings, earlier)  # what the file says, not ports of the command line
     is_own = options.hardware.endswith((".yaml", ".yml")) and not options.emulated
     if is_own and (options.yes or ask(f"Write the measured values into {source}? [y/N]").strip().lower() in ("y", "yes")):
         targets.append(source)

@@ -85,8 +85,6 @@ def run(options: DemoOptions) -> int:
 def _demo(options: DemoOptions) -> Demo:
     from wlr_gym.studies.demo.settings import Demo
 
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps}: expected 1 or more")
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)

@@ -70,9 +70,9 @@ class DeployOptions(JsonOption, PatchOption):
     command: tuple[str, ...] = ()
     """What to follow: linear_velocity_x=0.1 yaw_rate=0; default: drawn anew every few seconds, as in training."""
     seed: int = 0
-    """Seed of the drawn commands."""
+    """Seed of the drawn commands, and of an emulated robot's noise."""
     deadman: float | None = None
-    """Stop the wheels when no key was pressed for so many seconds; with --gamepad, its dead-man button (default: 0.2)."""
+    """Stop the wheels when no key was pressed for so many seconds (10 at most); with --gamepad: its dead-man button (0.2)."""
     gamepad: str | None = None
     """Steer with a gamepad, such as /dev/input/js0, while its dead-man button is held; buttons: the hardware file's gamepad."""
     realtime: int | None = None
@@ -140,12 +140,12 @@ def run(options: DeployOptions) -> int:
 
 def _check(options: DeployOptions) -> dict[str, float]:
     """Return the held command, from options that make sense."""
+    from wlr_gym.hardware.limits import require_deadman
+
     if not 0.0 < options.seconds < float("inf"):
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: expected 0 or more")
-    if options.deadman is not None and not 0.0 < options.deadman < float("inf"):
-        raise InputError(f"--deadman {options.deadman:g}: expected more than 0")
+    if options.deadman is not None:
+        require_deadman("--deadman", options.deadman)
     if not options.emulated and (options.stepped or options.fault):
         raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
     if options.stepped and options.realtime is not None:
@@ -237,6 +237,7 @@ def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> 
         "poses": None if poses is None else Path(poses),
         "dry_run": options.dry_run,
         "log": options.out,
+        "seed": options.seed,
         "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
     }
 
@@ -295,7 +296,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
         links = Path(folder) / "ports"
-        words = ["--links", str(links), "--hardware", options.hardware]
+        words = ["--links", str(links), "--hardware", options.hardware, "--seed", str(options.seed)]
         if options.camera is not None:
             words += ["--poses", str(Path(folder) / _POSES)]
         if robot is not None:

@@ -16,7 +16,7 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.options import PatchOption
 
 if TYPE_CHECKING:
-    from wlr_gym.hardware.emulator import Server
+    from wlr_gym.hardware.emulator import Machine, Server
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class EmulateOptions(PatchOption):
         links: folder for links to the ports with fixed names (one per bus, imu, and flow); made if it is not there.
         control: path of a Unix socket that takes command lines.
         fault: faults to start with, each in quotes.
+        stand: on a stand, wheels off the floor, for wlr calibrate joints; on the floor it collapses where motors are off.
         stepped: time passes only by the command ``step SECONDS``; answers then come at once.
         tick: emulated time per step, s.
         usb_latency: how long the adapter holds back unfilled packets, s (16 ms as an FTDI adapter comes, 1 ms as advised).
@@ -47,6 +48,7 @@ class EmulateOptions(PatchOption):
     links: Path | None = None
     control: Path | None = None
     fault: tuple[str, ...] = ()
+    stand: bool = False
     stepped: bool = False
     tick: float = 0.001
     usb_latency: float = 0.001
@@ -64,11 +66,37 @@ def run(options: EmulateOptions) -> int:
     Raises:
         InputError: unknown robot, hardware, backend or fault; ports that cannot be made.
     """
-    from wlr_gym.hardware.config import load_hardware
-    from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
+    from wlr_gym.hardware.emulator import Server
     from wlr_gym.hardware.emulator.camera import FeedWriter
+
+    machine = machine_of(options)
+    with Server(machine, real_time=not options.stepped, links=options.links, control=options.control) as server:
+        if options.poses is not None:
+            machine.watchers.append(FeedWriter(machine, options.poses, lambda: server.origin))
+        _print_ports(server, options.links)
+        try:
+            _take_commands(server, options.seconds)
+        except KeyboardInterrupt:
+            print("stopped")
+    if server.failure is not None:
+        raise server.failure
+    if server.slipped > 0.0:
+        print(f"this computer was too busy: emulated time fell behind by {server.slipped:.2f} s", file=sys.stderr)
+    machine.close()
+    return OK
+
+
+def machine_of(options: EmulateOptions) -> Machine:
+    """Return the emulated robot.
+
+    Raises:
+        InputError: unknown robot, hardware, backend or fault; numbers out of range.
+    """
+    from wlr_gym.hardware.config import load_hardware
+    from wlr_gym.hardware.emulator import Machine, MachineOptions
     from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
     from wlr_gym.hardware.emulator.link import with_flow_port
+    from wlr_gym.hardware.emulator.stand import EmulatedStand
     from wlr_gym.physics.effects import apply_patch
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters
@@ -89,24 +117,15 @@ def run(options: EmulateOptions) -> int:
     )
     hardware, patch = load_hardware(options.hardware), options.patch()
     robot = load_robot(options.robot or hardware.robot or "nominal")
-    parameters = apply_patch(patch, Parameters.nominal(robot, 1))
-    machine = Machine(robot, with_flow_port(robot, hardware), machine_options, parameters=parameters, forces=patch.forces)
+    hardware = with_flow_port(robot, hardware)
+    if options.stand:
+        machine = EmulatedStand(robot, hardware, patch, options=machine_options).machine
+    else:
+        parameters = apply_patch(patch, Parameters.nominal(robot, 1))
+        machine = Machine(robot, hardware, machine_options, parameters=parameters, forces=patch.forces)
     for fault in options.fault:
         machine.inject(fault)
-    with Server(machine, real_time=not options.stepped, links=options.links, control=options.control) as server:
-        if options.poses is not None:
-            machine.watchers.append(FeedWriter(machine, options.poses, lambda: server.origin))
-        _print_ports(server, options.links)
-        try:
-            _take_commands(server, options.seconds)
-        except KeyboardInterrupt:
-            print("stopped")
-    if server.failure is not None:
-        raise server.failure
-    if server.slipped > 0.0:
-        print(f"this computer was too busy: emulated time fell behind by {server.slipped:.2f} s", file=sys.stderr)
-    machine.close()
-    return OK
+    return machine
 
 
 def _print_ports(server: Server, links: Path | None) -> None:

@@ -227,8 +227,6 @@ def _shipped_for(environment: str) -> list[str]:
 
 
 def _check(options: EvaluateOptions) -> None:
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.backend not in (*BACKENDS, "both"):
         raise unknown_name("backend", str(options.backend), (*BACKENDS, "both"), "--backend")
     if options.record and (options.out is None or not 0 < options.record <= (options.episodes or 0)):

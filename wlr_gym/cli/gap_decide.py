@@ -97,14 +97,17 @@ def _simulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backe
 
 
 def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
-    """Drive an emulated robot in emulated time, through the command limiter as a real one."""
+    """Drive an emulated robot in emulated time, through the command limiter as a real one; noise as in a simulator."""
+    from wlr_gym.base.random import spawn_seeds
     from wlr_gym.data.read import read_meta
+    from wlr_gym.data.record import next_run
     from wlr_gym.gap.decision import Recorded
     from wlr_gym.hardware.driving import drive_robot
 
     del backend  # it has a simulator of its own
     meta = read_meta(data).model_copy(update={"profile": motion.profile})
-    with closing(RobotOption(emulated=True).plant_of(robot, data, meta, hidden)) as plant:
+    seed = int(spawn_seeds(0, 1, next_run(data).stem)[0])
+    with closing(RobotOption(emulated=True).plant_of(robot, data, meta, hidden, seed)) as plant:
         drive = drive_robot(plant, motion)
     return Recorded(drive.run, drive.reason)
 

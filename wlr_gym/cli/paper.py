@@ -121,7 +121,7 @@ def _check(options: PaperOptions) -> None:
         options.load_hardware()
     elif options.emulated or options.port:
         raise InputError("--emulated and --port are about the robot: add dynamixel to --plant")
-    for name, low, high in (("draws", 0, 10_000), ("levels", 1, 3), ("threads", 1, 256), ("seed", 0, 2**63)):
+    for name, low, high in (("draws", 0, 10_000), ("levels", 1, 3), ("threads", 1, 256)):
         value = getattr(options, name)
         if not low <= value <= high:
             raise InputError(f"--{name} {value}: expected {low} to {high}")

@@ -26,6 +26,8 @@ WIDTH = 80
 _WRITTEN = {int: "INT", float: "FLOAT", str: "STR", Path: "PATH"}
 _EXPECTED = {int: "a whole number", float: "a number", str: "a value", Path: "a path"}
 _HELP = ("-h", "--help")
+#: Largest ``--seed``: every library that a command seeds takes it.
+LARGEST_SEED = 2**32 - 1
 #: Shells that commands and options are completed in.
 SHELLS = ("bash", "zsh", "fish")
 
@@ -43,12 +45,17 @@ def parse(kind: type, program: str, arguments: Sequence[str], description: str) 
     shown, said = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(said):
-            return tyro.cli(builder(kind), prog=program, description=_plain(description), args=list(arguments))
+            found = tyro.cli(builder(kind), prog=program, description=_plain(description), args=list(arguments))
     except SystemExit as end:
         if end.code:
             raise InputError(f"{_first_words(said.getvalue(), program)}; see: {program} --help") from None
         print(_wrapped(shown.getvalue()), end="")
         raise
+    for name in ("seed", "noise_seed"):
+        seed = getattr(found, name, None)
+        if seed is not None and not 0 <= seed <= LARGEST_SEED:
+            raise InputError(f"--{name.replace('_', '-')} {seed}: expected 0 to {LARGEST_SEED}")
+    return found
 
 
 def chosen(program: str, commands: Mapping[str, tuple[type, str]], arguments: Sequence[str], description: str) -> Any:

@@ -109,8 +109,6 @@ def _check(options: PlayOptions) -> None:
 
     if options.backend in REAL:
         raise InputError(f"--backend {options.backend}: a real robot is driven with wlr deploy; wlr play takes a simulator")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: expected 0 or more")
     if options.seconds is not None and not 0 < options.seconds < float("inf"):
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     if not 1 <= options.fps <= 1000:

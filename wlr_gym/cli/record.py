@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
+from wlr_gym.cli.parsing import LARGEST_SEED
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import CameraOption, confirm
 
@@ -37,7 +38,9 @@ class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
         commands: files with setpoints to drive: of --commands-only, or of whole runs.
         out: folder for the runs; made if it is not there.
         backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
-        seed: seed of the motions, and of a simulator's noise.
+        seed: seed of the motions (default: 0), and of the noise of a simulator or an emulated robot.
+        noise_seed: seed of an emulated robot's noise: noise_seed of a run's events repeats it; default: from --seed and the
+            run's number, without --seed drawn anew.
         seconds: cut each motion off after this long.
         commands_only: write the setpoints only, one file per motion.
         list: show the excitations.
@@ -50,7 +53,8 @@ class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
     commands: tuple[Path, ...] = ()
     out: Path | None = None
     backend: str = "dynamixel"
-    seed: int = 0
+    seed: int | None = None
+    noise_seed: int | None = None
     seconds: float | None = None
     commands_only: bool = False
     list: bool = False
@@ -80,6 +84,8 @@ def run(options: RecordOptions) -> int:
     if options.list:
         _list(console, robot, options.json)
         return OK
+    if options.noise_seed is not None and not options.emulated:
+        raise InputError("--noise-seed is for the emulated robot: add --emulated")
     if options.backend not in REAL and (options.emulated or options.port or options.camera):
         raise InputError(f"--emulated, --port and --camera are about the robot: leave --backend {options.backend} out")
     if options.out is None:
@@ -111,7 +117,7 @@ def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
 
     if options.seconds is not None and not options.seconds > 0.0:
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
-    motions = [excite(name, options.seed, robot, seconds=options.seconds) for name in options.excitation]
+    motions = [excite(name, options.seed or 0, robot, seconds=options.seconds) for name in options.excitation]
     motions += [read_commands(path).cut(options.seconds) for path in options.commands]
     if not motions:
         raise InputError("nothing to drive: name excitations (--excitation straight turns; see --list) or files (--commands)")
@@ -131,7 +137,7 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
     for motion in motions:
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
-        with closing(options.plant(options.out, meta, options.patch())) as plant:
+        with closing(options.plant(options.out, meta, options.patch(), _noise_seed(options, options.out))) as plant:
             drive = drive_robot(plant, motion)
         _report(motion, drive, console)
         found.append(
@@ -145,6 +151,16 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
     found += [{"motion": name, "run": None, "reason": "not driven", "well": False, "ticks": 0} for name in left]
     _results(options, found)
     return code
+
+
+def _noise_seed(options: RecordOptions, out: Path) -> int:
+    """Return the seed of an emulated robot's noise in the next run of a folder."""
+    from wlr_gym.base.random import spawn_seeds
+    from wlr_gym.data.record import next_run
+
+    if options.noise_seed is not None:
+        return options.noise_seed
+    return int(spawn_seeds(options.seed, 1, next_run(out).stem)[0]) % (LARGEST_SEED + 1)  # one that --noise-seed takes
 
 
 def _results(options: RecordOptions, found: Sequence[dict[str, object]]) -> None:
@@ -184,7 +200,7 @@ def _record_simulations(
     make_output_folder(options.out)
     for motion in motions:
         path = next_run(options.out)
-        seed = int(spawn_seeds(options.seed, 1, path.stem)[0])  # no two runs of a folder have the same noise
+        seed = int(spawn_seeds(options.seed or 0, 1, path.stem)[0])  # no two runs of a folder have the same noise
         record_simulation(path, motion, robot, options.backend, seed, patch, meta)
         console.print(f"{motion.name}: {motion.duration:.1f} s on {options.backend}; written: {path}")
         found.append({"motion": motion.name, "run": path})

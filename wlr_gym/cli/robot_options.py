@@ -51,8 +51,13 @@ class HardwareOption:
         """Return the robot file that is asked for, else the one that the hardware file names, else ``nominal``."""
         return str(asked or self.load_hardware().robot or "nominal")
 
-    def link_to(self, robot: Robot, hardware: Hardware, patch: Patch | None = None) -> Link:
-        """Return connections to a robot, closed; ``patch`` is what an emulated one has that the nominal one lacks.
+    def link_to(self, robot: Robot, hardware: Hardware, patch: Patch | None = None, seed: int = 0) -> Link:
+        """Return connections to a robot, closed.
+
+        Args:
+            robot, hardware: of the robot.
+            patch: what an emulated one has that the nominal one lacks.
+            seed: of an emulated one's noise.
 
         Raises:
             InputError: a patch for a real robot.
@@ -65,7 +70,7 @@ class HardwareOption:
             hardware = with_flow_port(robot, hardware)
             if patch is None:
                 return emulated_link(Machine(robot, hardware), camera)
-            return emulated_robot(robot, hardware, patch, camera=camera)
+            return emulated_robot(robot, hardware, patch, camera=camera, seed=seed)
         from wlr_gym.hardware.link import serial_link
 
         if patch is not None and patch.effects:
@@ -76,15 +81,15 @@ class HardwareOption:
         """Return the camera above the floor; None = the command has none."""
         return None
 
-    def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
-        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``."""
+    def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
+        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``. ``seed``: :meth:`link_to`."""
         from wlr_gym.hardware.plant import RobotPlant
         from wlr_gym.physics.plants.base import PlantOptions
         from wlr_gym.physics.plants.robot_options import RobotOptions
 
         hardware = self.load_hardware()
         options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)
-        return RobotPlant(robot, 1, PlantOptions(), options, link=self.link_to(robot, hardware, patch), meta=meta)
+        return RobotPlant(robot, 1, PlantOptions(), options, link=self.link_to(robot, hardware, patch, seed), meta=meta)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,9 +125,9 @@ class RobotOption(HardwareOption):
         link.servos.set_patience(CALM_PATIENCE)
         return link
 
-    def plant(self, log: Path, meta: RunMeta, patch: Patch) -> RobotPlant:
+    def plant(self, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
         """Return the robot as a plant; see :meth:`plant_of`."""
-        return self.plant_of(self.load()[0], log, meta, patch)
+        return self.plant_of(self.load()[0], log, meta, patch, seed)
 
 
 @dataclass(frozen=True, kw_only=True)

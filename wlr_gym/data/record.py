@@ -129,10 +129,12 @@ def record_simulation(
         meta: for ``meta.yaml``; its profile is the motion's.
 
     Raises:
-        InputError: unknown backend, or a folder whose ``meta.yaml`` says something else.
+        InputError: unknown backend, a seed that is out of range, or a folder whose ``meta.yaml`` says something else.
     """
     if backend not in SIMULATORS:
         raise InputError(f"backend '{backend}' is no simulator; expected {', '.join(SIMULATORS)}")
+    if not 0 <= seed < 2**64:
+        raise InputError(f"seed = {seed}: expected 0 to {2**64 - 1}")
     patch = patch or load_patch(None)
     parameters = apply_patch(patch, profile_parameters(Parameters.nominal(robot), motion.profile))
     options, seeds = PlantOptions(control_period=motion.period), np.array([seed], np.uint64)

@@ -62,7 +62,7 @@ class Episodes:
         Raises:
             InputError: see :func:`read_seed`.
         """
-        self.robot_seeds[row] = read_seed(seed) % 2**64
+        self.robot_seeds[row] = _word(read_seed(seed))
         self.number[row] = -1
         self.seeded[row] = True
 
@@ -120,3 +120,8 @@ def read_seed(seed: Any) -> int:
     if not is_whole(seed) or seed < 0:
         raise InputError(f"seed = {seed!r}: expected a whole number of 0 or more")
     return int(seed)
+
+
+def _word(seed: int) -> int:
+    """Return the 64 bits that a seed draws from: itself, or, of a larger one such as fresh entropy, its hash."""
+    return seed if seed < 2**64 else int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])

@@ -176,7 +176,7 @@ def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask, first: int)
         if given is not None:
             core.seed(row, given)
         elif not core.episodes.seeded[row]:
-            core.seed(row, (first + row) % 2**64)
+            core.seed(row, (first + row) % 2**128)
 
 
 def _read_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:

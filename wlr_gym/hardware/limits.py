@@ -16,6 +16,10 @@ def _limit(default: float | None, unit: str, *, le: float, **low: Any) -> Any:
     return Field(default=default, le=le, json_schema_extra={"unit": unit}, **low)
 
 
+#: s: longest silence of the operator that may be allowed.
+LONGEST_DEADMAN = 10.0
+
+
 class SafetyLimits(SettingsModel):
     """Limits of a robot, SI units; the reasons stand in ``configs/hardware/nominal.yaml``.
 
@@ -80,7 +84,7 @@ class SafetyLimits(SettingsModel):
     wheel_error_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
     late: int = _limit(5, "ticks", ge=1, le=10_000)
     late_share: float = _limit(0.1, "of the ticks", gt=0.0, le=1.0)
-    deadman: float | None = _limit(None, "s", gt=0.0, le=10.0)
+    deadman: float | None = _limit(None, "s", gt=0.0, le=LONGEST_DEADMAN)
     watchdog: float = _limit(0.2, "s", ge=0.02, le=2.54)
     heartbeat: float = _limit(0.8, "s", gt=0.0, le=10.0)
     patience: float = _limit(0.004, "s", gt=0.0, le=1.0)
@@ -116,6 +120,12 @@ _ORDER = (
     ("watchdog", "heartbeat", ""),
     ("warm", "hot", ""),
 )
+
+
+def require_deadman(name: str, seconds: float) -> None:
+    """Raise :class:`InputError` where the silence that an operator is allowed is none, or so long that it has another unit."""
+    if not 0.0 < seconds <= LONGEST_DEADMAN:
+        raise InputError(f"{name} {seconds:g} s: expected more than 0 and at most {LONGEST_DEADMAN:g} s")
 
 
 def unit_of(limit: str) -> str:

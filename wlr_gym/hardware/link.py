@@ -30,6 +30,7 @@ class Link:
         is_serial: there are real ports, which a watchdog process can open.
         finish: called after closing.
         camera: above the floor; None = there is none.
+        seed: of an emulated robot's noise; None = not one of this process.
     """
 
     servos: Servos
@@ -39,6 +40,7 @@ class Link:
     finish: Callable[[], None] = lambda: None
     flow: Flow | None = None
     camera: CameraReader | None = None
+    seed: int | None = None
 
     def open(self) -> None:
         """Open all ports, or none.

@@ -185,6 +185,7 @@ class RunRecorder:
         clock: of the runs.
         robot: whose runs they are.
         has_camera: its poses are logged, too.
+        seed: of an emulated robot's noise; None = of none.
 
     Attributes:
         columns: of a row.
@@ -194,14 +195,22 @@ class RunRecorder:
         stream: where rows of the run go besides; it has these columns.
     """
 
-    def __init__(self, folder: Path | None, meta: RunMeta, clock: Clock, robot: Robot, has_camera: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path | None,
+        meta: RunMeta,
+        clock: Clock,
+        robot: Robot,
+        has_camera: bool = False,
+        seed: int | None = None,
+    ) -> None:
         self.folder, self.meta, self._robot, self._has_camera = folder, meta, robot, has_camera
         self.columns = row_columns(robot, has_camera)
         self.log: RunLog | None = None
         self.trouble = ""
         self.stream: McapStream | None = None
         self.origin: RunOrigin = RunOrigin(0.0, np.zeros(len(WHEELS)))
-        self._clock = clock
+        self._clock, self._seed = clock, seed
         self._checks: list[str] = []
         self._rules: frozenset[str] = frozenset()
         self._flow_trouble = ""
@@ -222,6 +231,8 @@ class RunRecorder:
         self.trouble = ""
         self.log = RunLog(self.folder, self.meta, self._robot, self._has_camera)
         self.log.event(self._clock.now(), "checks", found=self._checks)
+        if self._seed is not None:
+            self.log.event(self._clock.now(), "emulated", noise_seed=self._seed)
 
     def phase(self, name: str, reason: str) -> None:
         """Note that a phase begins; ``ramp`` and ``running`` begin a table."""

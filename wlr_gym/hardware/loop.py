@@ -111,7 +111,7 @@ class ControlLoop:
         self.reason, self.ended_well = "", True
         self.clock: Clock = link.clock
         self.operator, self.pacer = Operator(link.clock), Pacer(link.clock, period)
-        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot, has_camera=link.camera is not None)
+        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot, link.camera is not None, link.seed)
         self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
         self._step = ControlStep(self._limiter, link, self.operator, self.pacer)

@@ -37,8 +37,8 @@ class Measured(SettingsModel):
         velocity_loop_time: s, time constant of a wheel's way to a new speed.
         integral_cycle: s, control cycle of the wheel's servo that this means.
         load_per_pwm: Present Load over PWM from speed to speed of a free wheel: 0 = it is torque, 1 = it is PWM.
-        running_load: Present Load of a free wheel, part of stall torque.
-        stall_load: Present Load of a held wheel over PWM and supply.
+        running_load: load of a free wheel, or of a leg on its way, part of stall torque.
+        stall_load: load of a held wheel or leg over PWM and supply.
         stall_current: A of a held wheel, at full voltage.
         joint_zero: rad that a leg reads when it hangs straight down, less pi/2.
     """

@@ -13,6 +13,7 @@ from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.camera.config import load_camera_file
 from wlr_gym.hardware.config import Hardware, load_hardware, require_leg_range, with_ports
+from wlr_gym.hardware.limits import require_deadman
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors, Truth
@@ -68,8 +69,7 @@ class RobotPlant:
         description = with_ports(load_hardware(chosen.hardware), dict(chosen.ports))
         require_leg_range(description, robot, chosen.hardware)
         if chosen.deadman is not None:
-            if not 0.0 < chosen.deadman < np.inf:
-                raise InputError(f"deadman {chosen.deadman:g}: expected seconds, more than 0")
+            require_deadman("deadman", chosen.deadman)
             safety = description.safety.model_copy(update={"deadman": chosen.deadman})
             description = description.model_copy(update={"safety": safety})
         if link is None:
@@ -175,4 +175,5 @@ def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: Plant
         return serial_link(robot, hardware, camera, chosen.poses)
     from wlr_gym.hardware.emulator.link import emulated_robot  # with the simulators, which a real robot does not need
 
-    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=options.sensor_noise, camera=camera)
+    noise = options.sensor_noise
+    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=noise, camera=camera, seed=chosen.seed)

@@ -59,6 +59,10 @@ class Wheel(SettingsModel):
     transverse_inertia: float | None = Field(gt=0)
 
 
+#: A: far above the stall current of any servo; a value beyond it has another unit.
+LARGEST_CURRENT = 100.0
+
+
 class Motor(SettingsModel):
     """One servo at its output shaft; torque, speed and currents at the nominal supply voltage (source: ROBOTIS e-manual).
 
@@ -103,7 +107,7 @@ class Servo(SettingsModel):
 
 
 def _check_currents(where: str, motor: Motor, supply: float) -> None:
-    """Refuse one current without the other, and a motor that would give more power than it takes.
+    """Refuse one current without the other, a current in mA, and a motor that would give more power than it takes.
 
     With torque T (1 - w/w0) and current Is (1 - w/w0) + I0 w/w0 at the full supply V, and both in proportion at others, the
     shaft never gets more than the supply gives if  T w0 <= V (sqrt(Is) + sqrt(I0))^2.
@@ -114,6 +118,8 @@ def _check_currents(where: str, motor: Motor, supply: float) -> None:
     if stall is None or idle is None:
         there, missing = ("no_load_current", "stall_current") if stall is None else ("stall_current", "no_load_current")
         raise InputError(f"{where}.{there}: expected {missing} beside it: both or none")
+    if stall > LARGEST_CURRENT:
+        raise InputError(f"{where}.stall_current = {stall:g} A: expected {LARGEST_CURRENT:g} A at most; is it in mA?")
     if idle >= stall:
         raise InputError(f"{where}.no_load_current = {idle:g} A: expected less than stall_current, {stall:g} A")
     shaft, most = motor.stall_torque * motor.no_load_speed, supply * (math.sqrt(stall) + math.sqrt(idle)) ** 2

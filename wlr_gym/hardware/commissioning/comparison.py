@@ -54,9 +54,10 @@ def compare(test: StandTest, measured: Sequence[Reading], expected: Sequence[Rea
     ]
 
 
-def with_measurements(hardware: Hardware, findings: Iterable[StandFinding]) -> Hardware:
-    """Return the hardware with what was measured; values that were not measured now stay."""
-    kept = {name: dict(getattr(hardware.measured, name)) for name in Measured.model_fields}
+def with_measurements(hardware: Hardware, findings: Iterable[StandFinding], earlier: Measured | None = None) -> Hardware:
+    """Return the hardware with what was measured; values that were not measured now stay, its own and ``earlier`` ones."""
+    told = (hardware.measured, earlier or Measured())
+    kept = {name: {**getattr(told[0], name), **getattr(told[1], name)} for name in Measured.model_fields}
     today = datetime.datetime.now().astimezone().date().isoformat()
     for one in findings:
         if one.quantity.name in kept:

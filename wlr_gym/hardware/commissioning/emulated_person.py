@@ -27,13 +27,13 @@ class EmulatedPerson:
         """Tilt the body; it is there in about 2 s."""
         self._stand.tilt(**angles)
 
-    def brake(self, wheel: str) -> None:
+    def brake(self, joint: str) -> None:
         """Hold it."""
-        self._stand.brake(wheel)
+        self._stand.brake(joint)
 
-    def release(self, wheel: str) -> None:
+    def release(self, joint: str) -> None:
         """Let go."""
-        self._stand.release(wheel)
+        self._stand.release(joint)
 
     def watch_supply(self) -> None:
         """Note the current."""

@@ -29,12 +29,12 @@ class Person(Protocol):
         """Begin to turn the body to ``roll``, ``pitch`` or ``yaw`` (rad), be there within ``seconds``; none = level again."""
         ...
 
-    def brake(self, wheel: str) -> None:
-        """Hold a wheel so that it does not turn, until :meth:`release`."""
+    def brake(self, joint: str) -> None:
+        """Hold a wheel or a leg so that it does not turn, until :meth:`release`."""
         ...
 
-    def release(self, wheel: str) -> None:
-        """Let go of a wheel."""
+    def release(self, joint: str) -> None:
+        """Let go of it."""
         ...
 
     def watch_supply(self) -> None:
@@ -88,13 +88,16 @@ class TerminalPerson:
         way = " and ".join(ways) or "level, as it was before"
         self._answer(f"Robot: press Enter, then turn it {way}, smoothly within {seconds:g} s, and keep it still there.")
 
-    def brake(self, wheel: str) -> None:
-        """Ask for a hand on a wheel."""
-        self._answer(f"{full_name(wheel)}: hold the tyre firmly, away from gears and leg; watch the supply. Then Enter.")
+    def brake(self, joint: str) -> None:
+        """Ask for a hand on a wheel, or at a leg's end."""
+        where = "the tyre firmly, away from gears and leg; watch the supply"
+        if joint in LEGS:
+            where = "its end firmly, away from the hip; it will push to the back"
+        self._answer(f"{full_name(joint)}: hold {where}. Then Enter.")
 
-    def release(self, wheel: str) -> None:
-        """Say that the wheel may be let go."""
-        self._answer(f"{full_name(wheel)}: its motor is off, let go, then Enter.")
+    def release(self, joint: str) -> None:
+        """Say that it may be let go."""
+        self._answer(f"{full_name(joint)}: its motor is off, let go, then Enter.")
 
     def watch_supply(self) -> None:
         """Do nothing: a human looks by himself."""

@@ -36,7 +36,7 @@ PERIOD = 0.02
 TOP_SPEED = 3.0
 #: rad that a leg may be asked to move by, and rad/s it moves with.
 LARGEST_LEAN, LEAN_SPEED = 0.12, 0.5
-#: Part of the supply on a motor whose wheel is held: 0.3 N m, 9 N at the rim.
+#: Part of the supply on a motor that is held: a wheel pulls with 0.3 N m, 9 N at the rim, a leg with 1.5 N m, 11 N at its end.
 LOW_PWM = 0.2
 #: Part of the stall torque above which a motor that should turn freely is blocked, and rows in a row.
 BLOCKED, BLOCKED_ROWS = 0.4, 3
@@ -193,11 +193,15 @@ class Stand:
             reset_tuning(self.servos, joint)
             self.servos.set(joint, "goal_pwm", self.servos.get(joint, "pwm_limit"))
             if joint in LEGS:
-                speed = max(1, round(LEAN_SPEED / self.servos.table(joint).per_count("profile_velocity")))
-                self.servos.set(joint, "profile_velocity", speed)
+                self.slow(joint, LEAN_SPEED)
                 self.servos.set(joint, "goal_position", self.servos.get(joint, "present_position"))
             else:
                 self.servos.set(joint, "goal_velocity", 0)
+
+    def slow(self, leg: str, speed: float) -> None:
+        """Let a leg move at ``speed`` (rad/s) from now on, :data:`LEAN_SPEED` at most."""
+        count = round(min(speed, LEAN_SPEED) / self.servos.table(leg).per_count("profile_velocity"))
+        self.servos.set(leg, "profile_velocity", max(1, count))
 
     def switch_on(self, joints: Iterable[str]) -> None:
         """Switch torque on and arm the watchdogs; the servos' registers say what happens then."""
@@ -267,11 +271,11 @@ class Stand:
         if not np.isnan(self._setpoints[k]):
             self._setpoints[k] = value
 
-    def weaken(self, wheel: str) -> float:
+    def weaken(self, joint: str) -> float:
         """Let a motor have a small part of the supply only; return the part."""
-        full = self.servos.table(wheel).counts.full_pwm
+        full = self.servos.table(joint).counts.full_pwm
         count = round(LOW_PWM * full)
-        self.servos.set(wheel, "goal_pwm", count)
+        self.servos.set(joint, "goal_pwm", count)
         return count / full
 
     def pwm(self) -> Array:

@@ -1,4 +1,4 @@
-"""Tests of the wheels' servos: their velocity loop, what Present Load follows, and the stall."""
+"""Tests of the wheels' servos: their velocity loop, what Present Load follows; and of all servos: load and stall."""
 
 from __future__ import annotations
 
@@ -8,19 +8,24 @@ from numpy.typing import NDArray
 from wlr_gym.hardware.commissioning.contract import Reading, StandQuantity, StandTest
 from wlr_gym.hardware.commissioning.errors import TroubleError
 from wlr_gym.hardware.commissioning.person import Person
-from wlr_gym.hardware.commissioning.stand import LOW_PWM, Stand
-from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS
+from wlr_gym.hardware.commissioning.stand import LARGEST_LEAN, LOW_PWM, PERIOD, Stand
+from wlr_gym.robot import JOINTS, LEGS, WHEEL_SLICE, WHEELS
 
 #: rad/s of the step, s that are recorded, and the part of the step over which the response is fitted.
 _STEP, _STEP_TIME, _FITTED = 3.0, 2.0, (0.3, 0.9)
 #: rad/s at which the load is read, s until a wheel turns evenly, rows that are averaged.
 _SPEEDS, _EVEN, _ROWS = (1.0, 2.0, 3.0), 1.4, 10
-#: Part of the speed asked for that a wheel may be off it then.
+#: Part of the speed asked for that a wheel may be off it then; part of its way that a leg may be off.
 _OFF_SPEED = 0.2
-#: s that a held wheel pulls, and of it the part that is averaged; rad/s below which it counts as held.
-_HELD_TIME, _HELD_ROWS, _HELD_SPEED = 1.2, 20, 0.1
+#: rad/s of a free leg whose load is read, s until it is on its way, rows on the way, s until it is there.
+_LEG_SPEED, _LEG_START, _LEG_ROWS, _LEG_REST = 0.1, 0.4, 30, 0.6
+#: s that a held joint pulls, and of it the rows that are averaged.
+_HELD_TIME, _HELD_ROWS = 1.2, 20
+#: rad/s below which a wheel counts as held, and rad that a held leg may give way: its motor pulls with all that it may then.
+_HELD_SPEED, _HELD_WAY = 0.1, 0.05
 _LOOP = "The servo's velocity loop is not the file's: gains in its registers, firmware, or the robot file's numbers for it."
-_FRICTION = "The wheel needs another torque to turn freely: a rubbing tyre, a tight screw, or a weak or worn motor."
+_WEAK = "it does not follow; does something hold it, is its motor weak, its servo's PWM limited?"
+_FRICTION = "It needs another torque to turn freely: a rubbing tyre, a tight screw, or a weak or worn motor."
 _LAW = "Present Load follows something else than on the emulator: efforts of the wheels in logs mean that instead of torque."
 _STALL = "Its motor is weaker or stronger than the file's: check supply and plugs; else exchange the servo, or measure again."
 
@@ -103,7 +108,25 @@ def _measure_load(stand: Stand, person: Person) -> list[Reading]:
         stand.samples |= {f"load_{wheel}": loads[:, k].tolist(), f"pwm_{wheel}": pwms[:, k].tolist()}
         slope = float(np.polyfit(pwms[:, k], loads[:, k], 1)[0])
         found += [Reading("load_per_pwm", wheel, slope), Reading("running_load", wheel, float(loads[:, k].mean()))]
-    return found
+    stand.switch_off(WHEELS)  # before the legs are prepared: on a slow line that takes longer than the watchdogs wait
+    stand.prepare(LEGS)
+    return found + [Reading("running_load", leg, _leg_load(stand, leg)) for leg in LEGS]
+
+
+def _leg_load(stand: Stand, leg: str) -> float:
+    """Return the mean load of a free leg on a slow way, part of stall torque: a weak motor needs more for the same friction."""
+    k = JOINTS.index(leg)
+    stand.slow(leg, _LEG_SPEED)
+    stand.switch_on([leg])
+    start = stand.step().position[k]
+    stand.lean(leg, LARGEST_LEAN)
+    stand.run(_LEG_START)
+    loads = [stand.load(readings.effort)[k] for readings in stand.run(_LEG_ROWS * PERIOD)]
+    way = stand.run(_LEG_REST)[-1].position[k] - start
+    stand.switch_off([leg])
+    if abs(way - LARGEST_LEAN) > _OFF_SPEED * LARGEST_LEAN:
+        raise TroubleError(f"{leg} moved by {way:.3f} rad, expected {LARGEST_LEAN:g} within {_OFF_SPEED:.0%}: {_WEAK}")
+    return float(np.mean(loads))
 
 
 def _require_speed(asked: float, reached: NDArray[np.float64]) -> None:
@@ -111,69 +134,73 @@ def _require_speed(asked: float, reached: NDArray[np.float64]) -> None:
     slow = [f"{wheel} turns at {speed:.2f}" for wheel, speed in zip(WHEELS, reached, strict=True)]
     slow = [text for text, speed in zip(slow, reached, strict=True) if abs(speed - asked) > _OFF_SPEED * asked]
     if slow:
-        raise TroubleError(
-            f"{', '.join(slow)} rad/s after {_EVEN:g} s, expected {asked:g} within {_OFF_SPEED:.0%}: it does not follow; "
-            "does something hold it, is its motor weak, its servo's PWM limited?"
-        )
+        raise TroubleError(f"{', '.join(slow)} rad/s after {_EVEN:g} s, expected {asked:g} within {_OFF_SPEED:.0%}: {_WEAK}")
 
 
 LOAD = StandTest(
     "load",
-    "What Present Load follows",
-    "",
-    f"Wheels turn at {', '.join(f'{speed:g}' for speed in _SPEEDS)} rad/s, each for {_EVEN:g} s.",
+    "Load of free wheels and legs, and what Present Load follows",
+    "Legs straight down, then hands off.",
+    f"Wheels turn at {', '.join(f'{speed:g}' for speed in _SPEEDS)} rad/s, each for {_EVEN:g} s; then each leg moves by "
+    f"{LARGEST_LEAN:g} rad.",
     (
         StandQuantity(
             "load_per_pwm", "-", "load over PWM from speed to speed, wheel free: 0 = it is torque, 1 = it is PWM", 0.3, _LAW
         ),
-        StandQuantity("running_load", "-", "load of the free wheel, part of stall torque", 0.01, _FRICTION),
+        StandQuantity(
+            "running_load", "-", "load of the free wheel, or of the leg on its way, part of stall torque", 0.01, _FRICTION
+        ),
     ),
     _measure_load,
 )
 
 
 def _measure_stall(stand: Stand, person: Person) -> list[Reading]:
-    stand.prepare(WHEELS)
+    stand.prepare(JOINTS)
     found = []
-    for wheel in WHEELS:
-        found += _stall(stand, person, wheel)
+    for joint in (*WHEELS, *LEGS):
+        found += _stall(stand, person, joint)
     return found
 
 
-def _stall(stand: Stand, person: Person, wheel: str) -> list[Reading]:
-    k = JOINTS.index(wheel)
-    person.brake(wheel)
-    asked = stand.weaken(wheel)
-    stand.switch_on([wheel])
-    stand.spin({wheel: 2.0})
+def _stall(stand: Stand, person: Person, joint: str) -> list[Reading]:
+    k = JOINTS.index(joint)
+    person.brake(joint)
+    asked = stand.weaken(joint)
+    stand.switch_on([joint])
+    start = stand.step().position[k]
+    if joint in LEGS:
+        stand.lean(joint, LARGEST_LEAN)
+    else:
+        stand.spin({joint: 2.0})
     stand.run(_HELD_TIME - _HELD_ROWS * 0.02)
     rows = [stand.step() for _ in range(_HELD_ROWS)]
     person.watch_supply()
     pwm = float(abs(np.nanmean([stand.pwm()[k] for _ in range(_ROWS)])))
     supply = float(np.nanmean(stand.servos.read_health()[0])) / stand.robot.servo.supply_voltage
-    stand.switch_off([wheel])
-    speed = float(np.mean([readings.velocity[k] for readings in rows]))
-    if abs(speed) > _HELD_SPEED:
-        raise TroubleError(f"{wheel} turned at {speed:.2f} rad/s: hold it firmly")
+    stand.switch_off([joint])
+    speed, way = float(np.mean([readings.velocity[k] for readings in rows])), rows[-1].position[k] - start
+    if abs(speed) > _HELD_SPEED or (joint in LEGS and abs(way) > _HELD_WAY):
+        raise TroubleError(f"{joint} turned by {way:.2f} rad, in the end at {speed:.2f} rad/s: hold it firmly")
     load = float(np.mean([stand.load(readings.effort)[k] for readings in rows]))
-    found = [Reading("stall_pwm", wheel, pwm / asked), Reading("stall_load", wheel, load / (pwm * supply))]
-    current = person.supply_current()
-    person.release(wheel)
+    found = [Reading("stall_pwm", joint, pwm / asked), Reading("stall_load", joint, load / (pwm * supply))]
+    current = person.supply_current() if joint in WHEELS else None  # legs measure theirs: it is their load
+    person.release(joint)
     if current is not None:
-        found.append(Reading("stall_current", wheel, current / (pwm * pwm * supply)))
+        found.append(Reading("stall_current", joint, current / (pwm * pwm * supply)))
     return found
 
 
 STALL = StandTest(
     "stall",
-    "Stall of a held wheel",
-    "Each wheel is to be held by hand, one after the other.",
-    f"The held wheel pulls for {_HELD_TIME:g} s with {LOW_PWM:.0%} of the supply.",
+    "Stall of held wheels and legs",
+    "Each wheel, then each leg's end, is to be held by hand, one after the other. Legs straight down.",
+    f"The held wheel or leg pulls for {_HELD_TIME:g} s with {LOW_PWM:.0%} of the supply.",
     (
         StandQuantity(
-            "stall_pwm", "-", "PWM at the held wheel over the Goal PWM", 0.05, "The servo does not keep to Goal PWM."
+            "stall_pwm", "-", "PWM at the held joint over the Goal PWM", 0.05, "The servo does not keep to Goal PWM."
         ),
-        StandQuantity("stall_load", "-", "Present Load of the held wheel over PWM and supply", 0.05, _STALL, 0.1),
+        StandQuantity("stall_load", "-", "load of the held joint over PWM and supply", 0.05, _STALL, 0.1),
         StandQuantity("stall_current", "A", "current at full voltage, from the supply's display", 0.1, _STALL, 0.25),
     ),
     _measure_stall,

@@ -1,4 +1,4 @@
-"""Lines of text that an emulated robot takes: faults, ``clear``, ``faults``, ``status``, ``turn``, ``help``."""
+"""Lines of text that an emulated robot takes: faults, ``clear``, ``faults``, ``status``, ``turn``, ``straighten``, ``help``."""
 
 from __future__ import annotations
 
@@ -26,9 +26,12 @@ def run_command(machine: Machine, text: str) -> str:
         return "cleared"
     if word == "turn":
         return _turn(machine, text, rest)
+    if word == "straighten":
+        machine.straighten(" ".join(rest))
+        return f"{rest[0]} hangs straight down"
     actions = {"faults": _list_faults, "status": _status, "help": _help}
     if word not in actions:
-        raise unknown_name("command", word, [*actions, "clear", "turn", *FAULTS])
+        raise unknown_name("command", word, [*actions, "clear", "turn", "straighten", *FAULTS])
     return actions[word](machine)
 
 
@@ -62,7 +65,7 @@ def _status(machine: Machine) -> str:
 
 def _help(machine: Machine) -> str:
     lines = [
-        "status | faults | clear [KIND] | turn JOINT DEGREES | help",
+        "status | faults | clear [KIND] | turn JOINT DEGREES | straighten LEG | help",
         "KIND [WHERE ...] [probability=] [value=] [after=] [duration=]",
     ]
     for name, kind in FAULTS.items():

@@ -47,7 +47,8 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
 
         require_package("cv2", "vision")
         eye = EmulatedCamera(machine, camera)
-    return Link(servos, memory_imu(world, hardware.imu), world, is_serial=False, finish=machine.close, flow=stream, camera=eye)
+    imu, seed = memory_imu(world, hardware.imu), machine.options.seed
+    return Link(servos, imu, world, is_serial=False, finish=machine.close, flow=stream, camera=eye, seed=seed)
 
 
 def with_flow_port(robot: Robot, hardware: Hardware) -> Hardware:
@@ -64,6 +65,7 @@ def emulated_robot(
     *,
     sensor_noise: bool = True,
     camera: CameraFile | None = None,
+    seed: int = 0,
 ) -> Link:
     """Return a link to a new emulated robot whose lines and adapters take no time.
 
@@ -71,14 +73,14 @@ def emulated_robot(
         robot: the robot.
         hardware: wiring and mounting.
         effects: what the emulated robot has that its file does not say.
-        sensor_noise: of the simulator behind it.
+        sensor_noise, seed: of the simulator behind it.
         camera: above its floor; None = there is none.
 
     Raises:
         InputError: effects that cannot be read or that this robot cannot have.
     """
     patch = load_patch(effects)
-    options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise)
+    options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise, seed=seed)
     parameters = apply_patch(patch, Parameters.nominal(robot))
     hardware = with_flow_port(robot, hardware)
     return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces), camera)

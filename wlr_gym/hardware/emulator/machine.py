@@ -21,7 +21,7 @@ from wlr_gym.hardware.imu.reading import Conversion, Counts
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState
 from wlr_gym.physics.plants.forces import Force
-from wlr_gym.robot import JOINTS, Robot
+from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 #: Frames after which the last bit changes of a chip without noise.
@@ -188,6 +188,16 @@ class Machine:
         if joint not in JOINTS:
             raise unknown_name("joint", joint, JOINTS)
         self.coupling.turn(joint, angle)
+
+    def straighten(self, leg: str) -> None:
+        """Turn a leg straight down by hand while torque is off: the leg itself, whatever its encoder says.
+
+        Raises:
+            InputError: unknown leg, torque that is on, or a plant whose state cannot be set.
+        """
+        if leg not in LEGS:
+            raise unknown_name("leg", leg, LEGS)
+        self.turn(leg, float(np.pi / 2 - self.plant.mechanical_state().joint_position[0, JOINTS.index(leg)]))
 
     # ---- IMU ----
 

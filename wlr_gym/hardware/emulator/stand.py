@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from wlr_gym.base.errors import unknown_name
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
@@ -19,7 +17,7 @@ from wlr_gym.robot.parameters import Parameters
 
 #: m that the body hangs above the floor.
 HEIGHT = 0.5
-#: N m of a hand that holds a wheel.
+#: N m of a hand that holds a wheel or a leg.
 GRIP = 10.0
 #: Springs and dampers of the stand: stiff in place, and slow to follow a hand that tilts the body (0.5 s).
 _PLACE = {"k": 4000.0, "c": 250.0}
@@ -70,25 +68,24 @@ class EmulatedStand:
 
     def straighten(self, leg: str) -> None:
         """Hold a leg straight down, torque off: the leg itself, whatever its encoder says."""
-        k = JOINTS.index(leg)
-        self.machine.turn(leg, float(np.pi / 2 - self.machine.plant.mechanical_state().joint_position[0, k]))
+        self.machine.straighten(leg)
 
     def tilt(self, **angles: float) -> None:
         """Begin to turn the body to ``roll``, ``pitch`` and ``yaw`` (rad; the others to 0); it gets there in about 2 s."""
         self._plant.set_force_values(force_values([*_stand_forces(**angles), *self._forces])[None])
 
-    def brake(self, wheel: str) -> None:
-        """Hold a wheel by hand."""
-        self._set_friction(wheel, GRIP)
+    def brake(self, joint: str) -> None:
+        """Hold a wheel or a leg by hand."""
+        self._set_friction(joint, GRIP)
 
-    def release(self, wheel: str) -> None:
-        """Let go of a wheel."""
-        self._set_friction(wheel, float(self._friction[JOINTS.index(wheel)]))
+    def release(self, joint: str) -> None:
+        """Let go of it."""
+        self._set_friction(joint, float(self._friction[JOINTS.index(joint)]))
 
-    def _set_friction(self, wheel: str, torque: float) -> None:
-        if wheel not in WHEELS:
-            raise unknown_name("wheel", wheel, WHEELS)
-        self.machine.coupling.set_parameter("servo.coulomb_friction", JOINTS.index(wheel), torque)
+    def _set_friction(self, joint: str, torque: float) -> None:
+        if joint not in JOINTS:
+            raise unknown_name("joint", joint, JOINTS)
+        self.machine.coupling.set_parameter("servo.coulomb_friction", JOINTS.index(joint), torque)
 
     def wheel_current(self) -> float:
         """Return what the wheels draw from the supply, A: motor currents times the part of the time they are switched on."""

@@ -61,7 +61,7 @@ class Asked(SettingsModel):
     learning_rate: float = Field(default=5e-4, gt=0)
     episodes: int = Field(default=256, ge=8)
     sensors: tuple[str, ...] = ()
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, lt=2**32)
 
 
 class AdaptStep(SettingsModel):

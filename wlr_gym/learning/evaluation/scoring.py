@@ -79,14 +79,16 @@ def evaluate(
         training seed; ``write_card`` writes it.
 
     Raises:
-        InputError: unknown policy, environment, sweep or backend, a policy that does not fit the environment, or several that
-            are not trainings of one recipe.
+        InputError: unknown policy, environment, sweep or backend, a policy that does not fit the environment, several that are
+            not trainings of one recipe, or a seed that is out of range.
     """
     if backend not in (*BACKENDS, "both"):
         raise unknown_name("backend", backend, (*BACKENDS, "both"))
     for name, given in (("baselines", baselines), ("sweeps", sweeps)):
         if isinstance(given, str):
             raise InputError(f"{name} = {given!r}: expected a list of names, such as [{given!r}]")
+    if not 0 <= seed < 2**63:
+        raise InputError(f"seed = {seed}: expected 0 to {2**63 - 1}")
     subject = read_subjects([policy])[0]
     environment = env_id or trained_environment(subject.sources[0]) or "WLR-Velocity-v0"
     task = task_name_of(environment)

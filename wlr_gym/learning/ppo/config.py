@@ -43,7 +43,7 @@ class PpoConfig(SettingsModel):
         tasks: task name -> settings that differ there (``load_agent_config`` lays them over the others).
     """
 
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, lt=2**32)
     total_steps: int = Field(5_000_000, gt=0)
     schedule_steps: int | None = Field(None, gt=0)
     num_envs: int = Field(512, gt=0)

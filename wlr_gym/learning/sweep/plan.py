@@ -86,7 +86,7 @@ class SearchPlan(SettingsModel):
     seed: int = Field(0, ge=0)
 
 
-Seed = Annotated[int, Field(ge=0)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class SweepPlan(SettingsModel):

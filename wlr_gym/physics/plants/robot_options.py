@@ -27,6 +27,7 @@ class RobotOptions:
         camera: above the floor: name in ``configs/camera/`` or path of a YAML file; None = there is none.
         poses: file that the emulated robot on ``ports`` writes its true pose into, for a camera that films it by rendering;
             None = the camera is a real one.
+        seed: of the noise of an emulated robot.
 
     Raises:
         InputError: effects for a robot that is not emulated.
@@ -42,6 +43,7 @@ class RobotOptions:
     effects: Any = None
     camera: str | Path | None = None
     poses: Path | None = None
+    seed: int = 0
 
     def __post_init__(self) -> None:
         if self.effects and not self.emulated:
