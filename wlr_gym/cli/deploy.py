@@ -18,8 +18,9 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import JsonOption, PatchOption, environment_of, pairs
+from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, read_camera, wait_for_enter
 
