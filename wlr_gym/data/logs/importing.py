@@ -122,8 +122,8 @@ def import_log(
         if not made:
             raise InputError(f"{log}: nothing in it")
         write_map(out / MAP_FILE, map)
-        left_out, said = ((), ()) if meta.states_profile else (("profile",), (NO_PROFILE,))
-        write_meta(out, meta, left_out)
+        said = () if meta.states_profile else (NO_PROFILE,)
+        write_meta(out, meta)
         imported = []
         for one in made:
             imported.append(_moved(replace(one, notes=(*one.notes, *said)), next_run(out, suffix)))
