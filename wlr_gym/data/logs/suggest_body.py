@@ -95,9 +95,9 @@ def find_pose(look: LogSignals) -> BodyMotion | None:
     forward = integral(grid, vx * np.cos(turned) + vy * np.sin(turned))
     topic = look.chosen["cam_x"].topic
     by_name = look.log.topics[topic].kind.endswith(("PoseStamped", "Odometry")) or topic == "table"
-    look.note(
-        "cam", SURE if by_name else LIKELY, f"topic '{topic}', in {unit} by how fast the robot can be{_said_lost(look, topic)}"
-    )
+    taken = ", ".join(look.chosen[f"cam_{axis}"].field for axis in ("x", "y", "yaw"))
+    text = f"topic '{topic}': {taken}; in {unit} by how fast the robot can be{_said_lost(look, topic)}"
+    look.note("cam", SURE if by_name else LIKELY, text)
     _said_tilt(look)
     if "odom" in topic.lower() or look.log.topics[topic].kind.endswith("Odometry"):
         text = f"topic '{topic}' may be computed from the wheels: then it is no measurement: take 'cam' out of the map"
