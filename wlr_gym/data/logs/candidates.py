@@ -32,8 +32,8 @@ _VECTORS = {
 _SHORT = {"g": "gyro", "w": "gyro", "a": "acc"}
 _VOLTAGE = {"voltage", "volt", "volts", "vbat", "vbatt"}
 _HEADING = {"yaw", "heading"}
-#: Words that a heading of the body's pose does not have; of its x and y those that they have, if any.
-_OTHER_HEADING = {"rate", "vel", "velocity", "speed", "imu", "gyro"}
+#: Words that a pose's topic and heading do not have, and words one of which its x and y have, if any.
+_NOT_POSE = {"rate", "vel", "velocity", "speed", "twist", "imu", "gyro"}
 _PLACE = {
     "pos", "position", "pose", "place", "translation", "location", "cam", "camera", "mocap", "optitrack", "vicon", "qualisys",
     "tag", "apriltag", "aruco", "marker", "tracker", "body", "rigid", "base", "robot", "chassis", "trunk", "torso", "odom",
@@ -170,11 +170,9 @@ def may_be_pose(field: str) -> bool:
 def _pose(topic: Topic) -> Iterator[FieldCandidate]:
     """Yield what may be the body's pose: no setpoint, no joint's, and no element of a list."""
     kind = re.split(r"[/.]", topic.kind)
-    if (
-        (kind[0] in _STANDARD and kind[-1] not in _POSES)
-        or _of_other(topic.name)
-        or _says(topic.name, _OTHER_HEADING | {"twist"})
-    ):
+    if kind[0] in _STANDARD and kind[-1] not in _POSES:
+        return
+    if _of_other(topic.name) or _says(topic.name, _NOT_POSE):
         return
     for field in topic.fields:
         if may_be_pose(field) and "[" not in field and not _of_other(field):
@@ -189,7 +187,7 @@ def _pose(topic: Topic) -> Iterator[FieldCandidate]:
     headings = [
         field
         for field in [*named, *(f"{turn.rstrip('._')}.yaw" for turn in turns)]
-        if not _says(field, _OTHER_HEADING) and not _of_other(field)
+        if not _says(field, _NOT_POSE) and not _of_other(field)
     ]
     places = [
         field
@@ -213,7 +211,7 @@ def _of_other(name: str) -> bool:
 def _is_place(field: str) -> bool:
     """Whether a name is ``x`` or, as ``pose.x`` or ``cam_x``, the x of a place."""
     stem, axis = _axis_of(_bracket(field) or field)
-    return axis == "x" and (not stem or _says(stem, _PLACE)) and not _says(stem, {"vel", "velocity", "v"})
+    return axis == "x" and (not stem or _says(stem, _PLACE)) and not _says(stem, _NOT_POSE)
 
 
 def _axis_of(field: str) -> tuple[str, str | None]:
