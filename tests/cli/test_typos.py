@@ -43,15 +43,15 @@ COMMANDS = {
     "a setting's number": (["train", "--set", "total_steps=-5"], "total_steps = -5: expected greater than 0"),
     "a setting given twice": (
         ["train", "--set", "learning_rate=1", "learning_rate=2"],
-        "setting 'learning_rate' is given twice: 'learning_rate=1' and 'learning_rate=2'",
+        "setting: 'learning_rate' is given twice, 1 and 2: expected once",
     ),
     "a setting of a sweep given twice": (
         ["sweep", "WLR-Velocity-v0", "--set", "gamma=0.9", "gamma=0.97"],
-        "--set: 'gamma' is given twice; all its values go behind one: gamma=VALUE,VALUE",
+        "--set: 'gamma' is given twice, 0.9 and 0.97: expected once, such as learning_rate=1e-3,2e-3",
     ),
     "a command given twice": (
         ["deploy", "pid", "--command", "yaw_rate=0.1", "yaw_rate=0.2", "--emulated"],
-        "--command: 'yaw_rate' is given twice: 0.1 and 0.2",
+        "--command: 'yaw_rate' is given twice, 0.1 and 0.2: expected once",
     ),
     "an effect": (["effects", "stribek"], "did you mean 'stribeck_friction'?"),
     "an effect where a patch goes": (["evaluate", "pid", "--effects", "backlash"], "'backlash' is an effect"),

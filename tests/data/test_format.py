@@ -14,6 +14,8 @@ from hypothesis.extra import numpy as hnp
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import COLUMNS, Profile, RunMeta, check_table, convert, read_dataset, read_meta, read_run, write_run
 from wlr_gym.data.format import CAMERA, FLOW, REQUIRED
+from wlr_gym.data.logs import export_run
+from wlr_gym.data.logs.exported import read_exported
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 
 DATA = Path(__file__).parent / "data"
@@ -188,8 +190,8 @@ def test_file_that_is_no_run(tmp_path, path):
         ("cam_x", 1000, "millimetres"),
         ("cam_y", 1000, "millimetres"),
         ("cam_z", 1000, "millimetres"),
-        ("eff_leg_lf", 1000, "mN m"),
-        ("eff_wheel_lf", 1000, "mN m"),
+        ("eff_leg_lf", 1000, "mA or mN m"),
+        ("eff_wheel_lf", 1000, "mA or mN m"),
         ("volt", 1000, "millivolts"),
         ("t", 1000, "milliseconds"),
     ],
@@ -412,6 +414,19 @@ def test_convert_there_and_back(tmp_path):
     assert first.meta == last.meta
     with pytest.raises(InputError, match="format of a data set"):
         convert(tmp_path / "a", tmp_path / "d", ".mat")
+
+
+def test_a_profile_that_is_not_stated_is_not_stated_in_a_copy(tmp_path, table):
+    """Where nobody knows the servo profile, a converted or exported run does not claim that there was none."""
+    run = write_run(tmp_path / "a" / "run_01.csv", table, RunMeta(ground="mat"))
+    convert(run.parent, tmp_path / "b", ".parquet")
+    assert not read_meta(tmp_path / "b").states_profile
+    assert read_exported(export_run(read_run(run), tmp_path / "run_01.mcap")).meta.content() == {
+        "ground": "mat",
+        "marker_offset": [0.0, 0.0, 0.0],
+    }
+    write_run(tmp_path / "c" / "run_01.csv", table, RunMeta(profile=Profile()))
+    assert read_meta(tmp_path / "c").states_profile
 
 
 def test_every_joint_has_its_columns():

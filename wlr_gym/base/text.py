@@ -1,8 +1,11 @@
-"""Numbers and times as people read them."""
+"""Numbers, times and settings as people write and read them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+
+from wlr_gym.base.errors import InputError
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -23,3 +26,21 @@ def duration(seconds: float) -> str:
 def counted(count: int, word: str) -> str:
     """Return ``1 trial``, ``2 trials``."""
     return f"{count} {word}{'' if count == 1 else 's'}"
+
+
+def pairs(what: str, words: Iterable[str], example: str) -> dict[str, str]:
+    """Return name -> value of words such as ``name=value``.
+
+    Raises:
+        InputError: another word, or a name given twice; the message names ``what`` the words are, and the example.
+    """
+    found: dict[str, str] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        name = name.strip()
+        if not (name and value):
+            raise InputError(f"{what} {word}: expected name=value, such as {example}")
+        if name in found:
+            raise InputError(f"{what}: '{name}' is given twice, {found[name]} and {value}: expected once, such as {example}")
+        found[name] = value
+    return found

@@ -111,14 +111,14 @@ def _commission(
     options: CommissionOptions, out: Path, tests: Sequence[StandTest], ask: Callable[[str], str], console: Console
 ) -> int:
     from wlr_gym.base.files import write_json
-    from wlr_gym.data.format import RunMeta
+    from wlr_gym.data.format import Profile, RunMeta
     from wlr_gym.hardware.commissioning.runner import DONE, Commissioning, content_of
 
     robot, hardware = options.load()
     named = _named(options, robot)
     kept = _earlier(out / REPORT, named, tests)
     link, person = _robot(options, robot, hardware, ask)
-    meta = RunMeta(robot=robot.name, notes="wlr commission, on a stand")
+    meta = RunMeta(robot=robot.name, profile=Profile(), notes="wlr commission, on a stand")
     results: list[StandResult] = []
     with Commissioning(robot, hardware, link, person, out, meta) as commissioning:
         if faults := commissioning.faults():

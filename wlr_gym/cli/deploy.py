@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,9 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import JsonOption, PatchOption, environment_of, pairs
+from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, read_camera, wait_for_enter
 
@@ -102,7 +103,7 @@ def run(options: DeployOptions) -> int:
     command = _check(options)
     environment = environment_of(options.env, options.policy)
     robot = driven_robot(options)
-    policy = _make_policy(options, environment, robot)
+    policy = _make_policy(options, environment, robot, command)
     console = Console()
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
         ports = port_pairs(options.port)
@@ -195,7 +196,7 @@ def driven_robot(options: DeployOptions) -> Any:
     return made_for if options.hardware == DeployOptions.hardware and not is_same else wired
 
 
-def _make_policy(options: DeployOptions, environment: str, robot: Any) -> Policy:
+def _make_policy(options: DeployOptions, environment: str, robot: Any, command: Mapping[str, float]) -> Policy:
     """Return the policy; it needs no robot, so names and what does not fit are told before one is started.
 
     Raises:
@@ -215,13 +216,13 @@ def _make_policy(options: DeployOptions, environment: str, robot: Any) -> Policy
         "episode_length": options.seconds,
     }
     task = make_task(task_source_of(environment), read_settings(environment_for(options.policy, keywords)))
-    for name, value in pairs("--command", options.command, "yaw_rate=0.1").items():
+    for name, value in command.items():
         if name not in task.commands:
             raise unknown_name("command", name, task.commands, "--command")
         low, high = task.config.commands.terms[name]
-        if not low <= float(value) <= high:
+        if not low <= value <= high:
             raise InputError(
-                f"--command {name}={value}: expected {low:g} to {high:g} ({COMMANDS[name].unit}), the range of the task"
+                f"--command {name}={value:g}: expected {low:g} to {high:g} ({COMMANDS[name].unit}), the range of the task"
             )
     return make_policy(options.policy, contract(task, {}))
 

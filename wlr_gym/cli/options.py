@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -64,23 +63,6 @@ class SensorsOption:
         if self.sensors and len(self.sensors) > 1 and "none" in self.sensors:
             raise InputError(f"--sensors {' '.join(self.sensors)}: expected none alone, or camera, flow or both")
         return None if self.sensors is None else tuple(name for name in self.sensors if name != "none")
-
-
-def pairs(option: str, words: Sequence[str], example: str) -> dict[str, str]:
-    """Return name -> value of the words of an option, each ``name=value``.
-
-    Raises:
-        InputError: another word, or a name given twice; the message names the option and the example.
-    """
-    found: dict[str, str] = {}
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not (name and equals and value):
-            raise InputError(f"{option} {word}: expected name=value, such as {example}")
-        if name in found:
-            raise InputError(f"{option}: '{name}' is given twice: {found[name]} and {value}")
-        found[name] = value
-    return found
 
 
 def settings_of(options: Any) -> dict[str, Any]:

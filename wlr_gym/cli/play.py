@@ -137,21 +137,20 @@ def _driver(options: PlayOptions, core: Core) -> Driver | None:
     ranges = {name: (float(terms[name][0]), float(terms[name][1])) for name in names}
     if options.command is not None:
         script = Script(options.command, names)
-        _check_speed(script, ranges, core.task.robot)
+        _check_commands(script, ranges, core.task.robot)
         return script
     if options.video is not None:
         return None
     return Gamepad(ranges) if options.gamepad else Keyboard(ranges)
 
 
-def _check_speed(script: Script, ranges: Ranges, robot: Robot) -> None:
-    """Refuse a forward speed that the wheels cannot turn at; warn of commands that policies were not trained on."""
+def _check_commands(script: Script, ranges: Ranges, robot: Robot) -> None:
+    """Refuse commands that the robot cannot follow; warn of those that policies were not trained on."""
     from wlr_gym.envs.tasks.terms import COMMANDS
 
-    fastest = robot.servo.wheel.no_load_speed * robot.wheel.radius
-    for name, value in script.outside(dict.fromkeys(ranges, (-fastest, fastest))).items():
-        if name == "linear_velocity_x":
-            raise InputError(f"--command: {name} = {value:g} m/s: the wheels turn no faster than {fastest:.3g} m/s")
+    reach = {name: COMMANDS[name].bounds(robot) for name in ranges}
+    for name, value in script.outside(reach).items():
+        raise InputError(f"--command: {name} = {value:g}: expected {COMMANDS[name].words(*reach[name])}")
     for name, value in script.outside(ranges).items():
         low, high = ranges[name]
         print(

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, pairs
+from wlr_gym.cli.options import ForceOption
 from wlr_gym.cli.robot_options import ask_terminal
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.options import pairs
+from wlr_gym.base.text import pairs
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -12,7 +12,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
-from wlr_gym.base.text import counted, number
+from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import JsonOption, ray_address
 from wlr_gym.cli.results import print_json
@@ -97,16 +97,13 @@ def _settings(words: tuple[str, ...]) -> Mapping[str, Any]:
     """Return what ``--set`` says: a setting with one value is for all trials, others span the grid."""
     settings: dict[str, Any] = {}
     space: dict[str, list[Any]] = {}
-    for word in words:
-        name, equals, text = word.partition("=")
+    for name, text in pairs("--set", words, "learning_rate=1e-3,2e-3").items():
         try:
-            values = parse_yaml(f"[{text}]") if name and equals and text else None
+            values = parse_yaml(f"[{text}]")
         except yaml.YAMLError:
             values = None
         if not values:
-            raise InputError(f"--set {word}: expected key=value or key=value,value, such as learning_rate=1e-3,2e-3")
-        if name in settings or name in space:
-            raise InputError(f"--set: '{name}' is given twice; all its values go behind one: {name}=VALUE,VALUE")
+            raise InputError(f"--set {name}={text}: expected one value or several, such as learning_rate=1e-3,2e-3")
         if len(values) > 1:
             space[name] = values
         else:

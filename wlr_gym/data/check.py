@@ -75,8 +75,8 @@ _UNIT_LIMITS = (
     _UnitLimit("cam_yaw", 0.8, 25.0, "degrees", rate=True),
     _UnitLimit("cam_pitch", 0.9, math.pi / 2, "degrees"),
     _UnitLimit("cam_z", 0.5, 2.0, "millimetres"),
-    _UnitLimit("eff_leg", 0.95, 50.0, "mN m"),
-    _UnitLimit("eff_wheel", 0.95, 50.0, "mN m"),
+    _UnitLimit("eff_leg", 0.95, 50.0, "mA or mN m"),
+    _UnitLimit("eff_wheel", 0.95, 50.0, "mA or mN m"),
     _UnitLimit("volt", 0.5, 100.0, "millivolts"),
 )
 

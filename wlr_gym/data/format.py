@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from pydantic import Field
 
@@ -135,3 +136,7 @@ class RunMeta(SettingsModel):
     def states_profile(self) -> bool:
         """Whether the servo profile was given; where not, it is assumed that there is none."""
         return "profile" in self.model_fields_set
+
+    def content(self) -> dict[str, Any]:
+        """Return what a file says of it: all but what was not given."""
+        return self.model_dump(mode="json", exclude_none=True, exclude=None if self.states_profile else {"profile"})

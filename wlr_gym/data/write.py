@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,8 +58,8 @@ def write_run(
     return path
 
 
-def write_meta(folder: str | Path, meta: RunMeta, leave_out: Collection[str] = ()) -> Path:
-    """Write ``meta.yaml``, without the keys of ``leave_out``; one that is there and says the same is left alone.
+def write_meta(folder: str | Path, meta: RunMeta) -> Path:
+    """Write ``meta.yaml``, a servo profile only where it was stated; one that is there and says the same is left alone.
 
     Raises:
         InputError: the one that is there says something else (it holds for all runs of the folder).
@@ -68,10 +68,7 @@ def write_meta(folder: str | Path, meta: RunMeta, leave_out: Collection[str] = (
     check_meta(folder, meta)
     if path.is_file():
         return path
-    text = yaml.safe_dump(
-        meta.model_dump(mode="json", exclude_none=True, exclude={*leave_out}), sort_keys=False, allow_unicode=True
-    )
-    write_text(path, text)
+    write_text(path, yaml.safe_dump(meta.content(), sort_keys=False, allow_unicode=True))
     return path
 
 

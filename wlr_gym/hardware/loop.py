@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.format import RunMeta
+from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.link import Link
@@ -105,7 +105,7 @@ class ControlLoop:
         meta: RunMeta | None = None,
     ) -> None:
         _check_period(period, hardware.safety.watchdog)
-        meta = meta or RunMeta(robot=robot.name, notes="dry run" if dry_run else None)
+        meta = meta or RunMeta(robot=robot.name, profile=Profile(), notes="dry run" if dry_run else None)
         self.robot, self.hardware, self.limits = robot, hardware, hardware.safety
         self.phase: Phase = Phase.TORQUE_OFF
         self.reason, self.ended_well = "", True

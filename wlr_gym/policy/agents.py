@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import config_names, data_directory, named_in
 from wlr_gym.base.settings import merge_changes, parse_yaml, read_layers
+from wlr_gym.base.text import pairs
 
 Contract = Mapping[str, Any]
 Config = Mapping[str, Any]
@@ -171,13 +172,8 @@ def apply_changes(config: dict[str, Any], changes: Iterable[str]) -> None:
     Raises:
         InputError: a change that is not ``key=value``, or a key given twice.
     """
-    made: dict[str, str] = {}
-    for change in changes:
-        key = change.partition("=")[0].strip()
-        if key in made:
-            raise InputError(f"setting '{key}' is given twice: '{made[key]}' and '{change}'")
-        made[key] = change
-        _apply(config, change)
+    for key, text in pairs("setting", changes, "total_steps=1000000").items():
+        _apply(config, key, text)
 
 
 def _read_config(name: str | Path, task: str | None) -> dict[str, Any]:
@@ -214,16 +210,13 @@ def _settings(value: Any, where: str) -> dict[str, Any]:
     return {str(key): entry for key, entry in (value or {}).items()}
 
 
-def _apply(config: dict[str, Any], change: str) -> None:
-    key, equals, text = change.partition("=")
-    if not (equals and key.strip()):
-        raise InputError(f"setting '{change}': expected key=value, such as total_steps=1000000")
-    *parents, last = key.strip().split(".")
+def _apply(config: dict[str, Any], key: str, text: str) -> None:
+    *parents, last = key.split(".")
     for parent in parents:
         config = config.setdefault(parent, {})
         if not isinstance(config, dict):
-            raise InputError(f"setting '{change}': '{parent}' is a value, not a group")
+            raise InputError(f"setting '{key}={text}': '{parent}' is a value, not a group")
     try:
         config[last] = parse_yaml(text)
     except yaml.YAMLError:
-        raise InputError(f"setting '{change}': '{text}' is not a YAML value") from None
+        raise InputError(f"setting '{key}={text}': '{text}' is not a YAML value") from None

@@ -13,14 +13,15 @@ from foreign_logs import (
     made_up,
     ns,
     pose,
+    rows_of,
     write_mcap,
     write_rosbag1,
     write_rosbag2,
 )
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data import read_run
-from wlr_gym.data.logs import import_log, suggest_map
+from wlr_gym.data import read_run, write_run
+from wlr_gym.data.logs import export_run, import_log, suggest_map
 from wlr_gym.data.logs.messages import definition, make, typestore
 from wlr_gym.robot import JOINTS, LEGS
 
@@ -212,3 +213,29 @@ def test_two_imus_the_better_known_is_taken_and_the_other_said(messages, tmp_pat
     found = suggest_map(write_mcap(tmp_path / "a.mcap", sorted([*messages, *second], key=lambda one: one[0])))
     assert found.map.channels["gyro"].topic == "/xsens/data"
     assert "/camera/imu" in found.unused
+
+
+def test_poses_of_other_things_are_not_taken_for_the_bodys(tmp_path):
+    """An exported run without a camera has poses of its links; a goal and a marker are no measurement either."""
+    table = {name: values for name, values in rows_of(made_up(6.0)).items() if not name.startswith("cam")}
+    run = read_run(write_run(tmp_path / "run_01.csv", table))
+    found = suggest_map(export_run(run, tmp_path / "run_01.mcap"))
+    assert not [key for key in found.map.channels if key.startswith("cam")]
+    assert "cam" not in found.map.frames
+    (said,) = [one for one in found.reasons if one.what == "cam"]
+    assert said.why.startswith("not proposed: the poses of '/tf' are not known to be the body's")
+
+
+@pytest.mark.parametrize("topic", ["/goal_pose", "/wheel_lf/pose"])
+def test_a_setpoint_or_a_wheels_pose_is_not_the_bodys(messages, tmp_path, topic):
+    renamed = [(time, topic if name == "/mocap/base" else name, kind, message) for time, name, kind, message in messages]
+    found = suggest_map(write_mcap(tmp_path / "a.mcap", renamed))
+    assert "cam_x" not in found.map.channels
+    assert any(f"'{topic}'" in one.why for one in found.reasons if one.what == "cam")
+
+
+def test_what_is_taken_as_the_pose_is_said(messages, tmp_path):
+    found = suggest_map(write_mcap(tmp_path / "a.mcap", messages))
+    (said,) = [one for one in found.reasons if one.what == "cam"]
+    taken = "pose.position.x, pose.position.y, pose.orientation.yaw"
+    assert said.why == f"topic '/mocap/base': {taken}; in m by how fast the robot can be"

@@ -168,3 +168,22 @@ def test_quaternions_of_tables(tmp_path):
         (imported,) = import_log(path, tmp_path / field, {**known.model_dump(), "channels": channels})
         found = pandas.read_parquet(imported.path)["cam_yaw"].to_numpy()
         assert (np.nanmax(np.abs(found - yaw[: len(found)])) < 1e-9) == right, field
+
+
+@pytest.mark.parametrize(("x", "yaw", "is_pose"), [("x", "yaw", True), ("cam_x", "cam_heading", True), ("flow_x", "yaw", False),
+    ("x", "imu_yaw", False), ("target_x", "target_yaw", False)])  # fmt: skip
+def test_a_pose_of_a_table_is_of_columns_that_hold_one(tmp_path, frame, x, yaw, is_pose):
+    way = np.linspace(0.0, 0.3, len(frame))
+    path = written(tmp_path / "a.csv", frame.assign(**{x: way, x[:-1] + "y": 0.1 * way, yaw: way}).to_csv(index=False))
+    assert ("cam_x" in suggest_map(path).map.channels) == is_pose
+
+
+def test_an_axis_stands_apart_from_the_letters_of_a_word(tmp_path, frame):
+    """The y of angular_velocity_x is no axis."""
+    long = {
+        f"{short}{axis}": f"{name}_{axis}"
+        for short, name in (("g", "angular_velocity"), ("a", "acceleration"))
+        for axis in "xyz"
+    }
+    path = written(tmp_path / "a.csv", frame.rename(columns=long).to_csv(index=False))
+    assert {"gyro", "acc"} <= set(suggest_map(path).map.channels)

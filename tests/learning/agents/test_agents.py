@@ -234,7 +234,7 @@ def test_bad_settings_are_named(contract, name, setting, message):
         load_agent(name).make_policy(contract, load_agent_config(name) | setting)
 
 
-@pytest.mark.parametrize(("change", "message"), [("total_steps", "expected key=value"), ("seed.x=1", "a value, not a group")])
+@pytest.mark.parametrize(("change", "message"), [("total_steps", "expected name=value"), ("seed.x=1", "a value, not a group")])
 def test_bad_changes_are_named(change, message):
     with pytest.raises(InputError, match=message):
         load_agent_config("ppo", ("seed=3", change))

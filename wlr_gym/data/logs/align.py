@@ -27,11 +27,13 @@ class Lag:
         seconds: to be added.
         sigma: s; from how far parts of the recording differ.
         correlation: of the two motions once they are aligned, -1 to 1.
+        opposite: the largest correlation of the other sign, at another lag, as a magnitude.
     """
 
     seconds: float
     sigma: float
     correlation: float
+    opposite: float = 0.0
 
     @property
     def believable(self) -> bool:
@@ -62,9 +64,9 @@ def find_lag(t: Array, values: Array, reference_t: Array, reference: Array, coun
     whole = _best(moved, fixed, weight, reach)
     if whole is None:
         return None
-    lag, correlation = whole
+    lag, correlation, opposite = whole
     sigma = _jackknife(moved, fixed, weight, reach)
-    return Lag(lag, max(sigma, 0.1 * _STEP), correlation)
+    return Lag(lag, max(sigma, 0.1 * _STEP), correlation, opposite)
 
 
 def _jackknife(moved: Array, fixed: Array, weight: Array, reach: int) -> float:
@@ -94,19 +96,20 @@ def _average(values: Array, seconds: float) -> Array:
     return (total[place + reach + 1] - total[place - reach]) / (2 * reach + 1)
 
 
-def _best(moved: Array, fixed: Array, weight: Array, reach: int) -> tuple[float, float] | None:
-    """Return lag (s) and correlation where two signals on one grid are most alike or most opposite."""
+def _best(moved: Array, fixed: Array, weight: Array, reach: int) -> tuple[float, float, float] | None:
+    """Return lag (s) and correlation where two signals on one grid are most alike or most opposite, and the other of these."""
     reach = min(reach, len(moved) // 4)
     if np.std(moved) < 1e-9 or np.std(fixed) < 1e-9 or reach < 2 or weight[reach : len(weight) - reach].sum() * _STEP < 1.0:
         return None
     found = _correlations(moved, fixed, weight, reach)
     top = int(np.argmax(np.abs(found)))
+    opposite = max(float(np.max(-np.sign(found[top]) * found)), 0.0)
     if top in (0, 2 * reach):
-        return (top - reach) * _STEP, 0.5 * float(found[top])  # at the edge: not a peak
+        return (top - reach) * _STEP, 0.5 * float(found[top]), opposite  # at the edge: not a peak
     before, at, after = np.abs(found[top - 1 : top + 2])
     curve = before - 2.0 * at + after
     fine = 0.5 * (before - after) / curve if curve < 0.0 else 0.0
-    return float((top - reach + fine) * _STEP), float(found[top])
+    return float((top - reach + fine) * _STEP), float(found[top]), opposite
 
 
 def _correlations(moved: Array, fixed: Array, weight: Array, reach: int) -> Array:

@@ -32,6 +32,21 @@ _VECTORS = {
 _SHORT = {"g": "gyro", "w": "gyro", "a": "acc"}
 _VOLTAGE = {"voltage", "volt", "volts", "vbat", "vbatt"}
 _HEADING = {"yaw", "heading"}
+#: Words that a pose's topic and heading do not have, and words one of which its x and y have, if any.
+_NOT_POSE = {"rate", "vel", "velocity", "speed", "twist", "imu", "gyro"}
+_PLACE = {
+    "pos", "position", "pose", "place", "translation", "location", "cam", "camera", "mocap", "optitrack", "vicon", "qualisys",
+    "tag", "apriltag", "aruco", "marker", "tracker", "body", "rigid", "base", "robot", "chassis", "trunk", "torso", "odom",
+    "odometry", "world", "map", "floor", "ground", "truth", "gt", "state",
+}  # fmt: skip
+#: Packages whose types say what they hold, and those of their types that hold one pose.
+_STANDARD = {
+    "geometry_msgs", "nav_msgs", "sensor_msgs", "std_msgs", "tf2_msgs", "visualization_msgs", "foxglove", "foxglove_msgs",
+}  # fmt: skip
+_POSES = {
+    "Pose", "Pose2D", "PoseStamped", "PoseWithCovariance", "PoseWithCovarianceStamped", "PoseInFrame", "Odometry", "Transform",
+    "TransformStamped",
+}  # fmt: skip
 #: Words of topics with poses that are computed from wheels and not measured.
 _ODOMETRY = {"odom", "odometry"}
 
@@ -147,47 +162,77 @@ def _vectors(topic: Topic) -> Iterator[FieldCandidate]:
             yield FieldCandidate(f"{kind}_{axis}", topic.name, field, unit=read_name(field.replace("rad", "")).unit)
 
 
+def may_be_pose(field: str) -> bool:
+    """Whether a field is an x of a position or translation, whatever is there."""
+    return field.endswith(("position.x", "translation.x"))
+
+
 def _pose(topic: Topic) -> Iterator[FieldCandidate]:
+    """Yield what may be the body's pose: no setpoint, no joint's, and no element of a list."""
+    kind = re.split(r"[/.]", topic.kind)
+    if kind[0] in _STANDARD and kind[-1] not in _POSES:
+        return
+    if _of_other(topic.name) or _says(topic.name, _NOT_POSE):
+        return
     for field in topic.fields:
-        if field.endswith(("position.x", "translation.x")):
+        if may_be_pose(field) and "[" not in field and not _of_other(field):
             stem = field[: -len("position.x")] if field.endswith("position.x") else field[: -len("translation.x")]
             turn = f"{stem}orientation" if f"{stem}orientation.w" in topic.fields else f"{stem}rotation"
             if f"{turn}.w" in topic.fields:
                 yield from (FieldCandidate(f"cam_{axis}", topic.name, f"{field[:-1]}{axis}") for axis in "xyz")
                 yield FieldCandidate("cam_yaw", topic.name, f"{turn}.yaw")
                 return
-    headings = [field for field in topic.fields if (_says(field, _HEADING) or field == "theta") and "rate" not in field]
     turns = [field[:-1] for field in topic.fields if field.endswith("w") and _has(topic, f"{field[:-1]}x", "xyz")]
-    headings = headings or [f"{turn.rstrip('._')}.yaw" for turn in turns]
-    places = [field for field in topic.fields if _axis_of(field)[1] == "x" and _has(topic, field, "xy")]
-    places = [field for field in places if not _vector_word(field) and field[:-1] not in turns]
+    named = [field for field in topic.fields if _says(field, _HEADING) or re.fullmatch(r"(.*\.)?theta", field)]
+    headings = [
+        field
+        for field in [*named, *(f"{turn.rstrip('._')}.yaw" for turn in turns)]
+        if not _says(field, _NOT_POSE) and not _of_other(field)
+    ]
+    places = [
+        field
+        for field in topic.fields
+        if _is_place(field) and _has(topic, field, "xy") and field[:-1] not in turns and not _of_other(field)
+    ]
     if headings and places:
         x = places[0]
+        headings.sort(key=lambda one: words(one)[0] != words(x)[0])
         yield FieldCandidate("cam_x", topic.name, x, unit=read_name(x).unit)
         yield FieldCandidate("cam_y", topic.name, _other(x, "y"), unit=read_name(x).unit)
         yield FieldCandidate("cam_yaw", topic.name, headings[0], unit=read_name(headings[0]).unit)
 
 
-def _vector_word(field: str) -> bool:
-    stem = _axis_of(field)[0]
-    return (
-        stem in _SHORT or any(_says(stem, known) for known in _VECTORS.values()) or _says(stem, {"vel", "velocity", "v", "mag"})
-    )
+def _of_other(name: str) -> bool:
+    """Whether a name is that of a setpoint, or of something at a corner of the robot."""
+    facts = read_name(name)
+    return facts.command or facts.corner is not None
+
+
+def _is_place(field: str) -> bool:
+    """Whether a name is ``x`` or, as ``pose.x`` or ``cam_x``, the x of a place."""
+    stem, axis = _axis_of(_bracket(field) or field)
+    return axis == "x" and (not stem or _says(stem, _PLACE)) and not _says(stem, _NOT_POSE)
 
 
 def _axis_of(field: str) -> tuple[str, str | None]:
     """Return the name without its axis, and the axis: of ``gyro_x``, ``imu.acc.y``, ``gz``, ``x``, ``acc_x_mg``."""
-    found = re.fullmatch(r"(.*?)[._\[ ]?([xyzXYZ])(?:\]|[_ \[(].*)?", field)
+    found = _split(field)
     return (found.group(1).rstrip("._[ ").lower(), found.group(2).lower()) if found else (field.lower(), None)
 
 
 def _other(field: str, axis: str) -> str:
     """Return a field's name with another axis."""
-    found = re.fullmatch(r"(.*?[._\[ ]?)([xyzXYZ])((?:\]|[_ \[(].*)?)", field)
+    found = _split(field)
     if not found:
         return field
     letter = axis.upper() if found.group(2).isupper() else axis
     return f"{found.group(1)}{letter}{found.group(3)}"
+
+
+def _split(field: str) -> re.Match[str] | None:
+    """Split a name before and behind its axis; a letter that stands apart, as in ``velocity_x``, before one that does not."""
+    end = r"([xyzXYZ])((?:\]|[_ \[(].*)?)"
+    return re.fullmatch(rf"(.*[._\[ ]|){end}", field) or re.fullmatch(rf"(.*?){end}", field)
 
 
 def _has(topic: Topic, field: str, axes: Iterable[str]) -> bool:

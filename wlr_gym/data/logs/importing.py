@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,10 @@ from wlr_gym.data.logs.rows import ChannelFact, MadeRun, wanted_fields
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
 from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Log, Share
+from wlr_gym.data.logs.units import CURRENTS, check_effort, is_effort
 from wlr_gym.data.record import next_run
 from wlr_gym.data.write import check_meta, write_meta, write_run
-from wlr_gym.robot import load_robot
+from wlr_gym.robot import Robot, load_robot
 
 MAP_FILE, RECORD_FILE = "map.yaml", "import.yaml"
 #: Share of an import that reading the log takes.
@@ -118,12 +120,13 @@ def import_log(
     check_meta(out, meta)
     record = _read_record(out)
     with _beside(out) as folder:
-        made = list(_make_runs(log, map, resolved, split, suffix, folder, lambda one: _check_new(one, record, out), tell))
+        check_new = partial(_check_new, record=record, out=out)
+        made = list(_make_runs(log, map, resolved, chosen, split, suffix, folder, check_new, tell))
         if not made:
             raise InputError(f"{log}: nothing in it")
         write_map(out / MAP_FILE, map)
-        left_out, said = ((), ()) if meta.states_profile else (("profile",), (NO_PROFILE,))
-        write_meta(out, meta, left_out)
+        said = (*(() if meta.states_profile else (NO_PROFILE,)), *(() if entry else _unnamed_robot(resolved, chosen)))
+        write_meta(out, meta)
         imported = []
         for one in made:
             imported.append(_moved(replace(one, notes=(*one.notes, *said)), next_run(out, suffix)))
@@ -193,6 +196,7 @@ def _make_runs(
     log: Path,
     found: LogMap,
     resolved: Mapping[str, Resolved],
+    robot: Robot,
     split: float | None,
     suffix: str,
     folder: Path,
@@ -208,7 +212,7 @@ def _make_runs(
             runs: list[ImportedRun] = []
             for made in runs_of(recording, found, resolved, split, progress.making):
                 number += 1
-                findings = _check(made, recording.name, resolved)
+                findings = _check(made, recording.name, resolved, robot)
                 path = write_run(folder / f"{number}{suffix}", made.table)
                 write_samples(samples_of(path), made)
                 runs.append(ImportedRun(path, recording.name, made.origin, made.facts, findings, made.notes))
@@ -242,11 +246,21 @@ def _moved(run: ImportedRun, path: Path) -> ImportedRun:
     return replace(run, path=path)
 
 
-def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved]) -> tuple[Finding, ...]:
+def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Robot) -> tuple[Finding, ...]:
     try:
-        return tuple(check_table(made.table, name))
+        findings = tuple(check_table(made.table, name))
+        for column in filter(is_effort, made.table):
+            check_effort(column, made.table, resolved[column].unit, robot, name)
+        return findings
     except InputError as error:
         raise InputError(_with_source(str(error), resolved)) from None
+
+
+def _unnamed_robot(resolved: Mapping[str, Resolved], robot: Robot) -> Iterator[str]:
+    """Yield a note where currents or counts become torques, and nobody said of which robot."""
+    units = sorted({source.unit for column, source in resolved.items() if is_effort(column) and source.unit in CURRENTS})
+    if units:
+        yield f"efforts in {', '.join(units)} become N m by the torque constants of '{robot.name}': name your robot (--robot)"
 
 
 def _with_source(text: str, resolved: Mapping[str, Resolved]) -> str:

@@ -13,6 +13,7 @@ from pydantic import Field, field_validator
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_yaml
 from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
+from wlr_gym.data.logs.names import words
 from wlr_gym.data.logs.units import factor
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
@@ -229,6 +230,8 @@ def resolve(found: LogMap, robot: Robot, where: str) -> dict[str, Resolved]:
 def _resolve(found: LogMap, column: str, source: ChannelSource, robot: Robot, where: str) -> Resolved:
     kind, _, label = column.partition("_")
     field, sign, zero = source.field, source.sign, source.zero
+    if kind == "eff" and source.unit is None and "current" in words(field):
+        raise InputError(f"{where}: channel '{column}': field '{field}' is a current: expected its unit: A, mA or count")
     if label in JOINTS:
         joint = found.joints.get(label)
         if "{joint}" in field and joint is None:

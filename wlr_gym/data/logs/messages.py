@@ -125,7 +125,7 @@ def run_message(
         "name": name,
         "columns": list(columns),
         "clock_offset": offset,
-        "meta": meta.model_dump(mode="json", exclude_none=True),
+        "meta": meta.content(),
         "simulation": simulation.model_dump(mode="json") if simulation else None,
     } | ({} if robot is None else {"robot": robot_content(robot)})
     return sent(RUN, STRING, time, make(STRING, data=json.dumps(content)))

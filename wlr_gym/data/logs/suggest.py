@@ -11,7 +11,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config
 from wlr_gym.data.format import CAMERA, COLUMNS
-from wlr_gym.data.logs.candidates import FieldCandidate, find_candidates, is_unnamed
+from wlr_gym.data.logs.candidates import FieldCandidate, find_candidates, is_unnamed, may_be_pose
 from wlr_gym.data.logs.clocks import set_clocks
 from wlr_gym.data.logs.map import GROUPS, NO_PROFILE, ChannelSource, JointSource, LogMap, combine
 from wlr_gym.data.logs.signals import GUESS, SURE, LogSignals, Reason, roughly_one_clock
@@ -55,6 +55,7 @@ def propose(log: Log, robot: Robot, given: Mapping[str, Any] | None = None) -> P
     known = parse_config(LogMap, given, "map")
     look = _look(log, robot, known)
     _unnamed(look)
+    _no_pose(look)
     body = find_pose(look)
     joints = find_joints(look, body)
     if body is None:
@@ -79,9 +80,9 @@ def _look(log: Log, robot: Robot, known: LogMap) -> LogSignals:
     if not chosen:
         topics = ", ".join(f"'{name}' ({topic.kind})" for name, topic in list(log.topics.items())[:12])
         raise InputError(f"{log.name}: nothing in it is known for a channel; topics: {topics}")
-    if "cam_x" not in chosen:
-        for column in ("cam_z", "cam_pitch"):
-            chosen.pop(column, None)
+    for column in ("cam_z", "cam_pitch"):
+        if column in chosen and ("cam_x" not in chosen or chosen[column].topic != chosen["cam_x"].topic):
+            del chosen[column]
     topics = sorted({one.topic for one in chosen.values()})
     _leave_out_short(log, chosen)
     rows = known.rows or (chosen["pos_leg_lf"].topic if "pos_leg_lf" in chosen else topics[0])
@@ -97,6 +98,14 @@ def _unnamed(look: LogSignals) -> None:
         if long and not any(one.topic == name and one.column.partition("_")[2] in JOINTS for one in look.chosen.values()):
             text = f"topic '{name}': {', '.join(long)} have no names: say in the map which is which, by place"
             look.note("joints", GUESS, f"{text}: joints: {{{JOINTS[0]}: '0', ...}}")
+
+
+def _no_pose(look: LogSignals) -> None:
+    """Say which topics have poses, where none of them is known to be the body's."""
+    others = [f"'{name}'" for name, topic in look.log.topics.items() if any(map(may_be_pose, topic.fields))]
+    if others and not look.has("cam_x") and not any(key.startswith("cam") for key in look.given.channels):
+        text = f"not proposed: the poses of {', '.join(others)} are not known to be the body's; name one in the map if it is"
+        look.note("cam", GUESS, text)
 
 
 def _leave_out_short(log: Log, chosen: dict[str, FieldCandidate]) -> None:

@@ -40,8 +40,11 @@ _ROUGH = 0.1
 _TILTED = 1.0
 #: How much a gyroscope turns of what wheels or pose say: wheels slip in turns.
 _AS_MUCH = (0.12, 3.0)
-#: m/s2; standing readings whose length is off by more than this share are in no unit that is known.
-_GRAVITY_SHARE = 0.15
+#: Readings show gravity that are 1 g within this share, and this share of that along one axis.
+_GRAVITY_SHARE, _ALONG = 0.15, 0.8
+#: Correlation from which on a turn or a push shows an axis and its sign, by how much it must beat the usual one, and how many
+#: sigmas of chance it must be.
+_CLEAR, _MARGIN, _SIGMAS = 0.5, 0.2, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +98,9 @@ def find_pose(look: LogSignals) -> BodyMotion | None:
     forward = integral(grid, vx * np.cos(turned) + vy * np.sin(turned))
     topic = look.chosen["cam_x"].topic
     by_name = look.log.topics[topic].kind.endswith(("PoseStamped", "Odometry")) or topic == "table"
-    look.note(
-        "cam", SURE if by_name else LIKELY, f"topic '{topic}', in {unit} by how fast the robot can be{_said_lost(look, topic)}"
-    )
+    taken = ", ".join(look.chosen[f"cam_{axis}"].field for axis in ("x", "y", "yaw"))
+    text = f"topic '{topic}': {taken}; in {unit} by how fast the robot can be{_said_lost(look, topic)}"
+    look.note("cam", SURE if by_name else LIKELY, text)
     _said_tilt(look)
     if "odom" in topic.lower() or look.log.topics[topic].kind.endswith("Odometry"):
         text = f"topic '{topic}' may be computed from the wheels: then it is no measurement: take 'cam' out of the map"
@@ -198,7 +201,7 @@ def find_imu(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | Non
     """
     units: dict[str, str] = {}
     up = _upward(look, units)
-    yaw = _yaw_axis(look, body, wheels, units)
+    yaw = _yaw_axis(look, body, wheels, units, up)
     if "imu" in look.given.frames:
         look.frames["imu"] = look.given.frames["imu"]
     else:
@@ -214,30 +217,47 @@ def _along(look: LogSignals, kind: str, axis: str) -> Array:
     return -values if axis.startswith("-") else values
 
 
-def gravity(look: LogSignals) -> tuple[Array, str] | None:
-    """Return what the accelerometer reads in the median (3,), raw, and the axis that reads +g, such as ``-z``."""
+def upward_axis(look: LogSignals) -> str | None:
+    """Return the accelerometer's axis that reads +g in the median, such as ``-z``; None where none clearly does."""
     if not look.has("acc_x", "acc_y", "acc_z"):
         return None
-    mean = np.array([float(np.median(look.raw(f"acc_{axis}")[1])) for axis in XYZ])
+    mean, _, g = _gravity(look)
     axis = int(np.argmax(np.abs(mean)))
-    return mean, f"{'-' if mean[axis] < 0 else ''}{XYZ[axis]}"
+    if abs(g - 1.0) > _GRAVITY_SHARE or abs(mean[axis]) < _ALONG * np.linalg.norm(mean):
+        return None
+    return f"{'-' if mean[axis] < 0 else ''}{XYZ[axis]}"
+
+
+def _gravity(look: LogSignals) -> tuple[Array, str, float]:
+    """Return what the accelerometer reads in the median (3,), its unit, by its name or by g, and how many g that is."""
+    mean = np.array([float(np.median(look.raw(f"acc_{axis}")[1])) for axis in XYZ])
+    length, named = float(np.linalg.norm(mean)), look.chosen["acc_x"].unit
+    units = {unit: factor for unit, factor in FACTORS["m/s2"].items() if named not in FACTORS["m/s2"] or unit == named}
+    unit, g = unit_of(max(length, 1e-9) / 9.81, units)
+    if named is None and abs(g - 1.0) > _GRAVITY_SHARE:
+        return mean, "m/s2", length / 9.81
+    return mean, unit, g
 
 
 def _upward(look: LogSignals, units: dict[str, str]) -> str | None:
     """Return the accelerometer's axis that reads +g at rest; its unit by g."""
-    if (found := gravity(look)) is None:
+    if not look.has("acc_x", "acc_y", "acc_z"):
         return None
-    mean, name = found
-    unit, off = unit_of(float(np.linalg.norm(mean)) / 9.81, FACTORS["m/s2"])
-    units["acc"] = look.chosen["acc_x"].unit if look.chosen["acc_x"].unit in FACTORS["m/s2"] else unit
-    sure = SURE if abs(off - 1.0) < _GRAVITY_SHARE else GUESS
-    text = f"topic '{look.chosen['acc_x'].topic}', in {units['acc']}: reads {off:.3f} g in the median, along its {name}"
-    look.note("acc", sure, text)
-    return name
+    _, units["acc"], g = _gravity(look)
+    up = upward_axis(look)
+    where = f"along its {up}" if up else "along none of its axes as gravity would be: which one points up is not decided"
+    text = f"topic '{look.chosen['acc_x'].topic}', in {units['acc']}: reads {g:.3f} g in the median, {where}"
+    look.note("acc", SURE if up else GUESS, text)
+    return up
 
 
-def _yaw_axis(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | None, units: dict[str, str]) -> str | None:
-    """Return the gyroscope's axis that turns as the robot does, its unit by how fast; sets the topic's clock."""
+def _yaw_axis(
+    look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | None, units: dict[str, str], up: str | None
+) -> str | None:
+    """Return the gyroscope's axis that turns as the robot does, its unit by how fast; sets the topic's clock.
+
+    Where turns do not show another axis or sign clearly, they are those that point up by gravity.
+    """
     if not look.has("gyro_x", "gyro_y", "gyro_z"):
         return None
     units["gyro"] = look.chosen["gyro_x"].unit if look.chosen["gyro_x"].unit in FACTORS["rad/s"] else "rad/s"
@@ -254,12 +274,12 @@ def _yaw_axis(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | No
             "gyro", GUESS, f"topic '{topic}', in {units['gyro']}: too short, or none of its axes turns about as much as {by}"
         )
         return None
-    axis = max(known, key=lambda one: abs(known[one].correlation))
+    axis = max(known, key=lambda one: abs(known[one].correlation) + _MARGIN * (up is not None and one == up[-1]))
     lag = known[axis]
-    if topic not in look.given.clocks and abs(lag.correlation) > 0.6 and abs(lag.seconds) > _ROUGH:
+    is_clear = lag.believable and abs(lag.correlation) - lag.opposite > _MARGIN
+    if topic not in look.given.clocks and is_clear and abs(lag.seconds) > _ROUGH:
         clock = look.clocks.get(topic, TopicClock())
         look.clocks[topic] = clock.model_copy(update={"offset": clock.offset + lag.seconds})
-    sign = "-" if lag.correlation < 0 else ""
     if abs(lag.correlation) < 0.6:
         text = f"its turning does not go with {by} (correlation {abs(lag.correlation):.2f}): neither unit nor axis shows"
         look.note("gyro", GUESS, f"topic '{topic}', in {units['gyro']}: {text}")
@@ -267,10 +287,15 @@ def _yaw_axis(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | No
     if look.chosen["gyro_x"].unit is None:
         units["gyro"] = _gyro_unit(look, axis, body or reference)
     sure = GUESS if not look.sided else SURE if abs(lag.correlation) > 0.9 else LIKELY
-    text = f"topic '{topic}', in {units['gyro']}; its {sign}{axis} turns with {by} (correlation {abs(lag.correlation):.2f})"
+    is_clear = is_clear and look.sided
+    name = f"{'-' if lag.correlation < 0 else ''}{axis}"
+    if not is_clear:
+        name = up if up is not None and up[-1] == axis else axis
+    text = f"topic '{topic}', in {units['gyro']}; its {name} turns with {by} (correlation {abs(lag.correlation):.2f})"
     text += "" if look.sided else ", whose signs are not known"
-    look.note("gyro", sure, text)
-    return f"{sign}{axis}"
+    text += "" if is_clear else "; which way round is not decided by it"
+    look.note("gyro", sure if is_clear else GUESS, text)
+    return name
 
 
 def lag_of_gyro(look: LogSignals, axis: str, reference: BodyMotion) -> Lag | None:
@@ -304,6 +329,8 @@ def _axes(look: LogSignals, up: str | None, yaw: str | None, body: BodyMotion | 
     """Set the IMU's axes: up by gravity and by how it turns, forward by how it is pushed."""
     z = yaw or up
     if z is None:
+        if look.has("gyro_x") or look.has("acc_x"):
+            look.note("frames.imu", GUESS, "as the body's: neither gravity nor turns decide it; check the mounting")
         return
     if up is not None and yaw is not None and up.strip("-") != yaw.strip("-"):
         look.note("frames.imu", GUESS, f"gravity is along {up}, yet the robot turns about {yaw}: check the mounting")
@@ -312,34 +339,42 @@ def _axes(look: LogSignals, up: str | None, yaw: str | None, body: BodyMotion | 
         text = f"the accelerometer reads gravity itself (along {up}) and not the floor's push: its sign is turned"
         look.note("acc.sign", LIKELY, text)
         look.acc_sign = -1
-    forward, correlation = _forward_axis(look, z, body, wheels)
+    forward, is_clear = _forward_axis(look, z, body, wheels)
     axes = _complete(forward, z)
+    by = "forward by how it is pushed" if is_clear else "how it is pushed does not decide which axis points forward"
     if axes == XYZ:
-        look.note("frames.imu", SURE if correlation > 0.5 else LIKELY, "as the body's, x forward, z up")
+        look.note("frames.imu", SURE if is_clear else LIKELY, f"as the body's, x forward, z up; {by}")
         return
     look.frames["imu"] = axes
-    sure = LIKELY if correlation > 0.5 else GUESS
-    look.note("frames.imu", sure, f"our x, y, z are its {', '.join(axes)}; forward by how it is pushed ({correlation:.2f})")
+    if yaw is None and z.startswith("-"):
+        by += "; the turns do not decide whether it is mounted upside down or its accelerometer reads gravity itself"
+    sure = LIKELY if is_clear and yaw is not None else GUESS
+    look.note("frames.imu", sure, f"our x, y, z are its {', '.join(axes)}; {by}")
 
 
-def _forward_axis(look: LogSignals, z: str, body: BodyMotion | None, wheels: BodyMotion | None) -> tuple[str, float]:
-    """Return the axis along which the robot is pushed when it speeds up, and the correlation."""
+def _forward_axis(look: LogSignals, z: str, body: BodyMotion | None, wheels: BodyMotion | None) -> tuple[str, bool]:
+    """Return the axis along which the robot is pushed when it speeds up, and whether that is clear; if not, the usual axis."""
     others = [axis for axis in XYZ if axis != z.strip("-")]
     usual = "x" if "x" in others else others[0]
     motion = wheels or body
     if motion is None or not look.has("acc_x", "acc_y", "acc_z"):
-        return usual, 0.0
+        return usual, False
     grid, _, speed = smoothed(motion.t, motion.forward)
+    if len(grid) < 2:
+        return usual, False
     pushed = np.gradient(speed, grid)
-    best = (usual, 0.0)
+    found = dict.fromkeys(others, 0.0)
     for axis in others:
         t, values = look.raw(f"acc_{axis}")
         at, mean, _ = smoothed(t, values * look.acc_sign)
         same = likeness(np.interp(grid, at, mean - mean.mean()), pushed - pushed.mean())
-        if same is not None and abs(same.correlation) > abs(best[1]):
-            best = (f"{'-' if same.correlation < 0 else ''}{axis}", same.correlation)
-    axis, correlation = best
-    return (axis, abs(correlation)) if abs(correlation) > 0.25 else (usual, abs(correlation))
+        found[axis] = 0.0 if same is None else same.correlation
+    best = max(found, key=lambda axis: abs(found[axis]))
+    name = f"{'-' if found[best] < 0 else ''}{best}"
+    chance = _SIGMAS / np.sqrt((grid[-1] - grid[0]) / _SMOOTH)
+    is_clear = abs(found[best]) > max(_CLEAR, chance) and (name == usual or abs(found[best]) - found[usual] > _MARGIN)
+    is_clear = is_clear and (look.sided or name != f"-{usual}")  # wheels that count backwards look alike
+    return (name, True) if is_clear else (usual, False)
 
 
 def _complete(x: str, z: str) -> tuple[str, str, str]:

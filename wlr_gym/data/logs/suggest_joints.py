@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.data.logs.names import words
 from wlr_gym.data.logs.signals import (
     GUESS,
     LIKELY,
@@ -21,8 +22,7 @@ from wlr_gym.data.logs.signals import (
     over_windows,
     unit_of,
 )
-from wlr_gym.data.logs.units import FACTORS, units_of
-from wlr_gym.physics.servo import current_law, effort_counts
+from wlr_gym.data.logs.units import FACTORS, effort_range, factor, units_of
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 from wlr_gym.robot.parameters import Parameters
 
@@ -274,25 +274,19 @@ def _effort(look: LogSignals, found: JointFindings, joint: str) -> None:
 
 
 def _torque_unit(look: LogSignals, column: str, raw: Array) -> str:
-    """Return the unit by magnitude: of N m there are at most what the motor has, of mA and counts many."""
-    joint = JOINTS.index(column.removeprefix("eff_"))
-    stall = look.robot.servo.leg.stall_torque if joint < len(LEGS) else look.robot.servo.wheel.stall_torque
+    """Return the unit by magnitude: of N m and A there are at most what the motor has, of mA and counts many."""
+    field = look.chosen[column].field
+    stall, _ = effort_range(column, look.robot)
+    constant = factor(column, "A", look.robot, look.log.name)
     size = float(np.quantile(np.abs(raw), 0.95))
+    whole = bool(np.all(raw == np.round(raw)))
+    if "current" in words(field):
+        return "A" if size * constant < 1.5 * stall and not whole else "mA"
     if size < 1.5 * stall:
         return "N m"
-    whole = bool(np.all(raw == np.round(raw)))
-    factors = {
-        "mA": 1e-3 * float(current_law(look.robot).torque_constant[joint]),
-        "mN m": 1e-3,
-        "count": float(effort_counts(look.robot)[joint]),
-    }
-    return (
-        "count"
-        if whole and look.chosen[column].field.startswith("dynamixel_state")
-        else "mA"
-        if size * factors["mA"] < stall
-        else "mN m"
-    )
+    if whole and field.startswith("dynamixel_state"):
+        return "count"
+    return "mA" if 1e-3 * size * constant < stall else "mN m"
 
 
 # ---- what is said ----------------------------------------------------------------------------------------------------
@@ -324,6 +318,7 @@ def _say_group(look: LogSignals, found: JointFindings, name: str, columns: list[
     by = "by its name" if named else _by(found, name, what, unit)
     sure = SURE if named or unit in ("rad", "rad/s", "deg", "deg/s", "rpm") else LIKELY
     sure = LIKELY if not named and (what == "effort" or (name == "pos_wheel" and not found.rolled)) else sure
+    sure = GUESS if not named and unit in ("mA", "mN m") else sure
     count = f"{len(columns)} of 4 joints; " if len(columns) < 4 else ""
     look.note(name, sure, f"{count}topic '{', '.join(places)}', in {unit}, {by}")
 
@@ -334,4 +329,6 @@ def _by(found: JointFindings, name: str, what: str, unit: str) -> str:
         return "by how fast a wheel can turn"
     if name == "pos_leg":
         return "by how large they are"
+    if what == "effort" and unit != "N m":
+        return "by how large they are and by names: mA, mN m or another unit? state it in the map if you know it"
     return f"by how {what}s go with the others" if unit not in ("rad", "rad/s", "N m") else "as usual"

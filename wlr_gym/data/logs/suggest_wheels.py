@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from wlr_gym.data.logs.signals import GUESS, LIKELY, LogSignals
-from wlr_gym.data.logs.suggest_body import gravity, lag_of_gyro, wheel_motion
+from wlr_gym.data.logs.suggest_body import lag_of_gyro, upward_axis, wheel_motion
 from wlr_gym.data.logs.suggest_joints import JointFindings, is_given
 from wlr_gym.robot import WHEELS
 from wlr_gym.robot.parameter_table import XYZ
@@ -18,19 +18,24 @@ _SIDES = {"left": ("wheel_lf", "wheel_lr"), "right": ("wheel_rf", "wheel_rr")}
 
 @dataclass(frozen=True)
 class _Reading:
-    """Signs of the left and the right wheels, and how the gyroscope then turns with them, about which of its axes."""
+    """Signs of the left and the right wheels, and how the gyroscope then turns with them, about which of its axes.
+
+    ``is_clear``: at another lag it does not turn against them nearly as much.
+    """
 
     left: int
     right: int
     correlation: float
     axis: str
+    is_clear: bool
 
 
 def find_sides(look: LogSignals, found: JointFindings) -> None:
     """Set the signs of the wheels as the gyroscope turns; where it does not show them, ``look.sided`` becomes False.
 
     Two readings are told apart by how well they go with the gyroscope: sides that count alike, or against each other. Which of
-    the two signs a reading has as a whole, gravity shows: it says which way is up.
+    the two signs a reading has as a whole, gravity shows: it says which way is up. A gyroscope that half a period later turns
+    the other way as much shows neither.
     """
     if not look.has(*(f"pos_{wheel}" for wheel in WHEELS)) or any(is_given(look, wheel) for wheel in WHEELS):
         return
@@ -45,7 +50,9 @@ def find_sides(look: LogSignals, found: JointFindings) -> None:
         look.note("joints.wheel_*.sign", GUESS, f"left as in the log: {shown}; check that forward counts up on both sides")
         return
     fitting = [one for one in readings if one.left * one.right == (1 if alike > opposed else -1)]
-    _, upward = gravity(look) or (None, None)
+    upward = upward_axis(look)
+    if not fitting[0].is_clear:
+        upward = None
     best = next((one for one in fitting if upward is not None and _turns_up(one, upward)), fitting[0])
     for side, sign in (("left", best.left), ("right", best.right)):
         for wheel in _SIDES[side]:
@@ -71,7 +78,8 @@ def _readings(look: LogSignals, found: JointFindings) -> list[_Reading]:
         for axis in XYZ if look.has("gyro_x", "gyro_y", "gyro_z") else ():
             lag = lag_of_gyro(look, axis, motion)
             if lag is not None:
-                readings.append(_Reading(left, right, lag.correlation, axis))
+                is_clear = abs(lag.correlation) - lag.opposite > _MARGIN
+                readings.append(_Reading(left, right, lag.correlation, axis, is_clear))
     return sorted(readings, key=lambda one: -abs(one.correlation))
 
 

@@ -1,0 +1,71 @@
+"""Efforts of a log are torques, currents or counts: a unit that is wrong or open is refused or said, whoever the robot is."""
+
+import numpy as np
+import pytest
+from foreign_logs import NAMES, lab_frame, made_up, rows_of
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.data import read_run
+from wlr_gym.data.logs import import_log, suggest_map
+from wlr_gym.physics.servo import current_law
+from wlr_gym.robot import JOINTS, load_robot
+
+UNITS = {"A": 1.0, "mA": 1e-3}
+
+
+def written(tmp_path, unit, name="current", wheels_only=False):
+    """Return a table with the efforts as currents, or as torques in a unit, and the torques (rows,) of each joint."""
+    table = rows_of(made_up(8.0))
+    torques = {joint: 0.03 * np.tanh(table[f"vel_{joint}"]) + 0.003 for joint in JOINTS}
+    constants = dict(zip(JOINTS, current_law(load_robot()).torque_constant, strict=True))
+    frame = lab_frame(made_up(8.0))
+    for joint in JOINTS[4:] if wheels_only else JOINTS:
+        size = UNITS[unit] * constants[joint] if unit in UNITS else {"N m": 1.0, "mN m": 1e-3}[unit]
+        frame[f"{NAMES[joint].lower()}_{name}"] = torques[joint] / size
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    return tmp_path / "a.csv", torques
+
+
+def read_as(log, unit, name="current"):
+    """Return the proposed map with another unit of the efforts."""
+    channels = {key: one for key, one in suggest_map(log).map.model_dump()["channels"].items() if not key.startswith("eff")}
+    efforts = {f"eff_{joint}": f"{NAMES[joint].lower()}_{name}" for joint in JOINTS[4:]}
+    return {"channels": channels | {key: {"topic": "table", "field": one, "unit": unit} for key, one in efforts.items()}}
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_current_comes_in_as_a_torque(tmp_path, unit):
+    log, torques = written(tmp_path, unit)
+    (imported,) = import_log(log, tmp_path / "runs")
+    run = read_run(imported.path)
+    for joint in JOINTS:
+        assert np.allclose(run[f"eff_{joint}"], torques[joint][: len(run["t"])], rtol=1e-6)
+    (note,) = [note for note in imported.notes if note.startswith("efforts")]
+    assert note == f"efforts in {unit} become N m by the torque constants of 'wlr-nominal': name your robot (--robot)"
+    (named,) = import_log(log, tmp_path / "named", robot="nominal")
+    assert not [note for note in named.notes if note.startswith("efforts")]
+
+
+@pytest.mark.parametrize("robot", [None, "nominal"])
+@pytest.mark.parametrize(
+    ("unit", "name", "read", "message"),
+    [
+        ("mA", "effort", "N m", r"a.csv: row \d+, column 'eff_wheel_lf': -?\d\S+ N m; expected up to 1.5, the stall torque of"),
+        ("mN m", "effort", "N m", "column 'eff_wheel_lf': .*; looks like mA, mN m or counts of a register"),
+        ("A", "current", "mA", r"column 'eff_wheel_lf': \S+ N m; expected more than 0.0015, one count of robot 'wlr-nominal'"),
+        ("N m", "effort", "mN m", "looks like A or N m .from topic 'table', field 'fl_wheel_effort', read as mN m: check its"),
+        ("mA", "current", None, "'eff_wheel_lf': field 'fl_wheel_current' is a current: expected its unit: A, mA or count"),
+    ],
+)  # fmt: skip
+def test_a_unit_that_makes_no_sense_is_refused(tmp_path, robot, unit, name, read, message):
+    log, _ = written(tmp_path, unit, name, wheels_only=True)
+    with pytest.raises(InputError, match=message):
+        import_log(log, tmp_path / "runs", read_as(log, read, name), robot=robot)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_an_effort_whose_unit_only_its_size_shows_is_a_guess(tmp_path):
+    log, _ = written(tmp_path, "mA", "effort")
+    said = {reason.what: reason for reason in suggest_map(log).reasons}
+    assert said["eff_wheel"].sure == "guess"
+    assert "mA, mN m or another unit? state it in the map" in said["eff_wheel"].why
