@@ -250,7 +250,7 @@ def test_report_reads_as_a_table(finished):
     assert "| false alarms, parameters only | 0/1 = 0% (at most 95%)" in text
     assert "| parameters only | nothing_missing 1 |" in text
     assert "| analyses that crashed | 0/2 = 0% (at most 78%) | 0 | yes |" in text
-    assert len({line.what for line in gap_score_table.lines(report)}) == 25
+    assert len({line.what for line in gap_score_table.lines(report)}) == 27
 
 
 def test_same_seed_same_bits_whatever_else_runs(tmp_path):

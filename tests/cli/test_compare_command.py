@@ -43,7 +43,7 @@ def test_strict_fails_when_plants_disagree(tmp_path, monkeypatch):
         (["--runs", "nowhere"], "no such file or folder"),
         (["--seconds", "0"], "--seconds 0"),
         (["--threshold", "-1"], "--threshold -1"),
-        (["--seed", "-1"], "seed = -1"),
+        (["--seed", "-1"], "--seed -1: expected 0 to"),
         (["--effects", "nothing_like_it"], "nothing_like_it"),
         (["--physics-step", "0.0007"], "does not divide"),
     ],

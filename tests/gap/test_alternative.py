@@ -146,4 +146,4 @@ def test_a_misfit_of_one_held_out_run_is_not_passed_over(error, verdict):
     assert done.gap is not None
     assert (done.gap.fit_after < 1.5, done.verdict) == (True, verdict)
     said = "run_5, which no fit has used, is replayed to within"
-    assert (said in sentence(done)) == sentence(done).endswith("; worst is torque.") == (verdict == UNKNOWN)
+    assert (said in sentence(done)) == sentence(done).endswith("; in held-out runs torque is worst.") == (verdict == UNKNOWN)

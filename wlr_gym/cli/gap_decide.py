@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.robot_options import RobotOption
+from wlr_gym.cli.robot_options import RobotOption, noise_seed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -98,16 +98,13 @@ def _simulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backe
 
 def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
     """Drive an emulated robot in emulated time, through the command limiter as a real one; noise as in a simulator."""
-    from wlr_gym.base.random import spawn_seeds
     from wlr_gym.data.read import read_meta
-    from wlr_gym.data.record import next_run
     from wlr_gym.gap.decision import Recorded
     from wlr_gym.hardware.driving import drive_robot
 
     del backend  # it has a simulator of its own
     meta = read_meta(data).model_copy(update={"profile": motion.profile})
-    seed = int(spawn_seeds(0, 1, next_run(data).stem)[0])
-    with closing(RobotOption(emulated=True).plant_of(robot, data, meta, hidden, seed)) as plant:
+    with closing(RobotOption(emulated=True).plant_of(robot, data, meta, hidden, noise_seed(data, 0))) as plant:
         drive = drive_robot(plant, motion)
     return Recorded(drive.run, drive.reason)
 

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
-from wlr_gym.cli.parsing import LARGEST_SEED
 from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import CameraOption, confirm
+from wlr_gym.cli.robot_options import CameraOption, confirm, noise_seed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,8 +38,8 @@ class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
         out: folder for the runs; made if it is not there.
         backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
         seed: seed of the motions (default: 0), and of the noise of a simulator or an emulated robot.
-        noise_seed: seed of an emulated robot's noise: noise_seed of a run's events repeats it; default: from --seed and the
-            run's number, without --seed drawn anew.
+        noise_seed: seed of an emulated robot's noise: noise_seed of a run's events repeats it (with the same --seed); default:
+            from --seed and the run's number, without --seed drawn anew.
         seconds: cut each motion off after this long.
         commands_only: write the setpoints only, one file per motion.
         list: show the excitations.
@@ -137,7 +136,8 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
     for motion in motions:
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
-        with closing(options.plant(options.out, meta, options.patch(), _noise_seed(options, options.out))) as plant:
+        seed = noise_seed(options.out, options.seed) if options.noise_seed is None else options.noise_seed
+        with closing(options.plant(options.out, meta, options.patch(), seed)) as plant:
             drive = drive_robot(plant, motion)
         _report(motion, drive, console)
         found.append(
@@ -151,16 +151,6 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
     found += [{"motion": name, "run": None, "reason": "not driven", "well": False, "ticks": 0} for name in left]
     _results(options, found)
     return code
-
-
-def _noise_seed(options: RecordOptions, out: Path) -> int:
-    """Return the seed of an emulated robot's noise in the next run of a folder."""
-    from wlr_gym.base.random import spawn_seeds
-    from wlr_gym.data.record import next_run
-
-    if options.noise_seed is not None:
-        return options.noise_seed
-    return int(spawn_seeds(options.seed, 1, next_run(out).stem)[0]) % (LARGEST_SEED + 1)  # one that --noise-seed takes
 
 
 def _results(options: RecordOptions, found: Sequence[dict[str, object]]) -> None:

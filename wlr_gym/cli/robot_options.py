@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.text import pairs
+from wlr_gym.cli.parsing import LARGEST_SEED
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,6 +22,17 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.plant import RobotPlant
     from wlr_gym.physics.effects import Patch
     from wlr_gym.robot import Robot
+
+
+def noise_seed(folder: Path, seed: int | None) -> int:
+    """Return the seed of an emulated robot's noise in the next run of a folder, one that ``--noise-seed`` takes.
+
+    It follows from ``seed`` and the run's number; without a seed it is drawn anew.
+    """
+    from wlr_gym.base.random import spawn_seeds
+    from wlr_gym.data.record import next_run
+
+    return int(spawn_seeds(seed, 1, next_run(folder).stem)[0]) % (LARGEST_SEED + 1)
 
 
 @dataclass(frozen=True, kw_only=True)

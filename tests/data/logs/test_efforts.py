@@ -1,12 +1,14 @@
 """Efforts of a log are torques, currents or counts: a unit that is wrong or open is refused or said, whoever the robot is."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from foreign_logs import NAMES, lab_frame, made_up, rows_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
-from wlr_gym.data.logs import import_log, suggest_map
+from wlr_gym.data.logs import import_log, suggest_joints, suggest_map
 from wlr_gym.physics.servo import current_law
 from wlr_gym.robot import JOINTS, load_robot
 
@@ -69,3 +71,19 @@ def test_an_effort_whose_unit_only_its_size_shows_is_a_guess(tmp_path):
     said = {reason.what: reason for reason in suggest_map(log).reasons}
     assert said["eff_wheel"].sure == "guess"
     assert "mA, mN m or another unit? state it in the map" in said["eff_wheel"].why
+
+
+@pytest.mark.parametrize(
+    ("field", "size", "unit"),
+    [
+        ("dynamixel_state[1].present_current", 1.0, "count"),  # of Present Current (2.69 mA), whatever the field is called
+        ("dynamixel_state[1].present_current", 40.0, "count"),
+        ("current", 40.0, "mA"),
+        ("effort", 0.02, "N m"),
+    ],
+)
+def test_whole_currents_of_dynamixel_workbench_are_counts(field, size, unit):
+    look = SimpleNamespace(
+        chosen={"eff_leg_lf": SimpleNamespace(field=field)}, robot=load_robot(), log=SimpleNamespace(name="a.bag")
+    )
+    assert suggest_joints._torque_unit(look, "eff_leg_lf", size * np.arange(-5.0, 6.0)) == unit  # pyright: ignore[reportArgumentType]

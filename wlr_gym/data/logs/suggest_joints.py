@@ -280,12 +280,12 @@ def _torque_unit(look: LogSignals, column: str, raw: Array) -> str:
     constant = factor(column, "A", look.robot, look.log.name)
     size = float(np.quantile(np.abs(raw), 0.95))
     whole = bool(np.all(raw == np.round(raw)))
+    if whole and field.startswith("dynamixel_state"):
+        return "count"
     if "current" in words(field):
         return "A" if size * constant < 1.5 * stall and not whole else "mA"
     if size < 1.5 * stall:
         return "N m"
-    if whole and field.startswith("dynamixel_state"):
-        return "count"
     return "mA" if 1e-3 * size * constant < stall else "mN m"
 
 

@@ -72,7 +72,7 @@ def check_effort(column: str, table: Mapping[str, NDArray[np.float64]], unit: st
     row = int(np.argmax(sizes))
     text = f"{where}: row {row}, column '{column}': {table[column][row]:.3g} N m; expected"
     if np.quantile(sizes, 0.95) > _STALLS * stall:
-        hint = "looks like mA, mN m or counts of a register"
+        hint = "looks like mA, mN m or counts of a register, or another robot (--robot)"
         raise InputError(f"{text} up to {stall:g}, the stall torque of robot '{robot.name}'; {hint}")
     if unit in ("mA", "mN m") and 0.0 < sizes[row] < count and moved > _MOVED:
         raise InputError(f"{text} more than {count:.2g}, one count of robot '{robot.name}'; looks like A or N m")

@@ -316,7 +316,8 @@ def _misfit(analysis: Analysis) -> str:
     left, run = most_left(gap.fit_after, analysis.run_gaps)
     replayed = f"to within {capped(left, gap)} times the sensor noise, where a complete model reaches {error(gap.noise_floor)}"
     if run and analysis.channel_gaps:
-        return f"{run}, which no fit has used, is replayed {replayed}; worst is {channel(most_in(analysis.channel_gaps))}"
+        worst = channel(most_in(analysis.channel_gaps))
+        return f"{run}, which no fit has used, is replayed {replayed}; in held-out runs {worst} is worst"
     most = [f"; {percent(one.share)} of what is left is in {channel(one.name)}" for one in analysis.localisation[:1]]
     return f"the fitted runs are replayed {replayed}{''.join(most)}"
 

@@ -113,7 +113,7 @@ class SweepPlan(SettingsModel):
     settings: dict[str, Any] = Field(default_factory=dict)
     space: dict[str, NumberRange | Annotated[list[Any], Field(min_length=1)]] = Field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    seeds: Annotated[int, Field(gt=0)] | Annotated[list[Seed], Field(min_length=1)] = 5
+    seeds: Annotated[int, Field(gt=0, le=1_000_000)] | Annotated[list[Seed], Field(min_length=1)] = 5
     search: SearchPlan | None = None
     imports: tuple[str, ...] = ()
 

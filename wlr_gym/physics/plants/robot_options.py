@@ -30,7 +30,7 @@ class RobotOptions:
         seed: of the noise of an emulated robot.
 
     Raises:
-        InputError: effects for a robot that is not emulated.
+        InputError: effects for a robot that is not emulated, a seed out of range.
     """
 
     hardware: str | Path = "nominal"
@@ -48,6 +48,8 @@ class RobotOptions:
     def __post_init__(self) -> None:
         if self.effects and not self.emulated:
             raise InputError("effects: a real robot has its own; they are for simulators and the emulated robot")
+        if not 0 <= self.seed < 2**64:
+            raise InputError(f"seed {self.seed}: expected 0 to {2**64 - 1}")
 
 
 def read_robot_options(given: object) -> RobotOptions:
