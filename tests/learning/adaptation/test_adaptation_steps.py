@@ -177,24 +177,39 @@ def episodes(stopped):
     return np.arange(128) < stopped
 
 
-@pytest.mark.parametrize(("stops", "trainings"), [(6, ["training"]), (30, ["training", "training_again"])])
-def test_a_policy_that_the_supervision_stops_more_often_is_trained_again(tmp_path, monkeypatch, stops, trainings):
-    done = {}
+@pytest.mark.parametrize("better", ["training", "training_other"])
+@pytest.mark.parametrize(("stops", "again"), [(6, []), (30, ["training_again"])])
+def test_the_better_of_two_trainings_goes_on_and_is_trained_again_where_it_is_stopped(
+    tmp_path, monkeypatch, stops, again, better
+):
+    done, seeds, compared = {}, [], []
 
-    def train(progress, folder, config, family, rewards=None):
+    def train(progress, folder, config, family, rewards=None, further=0):
         (folder / "policy").mkdir(parents=True, exist_ok=True)
         done[folder.name] = rewards
+        seeds.append(further)
 
     def watched(progress, found, own, policy):
-        return episodes(stops if policy.endswith("training/policy") else 5)
+        return episodes(stops if policy.endswith(f"{better}/policy") else 5)
+
+    def compare(new, old, asked, family, own, threads):
+        compared.append(new)
+        error = 0.2 if new.endswith(f"{better}/policy") else 0.3
+        return Acceptance(new, asked.environment, 8, 1, (), 5.0, "", (Loss(family.name, old, error, 0.4, -1.0, -0.5),))
 
     monkeypatch.setattr(retraining, "train_in", train)
     monkeypatch.setattr(retraining, "watched", watched)
+    monkeypatch.setattr(retraining, "compare_on", compare)
+    trainings = [better, *again]
     progress = Progress(tmp_path, asked())
     found = uncertainty.Uncertainty(Patch(), uncertainty.Family("training", {}), (uncertainty.Family("as stated", {}),), ())
     record = retraining.train_supervised(progress, found, ROBOT)
-    assert list(done) == trainings
-    assert done["training"] is None
+    assert list(done) == ["training", "training_other", *again]
+    assert seeds[:2] == [0, 1]
+    assert done["training"] is done["training_other"] is None
+    assert "tracking error 0." in record.said[1]
+    retraining.train_supervised(progress, found, ROBOT)
+    assert len(compared) == 2  # the second time its file answers
     assert retraining.trained_policy(progress) == str(tmp_path / trainings[-1] / "policy")
     if len(trainings) == 2:
         assert done["training_again"] == retraining.STUCK_WHEELS
