@@ -41,6 +41,8 @@ from wlr_gym.hardware.emulator.stand import EmulatedStand
 
 NOMINAL = load_hardware()
 ROBOT = load_robot(NOMINAL.robot or "nominal")
+#: Tests in which a person is asked for something often.
+ASKING = ("joints", "imu", "stall")
 QUANTITIES = {quantity.name: quantity for test in TESTS.values() for quantity in test.quantities}
 
 
@@ -379,21 +381,42 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
     assert [guard.is_released for guard in guards] == [not fault]
 
 
-@pytest.mark.parametrize("name", ["torque_on", "watchdog", "velocity_step"])
+@pytest.mark.parametrize(
+    "name",
+    ["watchdog", "velocity_step", "torque_on", "load", *(pytest.param(name, marks=pytest.mark.slow) for name in ASKING)],
+)
 def test_the_next_sign_of_life_comes_in_time_while_a_motor_is_on(stood, name):
+    """However long a person takes over a question: no motor is on then."""
     emulated, stand = stood
     signs = []
     stand.sign_of_life = lambda seconds: signs.append((stand.clock.now(), seconds))
-    run_test(TESTS[name], stand, EmulatedPerson(emulated))
+    human = SlowHuman(emulated, stand.clock)
+    run_test(TESTS[name], stand, TerminalPerson(human))
+    assert bool(human.asked) == (name in ("torque_on", *ASKING))
     times, promised = np.array(signs).T
     assert promised[-1] == math.inf
     assert motors_on(emulated.machine) == []
-    assert len(signs) > 10
     waited = np.diff(times)
     on = np.isfinite(promised[:-1])
+    assert on.sum() > 10 or name in ("joints", "imu")
     assert (waited[on] < promised[:-1][on]).all()
     late = promised[:-1][on] - waited[on]  # how much later than needed it would be seen that nothing comes any more
     assert (late[:-1] < 2.1).all()
+
+
+@pytest.mark.parametrize("name", ["torque_on", "stall", "load", "watchdog"])
+def test_signs_of_life_are_promised_whenever_a_motor_is_on(stood, monkeypatch, name):
+    emulated, stand = stood
+    promised = [math.inf]
+    stand.sign_of_life = promised.append
+    read = stand.servos.read
+
+    def look():
+        assert (promised[-1] < math.inf) == bool(motors_on(emulated.machine))
+        return read()
+
+    monkeypatch.setattr(stand.servos, "read", look)
+    run_test(TESTS[name], stand, EmulatedPerson(emulated))
 
 
 def test_the_stand_has_limits_of_its_own(stood):
@@ -455,7 +478,22 @@ class Human:
             self.emulated.brake(joint)
         elif "let go" in text:
             self.emulated.release(joint)
+        elif joint == "Robot:":
+            tilts = {"roll": "right side down", "pitch": "nose down", "yaw": "nose to the left"}
+            self.emulated.tilt(**{name: math.radians(20.0) for name, words in tilts.items() if words in text})
         return ""
+
+
+class SlowHuman(Human):
+    """Lets 5 s pass before every answer."""
+
+    def __init__(self, emulated, clock):
+        super().__init__(emulated)
+        self.clock = clock
+
+    def __call__(self, text):
+        self.clock.wait_until(self.clock.now() + 5.0)
+        return super().__call__(text)
 
 
 def beside(monkeypatch, emulated):
