@@ -55,7 +55,8 @@ class StandTest:
         asks: what the person has to do; empty = keep hands off.
         moves: what will move, for the question before the test.
         quantities: what it measures.
-        measure: does it; torque may be on when it returns or fails: who calls switches off.
+        measure: does it; torque may be on when it returns or fails: who calls switches off. Raises
+            :class:`PartlyError` with the readings it has where it could not be made at some joints.
     """
 
     name: str
