@@ -567,6 +567,26 @@ def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(monkeypa
     assert not found.measured.joint_zero
 
 
+def test_a_joint_that_cannot_be_held_is_named_and_the_others_are_told(monkeypatch, tmp_path, capsys):
+    class OneHanded(Human):
+        def __call__(self, text):
+            answer = super().__call__(text)
+            if "leg_rf (right front): hold" in text:
+                self.emulated.release("leg_rf")
+            return answer
+
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    beside(monkeypatch, emulated)
+    human = OneHanded(emulated)
+    assert run(CommissionOptions(out=tmp_path, tests=("stall",), yes=True), human) == 1
+    (again,) = (text for text in human.asked if "Once more" in text)
+    assert re.match(r"leg_rf turned by .*: hold it firmly. Once more. leg_rf \(right front\): hold its end", again)
+    shown = capsys.readouterr().out
+    assert "stall: failed: not measured: leg_rf turned by" in shown
+    assert "Not tested: stall in part." in shown
+    assert set(load_hardware(tmp_path / "hardware.yaml").measured.stall_load) == set(JOINTS) - {"leg_rf"}
+
+
 def test_how_the_body_is_to_be_turned():
     asked = []
     person = TerminalPerson(lambda text: asked.append(text) or "")
