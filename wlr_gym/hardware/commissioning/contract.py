@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from wlr_gym.hardware.commissioning.errors import TroubleError
 from wlr_gym.hardware.commissioning.person import Person
 from wlr_gym.hardware.commissioning.stand import Stand
 
@@ -43,6 +44,14 @@ class Reading:
     quantity: str
     where: str
     value: float
+
+
+class PartlyError(TroubleError):
+    """A test could not be made at some joints; ``readings`` are of the others."""
+
+    def __init__(self, message: str, readings: Sequence[Reading]) -> None:
+        super().__init__(message)
+        self.readings: list[Reading] = list(readings)
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from wlr_gym.hardware.commissioning.contract import Reading
-
 
 class TroubleError(RuntimeError):
     """A test cannot go on; the message says why. Torque goes off."""
@@ -19,14 +13,6 @@ class TrippedError(TroubleError):
 
 class SlippedError(TroubleError):
     """A joint that was to be held gave way."""
-
-
-class PartlyError(TroubleError):
-    """A test could not be made at some joints; ``readings`` are of the others."""
-
-    def __init__(self, message: str, readings: Sequence[Reading]) -> None:
-        super().__init__(message)
-        self.readings = list(readings)
 
 
 class SkippedError(Exception):

@@ -15,9 +15,9 @@ from wlr_gym.data.format import RunMeta
 from wlr_gym.data.record import next_run
 from wlr_gym.data.write import write_run
 from wlr_gym.hardware.commissioning.comparison import StandFinding, compare
-from wlr_gym.hardware.commissioning.contract import Reading, StandTest
+from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandTest
 from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
-from wlr_gym.hardware.commissioning.errors import PartlyError, PowerError, QuitError, SkippedError, TrippedError, TroubleError
+from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TrippedError, TroubleError
 from wlr_gym.hardware.commissioning.person import Person
 from wlr_gym.hardware.commissioning.stand import Stand
 from wlr_gym.hardware.config import Hardware

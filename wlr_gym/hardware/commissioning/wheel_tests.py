@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.hardware.commissioning.contract import Reading, StandQuantity, StandTest
-from wlr_gym.hardware.commissioning.errors import PartlyError, SlippedError, TroubleError
+from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandQuantity, StandTest
+from wlr_gym.hardware.commissioning.errors import SlippedError, TroubleError
 from wlr_gym.hardware.commissioning.person import Person
 from wlr_gym.hardware.commissioning.stand import LARGEST_LEAN, LOW_PWM, PERIOD, Stand
 from wlr_gym.robot import JOINTS, LEGS, WHEEL_SLICE, WHEELS
