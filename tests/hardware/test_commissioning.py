@@ -41,6 +41,8 @@ from wlr_gym.hardware.emulator.stand import EmulatedStand
 
 NOMINAL = load_hardware()
 ROBOT = load_robot(NOMINAL.robot or "nominal")
+#: Tests in which a person is asked for something often.
+ASKING = ("joints", "imu", "stall")
 QUANTITIES = {quantity.name: quantity for test in TESTS.values() for quantity in test.quantities}
 
 
@@ -172,19 +174,67 @@ def test_legs_that_get_a_part_of_their_voltage_are_found(tmp_path):
     assert found_in(results) == {("stall_pwm", leg) for leg in LEGS}
 
 
+class Careless(EmulatedPerson):
+    """Holds each of some joints only the nth time that it is asked for, and notes what it is told then."""
+
+    def __init__(self, stand, **holds):
+        super().__init__(stand)
+        self.holds, self.told = holds, []
+
+    def brake(self, joint, trouble=""):
+        self.told += [trouble] if trouble else []
+        self.holds[joint] = self.holds.get(joint, 1) - 1
+        if self.holds[joint] <= 0:
+            super().brake(joint, trouble)
+
+
 def test_a_leg_that_does_not_move_or_is_not_held_has_no_strength(tmp_path):
     effect = {"name": "weak_motor", "where": ["leg_rf"], "parameters": {"scale": 0.05}}
     emulated = EmulatedStand(ROBOT, NOMINAL, {"effects": [effect]})
-
-    class Careless(EmulatedPerson):
-        def brake(self, joint):
-            if joint in WHEELS:
-                super().brake(joint)
-
-    results = make(tmp_path, emulated, "load", "stall", person=Careless(emulated))
+    results = make(tmp_path, emulated, "load", "stall", person=Careless(emulated, leg_lf=3, wheel_rr=3))
     assert [result.state for result in results.values()] == ["failed", "failed"]
     assert re.match(r"leg_rf moved by 0.0\d+ rad, expected 0.12 within 20%", results["load"].reason)
-    assert re.match(r"leg_lf turned by 0.1\d rad, in the end at 0.00 rad/s: hold it firmly", results["stall"].reason)
+    assert re.match(r"not measured: wheel_rr .*; leg_lf turned by 0.1\d rad, .*: hold it firmly$", results["stall"].reason)
+    assert {finding.where for finding in results["stall"].findings} == set(JOINTS) - {"wheel_rr", "leg_lf"}
+    assert found_in(results) == set()
+
+
+def test_a_joint_that_slips_is_asked_for_once_more(tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    person = Careless(emulated, leg_rf=2, wheel_lf=2)
+    result = make(tmp_path, emulated, "stall", person=person)["stall"]
+    assert result.is_good
+    assert {finding.where for finding in result.findings} == set(JOINTS)
+    assert [re.sub(r"turned by .*:", ":", text) for text in person.told] == [
+        f"{joint} : hold it firmly. Once more. " for joint in ("wheel_lf", "leg_rf")
+    ]
+
+
+def test_torque_comes_on_where_the_hand_holds_the_joint(stood, monkeypatch):
+    emulated, stand = stood
+    off = []
+
+    class Mover(EmulatedPerson):
+        def brake(self, joint, trouble=""):
+            for leg in LEGS if joint in LEGS else ():
+                emulated.turn(leg, 0.3 if leg == joint else -0.1)
+            super().brake(joint, trouble)
+
+    def note(joints):
+        off.extend(abs(stand.servos.get(leg, "goal_position") - stand.servos.get(leg, "present_position")) for leg in joints)
+        switch_on(joints)
+
+    switch_on = stand.switch_on
+    monkeypatch.setattr(stand, "switch_on", lambda joints: note(joints) if joints[0] in LEGS else switch_on(joints))
+    run_test(TESTS["stall"], stand, Mover(emulated))
+    assert len(off) == len(LEGS)
+    assert max(off) <= 2  # counts
+
+
+def test_nobody_says_that_legs_have_no_profile(tmp_path):
+    assert main(["commission", "--emulated", "--out", str(tmp_path), "--tests", "velocity_step"]) == 0
+    (run_made,) = read_dataset(tmp_path).runs
+    assert not run_made.meta.states_profile
 
 
 @pytest.mark.slow
@@ -379,21 +429,42 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
     assert [guard.is_released for guard in guards] == [not fault]
 
 
-@pytest.mark.parametrize("name", ["torque_on", "watchdog", "velocity_step"])
+@pytest.mark.parametrize(
+    "name",
+    ["watchdog", "velocity_step", "torque_on", "load", *(pytest.param(name, marks=pytest.mark.slow) for name in ASKING)],
+)
 def test_the_next_sign_of_life_comes_in_time_while_a_motor_is_on(stood, name):
+    """However long a person takes over a question: no motor is on then."""
     emulated, stand = stood
     signs = []
     stand.sign_of_life = lambda seconds: signs.append((stand.clock.now(), seconds))
-    run_test(TESTS[name], stand, EmulatedPerson(emulated))
+    human = SlowHuman(emulated, stand.clock)
+    run_test(TESTS[name], stand, TerminalPerson(human))
+    assert bool(human.asked) == (name in ("torque_on", *ASKING))
     times, promised = np.array(signs).T
     assert promised[-1] == math.inf
     assert motors_on(emulated.machine) == []
-    assert len(signs) > 10
     waited = np.diff(times)
     on = np.isfinite(promised[:-1])
+    assert on.sum() > 10 or name in ("joints", "imu")
     assert (waited[on] < promised[:-1][on]).all()
     late = promised[:-1][on] - waited[on]  # how much later than needed it would be seen that nothing comes any more
     assert (late[:-1] < 2.1).all()
+
+
+@pytest.mark.parametrize("name", ["torque_on", "stall", "load", "watchdog"])
+def test_signs_of_life_are_promised_whenever_a_motor_is_on(stood, monkeypatch, name):
+    emulated, stand = stood
+    promised = [math.inf]
+    stand.sign_of_life = promised.append
+    read = stand.servos.read
+
+    def look():
+        assert (promised[-1] < math.inf) == bool(motors_on(emulated.machine))
+        return read()
+
+    monkeypatch.setattr(stand.servos, "read", look)
+    run_test(TESTS[name], stand, EmulatedPerson(emulated))
 
 
 def test_the_stand_has_limits_of_its_own(stood):
@@ -455,7 +526,22 @@ class Human:
             self.emulated.brake(joint)
         elif "let go" in text:
             self.emulated.release(joint)
+        elif joint == "Robot:":
+            tilts = {"roll": "right side down", "pitch": "nose down", "yaw": "nose to the left"}
+            self.emulated.tilt(**{name: math.radians(20.0) for name, words in tilts.items() if words in text})
         return ""
+
+
+class SlowHuman(Human):
+    """Lets 5 s pass before every answer."""
+
+    def __init__(self, emulated, clock):
+        super().__init__(emulated)
+        self.clock = clock
+
+    def __call__(self, text):
+        self.clock.wait_until(self.clock.now() + 5.0)
+        return super().__call__(text)
 
 
 def beside(monkeypatch, emulated):
@@ -479,6 +565,26 @@ def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(monkeypa
     found = load_hardware(mine)
     assert found.measured.stall_current["wheel_lf"].value == pytest.approx(emulated.stall_current, rel=0.05)
     assert not found.measured.joint_zero
+
+
+def test_a_joint_that_cannot_be_held_is_named_and_the_others_are_told(monkeypatch, tmp_path, capsys):
+    class OneHanded(Human):
+        def __call__(self, text):
+            answer = super().__call__(text)
+            if "leg_rf (right front): hold" in text:
+                self.emulated.release("leg_rf")
+            return answer
+
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    beside(monkeypatch, emulated)
+    human = OneHanded(emulated)
+    assert run(CommissionOptions(out=tmp_path, tests=("stall",), yes=True), human) == 1
+    (again,) = (text for text in human.asked if "Once more" in text)
+    assert re.match(r"leg_rf turned by .*: hold it firmly. Once more. leg_rf \(right front\): hold its end", again)
+    shown = capsys.readouterr().out
+    assert "stall: failed: not measured: leg_rf turned by" in shown
+    assert "Not tested: stall in part." in shown
+    assert set(load_hardware(tmp_path / "hardware.yaml").measured.stall_load) == set(JOINTS) - {"leg_rf"}
 
 
 def test_how_the_body_is_to_be_turned():
@@ -697,6 +803,71 @@ def test_tests_made_again_leave_the_results_of_the_others(tmp_path, capsys):
     assert main([*words, "latency", "--fault", "delay legs value=0.015"]) == 2
     assert "silent_servo is of robot 'wlr-emanual', hardware 'nominal', emulated, not of" in capsys.readouterr().err
     assert results_of(tmp_path) == second
+
+
+@pytest.mark.parametrize("answers", [{"Latency": "q"}, {"Latency": "s", "A read of": "q"}, {"swing its foot": "q"}])
+def test_a_test_that_is_not_made_leaves_its_earlier_result(monkeypatch, tmp_path, answers):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    beside(monkeypatch, emulated)
+    tests = ("latency", "silent_servo", "joints")
+    assert run(CommissionOptions(out=tmp_path, tests=tests, yes=True), Human(emulated)) == 0
+    first, samples = results_of(tmp_path), (tmp_path / "joints.json").read_text()
+    run(CommissionOptions(out=tmp_path, tests=tests, force=True), Human(emulated, **answers))
+    second = json.loads((tmp_path / "commission.json").read_text())
+    assert [result["state"] for result in second] == ["done"] * 3
+    assert {result["test"] for result in second} == set(tests)
+    assert results_of(tmp_path)["joints"] == first["joints"]
+    assert (tmp_path / "joints.json").read_text() == samples
+
+
+@pytest.mark.parametrize(
+    "content", ['[{"test": "silent_servo", "state": "done", "findings": []}]', '[{"test": "silent_se', "{}  []", '{"a": 1}']
+)
+def test_results_of_nobody_knows_whom_are_replaced(tmp_path, capsys, content):
+    (tmp_path / "commission.json").write_text(content)
+    (tmp_path / "hardware.yaml").write_text("of another robot\n")
+    words = ["commission", "--emulated", "--out", str(tmp_path), "--tests", "latency"]
+    assert main(words) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main([*words, "--force"]) == 0
+    assert "commission.json: damaged, or does not say of which robot" in capsys.readouterr().out
+    assert set(results_of(tmp_path)) == {"latency"}
+
+
+def test_two_hardware_files_of_one_name_are_two_robots(tmp_path, capsys):
+    words = ["commission", "--emulated", "--force", "--out", str(tmp_path / "out"), "--hardware"]
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "my_robot.yaml").write_text((data_directory("configs") / "hardware/nominal.yaml").read_text())
+    assert main([*words, str(tmp_path / "a/my_robot.yaml"), "--tests", "latency"]) == 0
+    assert main([*words, str(tmp_path / "b/my_robot.yaml"), "--tests", "silent_servo"]) == 2
+    assert "choose another --out" in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "b/../a/my_robot.yaml"), "--tests", "silent_servo"]) == 0
+    assert main([*words, str(tmp_path / "b/my_robot.yaml"), "--tests", "latency", "silent_servo"]) == 0  # nothing is left of a
+
+
+def test_the_later_of_two_values_stays_and_only_the_copy_gets_those_of_an_earlier_session(monkeypatch, tmp_path):
+    def at(date, value):
+        return {"value": value, "unit": "A", "date": date}
+
+    beside(monkeypatch, EmulatedStand(ROBOT, NOMINAL))
+    text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
+    mine, out = tmp_path / "mine.yaml", tmp_path / "out"
+    mine.write_text(text)
+    options = {"hardware": str(mine), "out": out, "yes": True, "force": True}
+    assert run(CommissionOptions(tests=("silent_servo",), **options)) == 0
+    own = {"wheel_lf": at("2026-11-20", 1.5), "wheel_rf": at("2026-11-01", 1.6)}
+    earlier = {"wheel_lf": at("2026-11-01", 1.1), "wheel_rf": at("2026-11-20", 1.2), "wheel_lr": at("2026-11-20", 1.3)}
+    mine.write_text(text + yaml.safe_dump({"measured": {"stall_current": own}}))
+    (out / "hardware.yaml").write_text(text + yaml.safe_dump({"measured": {"stall_current": earlier}}))
+    assert run(CommissionOptions(tests=("latency",), **options)) == 0
+
+    def currents(file):
+        return {wheel: found.value for wheel, found in load_hardware(file).measured.stall_current.items()}
+
+    assert currents(mine) == {"wheel_lf": 1.5, "wheel_rf": 1.6}
+    assert currents(out / "hardware.yaml") == {"wheel_lf": 1.5, "wheel_rf": 1.2, "wheel_lr": 1.3}
+    assert set(load_hardware(mine).measured.adapter_latency) == set(NOMINAL.buses)
 
 
 def test_a_copy_of_the_hardware_file_still_finds_its_robot(tmp_path):

@@ -28,10 +28,13 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.commissioning.runner import StandResult
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
+    from wlr_gym.hardware.measured import Measured
     from wlr_gym.robot import Robot
 
 #: File in ``--out`` with all results.
 REPORT = "commission.json"
+#: File in ``--out``: the hardware file with what was measured.
+COPY = "hardware.yaml"
 #: Digits of a value in the table.
 _DIGITS = 3
 
@@ -84,41 +87,57 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     return _commission(options, options.out, tests, ask or partial(ask_terminal, what="commissioning"), console)
 
 
-def _earlier(report: Path, robot: str, tests: Sequence[StandTest]) -> list[dict[str, Any]]:
-    """Return the results of an earlier session that this one does not replace: those of tests that are not made now.
+def _earlier(report: Path, robot: str, tests: Sequence[StandTest], console: Console) -> list[dict[str, Any]]:
+    """Return the results of an earlier session with the same robot; none where the file does not say of which they are.
 
     Raises:
-        InputError: they are of another robot.
+        InputError: they are of another robot, and of tests that are not made now.
     """
-    found = json.loads(report.read_text(encoding="utf-8")) if report.is_file() else []
+    try:
+        found = json.loads(report.read_text(encoding="utf-8")) if report.is_file() else []
+        others = [(result["test"], result["robot"]) for result in found if result["robot"] != robot]
+    except (OSError, ValueError, TypeError, KeyError):
+        console.print(f"{report}: damaged, or does not say of which robot its results are: it is replaced", style="bold yellow")
+        return []
     made = [test.name for test in tests]
-    kept = [result for result in found if result["test"] not in made]
-    for result in kept:
-        if result.get("robot") != robot:
-            raise InputError(
-                f"{report}: its {result['test']} is of {result.get('robot')}, not of {robot}: choose another --out"
-            )
-    return kept
+    for test, other in others:
+        if test not in made:
+            raise InputError(f"{report}: its {test} is of {other}, not of {robot}: choose another --out")
+    return [result for result in found if result["robot"] == robot]
+
+
+def _together(earlier: Sequence[dict[str, Any]], made: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return all results, one per test: an earlier one stays until its test was made anew, well or not."""
+    from wlr_gym.hardware.commissioning.runner import SKIPPED, STOPPED
+
+    known = {result["test"] for result in earlier}
+    new = [result for result in made if result["state"] not in (SKIPPED, STOPPED) or result["test"] not in known]
+    replaced = {result["test"] for result in new}
+    return [*(result for result in earlier if result["test"] not in replaced), *new]
 
 
 def _named(options: CommissionOptions, robot: Robot) -> str:
-    """Return in words which robot is tested."""
-    words = [f"robot '{robot.name}'", f"hardware '{Path(options.hardware).name}'", *(["emulated"] if options.emulated else [])]
-    return ", ".join([*words, *options.effects, *options.fault])
+    """Return in words which robot is tested; a hardware file of one's own by its path, for others may have its name."""
+    file = Path(options.hardware)
+    words = [f"robot '{robot.name}'", f"hardware '{file.resolve() if file.suffix else file}'"]
+    return ", ".join([*words, *(["emulated"] if options.emulated else []), *options.effects, *options.fault])
 
 
 def _commission(
     options: CommissionOptions, out: Path, tests: Sequence[StandTest], ask: Callable[[str], str], console: Console
 ) -> int:
     from wlr_gym.base.files import write_json
-    from wlr_gym.data.format import Profile, RunMeta
-    from wlr_gym.hardware.commissioning.runner import DONE, Commissioning, content_of
+    from wlr_gym.data.format import RunMeta
+    from wlr_gym.hardware.commissioning.runner import Commissioning, content_of
+    from wlr_gym.hardware.config import load_hardware
 
     robot, hardware = options.load()
     named = _named(options, robot)
-    kept = _earlier(out / REPORT, named, tests)
+    earlier = _earlier(out / REPORT, named, tests, console)
+    copy = out / COPY
+    measured = load_hardware(copy).measured if earlier and copy.is_file() else None
     link, person = _robot(options, robot, hardware, ask)
-    meta = RunMeta(robot=robot.name, profile=Profile(), notes="wlr commission, on a stand")
+    meta = RunMeta(robot=robot.name, notes="wlr commission, on a stand")
     results: list[StandResult] = []
     with Commissioning(robot, hardware, link, person, out, meta) as commissioning:
         if faults := commissioning.faults():
@@ -129,16 +148,15 @@ def _commission(
             for reason in result.repeated:
                 console.print(f"{result.test}: made once more: {reason}")
             console.print(f"{result.test}: {result.state}{f': {result.reason}' if result.reason else ''}")
-            write_json(out / REPORT, [*kept, *(content_of(one) | {"robot": named} for one in results)])
+            write_json(out / REPORT, _together(earlier, [content_of(one) | {"robot": named} for one in results]))
     findings = [finding for result in results for finding in result.findings]
     if options.json:
         print_json([content_of(one) for one in results])
     else:
         _print_table(findings, console)
-    made = {result.test for result in results if result.state == DONE}
-    _print_end(findings, [test.name for test in tests if test.name not in made], console)
+    _print_end(findings, _untested(tests, results), console)
     if findings:
-        _save(options, out, findings, bool(kept), ask, console)
+        _save(options, out, findings, measured, ask, console)
     return OK if all(result.is_good for result in results) else FAILED
 
 
@@ -161,13 +179,13 @@ def _save(
     options: CommissionOptions,
     out: Path,
     findings: Iterable[StandFinding],
-    is_continued: bool,
+    earlier: Measured | None,
     ask: Callable[[str], str],
     console: Console,
 ) -> None:
     """Write the hardware file with what was measured: a copy in ``--out``, and, of a real robot, the file itself if wanted.
 
-    The copy keeps what an earlier session measured that this one continues.
+    The copy keeps what an ``earlier`` session measured that this one continues.
     """
     from wlr_gym.base.paths import find_config
     from wlr_gym.hardware.calibration import save_hardware
@@ -175,14 +193,13 @@ def _save(
     from wlr_gym.hardware.config import load_hardware
 
     source = find_config("hardware", options.hardware)
-    targets = [out / "hardware.yaml"]
-    earlier = load_hardware(targets[0]).measured if is_continued and targets[0].is_file() else None
-    changed = with_measurements(load_hardware(source), findings, earlier)  # what the file says, not ports of the command line
+    told = load_hardware(source)  # what the file says, not ports of the command line
+    changed = {out / COPY: with_measurements(told, findings, earlier)}
     is_own = options.hardware.endswith((".yaml", ".yml")) and not options.emulated
     if is_own and (options.yes or ask(f"Write the measured values into {source}? [y/N]").strip().lower() in ("y", "yes")):
-        targets.append(source)
-    for target in targets:
-        save_hardware(target, source, changed, "measured", "Measured on the robot by wlr commission: docs/commissioning.md.")
+        changed[source] = with_measurements(told, findings)
+    for target, content in changed.items():
+        save_hardware(target, source, content, "measured", "Measured on the robot by wlr commission: docs/commissioning.md.")
         console.print(f"written: {target}")
 
 
@@ -212,6 +229,15 @@ def _print_table(findings: Sequence[StandFinding], console: Console) -> None:
         console.print(
             f"{finding.where}, {finding.quantity.name}: {finding.quantity.doc}. {finding.quantity.remedy}", style="bold"
         )
+
+
+def _untested(tests: Sequence[StandTest], results: Sequence[StandResult]) -> list[str]:
+    """Return the tests that were not made, or not at every joint."""
+    from wlr_gym.hardware.commissioning.runner import DONE
+
+    done = {result.test for result in results if result.state == DONE}
+    partly = {result.test for result in results if result.findings}
+    return [f"{test.name} in part" if test.name in partly else test.name for test in tests if test.name not in done]
 
 
 def _print_end(findings: Sequence[StandFinding], untested: Sequence[str], console: Console) -> None:

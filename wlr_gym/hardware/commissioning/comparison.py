@@ -55,9 +55,12 @@ def compare(test: StandTest, measured: Sequence[Reading], expected: Sequence[Rea
 
 
 def with_measurements(hardware: Hardware, findings: Iterable[StandFinding], earlier: Measured | None = None) -> Hardware:
-    """Return the hardware with what was measured; values that were not measured now stay, its own and ``earlier`` ones."""
-    told = (hardware.measured, earlier or Measured())
-    kept = {name: {**getattr(told[0], name), **getattr(told[1], name)} for name in Measured.model_fields}
+    """Return the hardware with what was measured; values that were not stay, its own or ``earlier`` ones: the later of two."""
+    kept = {name: dict(getattr(hardware.measured, name)) for name in Measured.model_fields}
+    for name, values in kept.items():
+        for where, value in getattr(earlier or Measured(), name).items():
+            if where not in values or value.date >= values[where].date:
+                values[where] = value
     today = datetime.datetime.now().astimezone().date().isoformat()
     for one in findings:
         if one.quantity.name in kept:

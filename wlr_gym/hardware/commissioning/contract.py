@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from wlr_gym.hardware.commissioning.errors import TroubleError
 from wlr_gym.hardware.commissioning.person import Person
 from wlr_gym.hardware.commissioning.stand import Stand
 
@@ -45,6 +46,14 @@ class Reading:
     value: float
 
 
+class PartlyError(TroubleError):
+    """A test could not be made at some joints; ``readings`` are of the others."""
+
+    def __init__(self, message: str, readings: Sequence[Reading]) -> None:
+        super().__init__(message)
+        self.readings: list[Reading] = list(readings)
+
+
 @dataclass(frozen=True)
 class StandTest:
     """A test of a robot on a stand.
@@ -55,7 +64,8 @@ class StandTest:
         asks: what the person has to do; empty = keep hands off.
         moves: what will move, for the question before the test.
         quantities: what it measures.
-        measure: does it; torque may be on when it returns or fails: who calls switches off.
+        measure: does it; torque may be on when it returns or fails: who calls switches off. Raises
+            :class:`PartlyError` with the readings it has where it could not be made at some joints.
     """
 
     name: str

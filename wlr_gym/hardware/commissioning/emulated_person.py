@@ -27,7 +27,7 @@ class EmulatedPerson:
         """Tilt the body; it is there in about 2 s."""
         self._stand.tilt(**angles)
 
-    def brake(self, joint: str) -> None:
+    def brake(self, joint: str, trouble: str = "") -> None:
         """Hold it."""
         self._stand.brake(joint)
 

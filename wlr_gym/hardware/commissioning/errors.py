@@ -11,6 +11,10 @@ class TrippedError(TroubleError):
     """The Bus Watchdog stopped a motor that a test drives: what was measured says nothing about the servo."""
 
 
+class SlippedError(TroubleError):
+    """A joint that was to be held gave way."""
+
+
 class SkippedError(Exception):
     """The person does not want this test."""
 

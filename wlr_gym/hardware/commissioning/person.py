@@ -29,8 +29,8 @@ class Person(Protocol):
         """Begin to turn the body to ``roll``, ``pitch`` or ``yaw`` (rad), be there within ``seconds``; none = level again."""
         ...
 
-    def brake(self, joint: str) -> None:
-        """Hold a wheel or a leg so that it does not turn, until :meth:`release`."""
+    def brake(self, joint: str, trouble: str = "") -> None:
+        """Hold a wheel or a leg so that it does not turn, until :meth:`release`; ``trouble``: why it is asked for again."""
         ...
 
     def release(self, joint: str) -> None:
@@ -88,12 +88,12 @@ class TerminalPerson:
         way = " and ".join(ways) or "level, as it was before"
         self._answer(f"Robot: press Enter, then turn it {way}, smoothly within {seconds:g} s, and keep it still there.")
 
-    def brake(self, joint: str) -> None:
+    def brake(self, joint: str, trouble: str = "") -> None:
         """Ask for a hand on a wheel, or at a leg's end."""
         where = "the tyre firmly, away from gears and leg; watch the supply"
         if joint in LEGS:
             where = "its end firmly, away from the hip; it will push to the back"
-        self._answer(f"{full_name(joint)}: hold {where}. Then Enter.")
+        self._answer(f"{trouble}{full_name(joint)}: hold {where}. Then Enter.")
 
     def release(self, joint: str) -> None:
         """Say that it may be let go."""

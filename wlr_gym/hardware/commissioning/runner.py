@@ -15,7 +15,7 @@ from wlr_gym.data.format import RunMeta
 from wlr_gym.data.record import next_run
 from wlr_gym.data.write import write_run
 from wlr_gym.hardware.commissioning.comparison import StandFinding, compare
-from wlr_gym.hardware.commissioning.contract import Reading, StandTest
+from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandTest
 from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
 from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TrippedError, TroubleError
 from wlr_gym.hardware.commissioning.person import Person
@@ -48,7 +48,7 @@ class StandResult:
         test: name.
         state: one of :data:`DONE`, :data:`SKIPPED`, :data:`FAILED`, :data:`STOPPED` (nothing follows).
         reason: why it is not done.
-        findings: what was measured, and what was expected.
+        findings: what was measured, and what was expected; of a failed test, where it could be made.
         run: name of its measured run; empty = it has no rows.
         repeated: why it was begun anew, once for each time.
     """
@@ -158,6 +158,8 @@ class Commissioning:
         except PowerError as error:
             self._is_off = False
             state, reason = STOPPED, str(error)
+        except PartlyError as error:
+            state, reason, readings = FAILED, str(error), error.readings
         except _TROUBLE as error:
             state, reason = FAILED, str(error)
         expected: list[Reading] = []
@@ -167,7 +169,9 @@ class Commissioning:
             state, reason, readings = STOPPED, str(asked) or "asked to", []
         findings = tuple(compare(test, readings, expected))
         result = StandResult(test.name, state, reason, findings, self._log_run(), repeated)
-        write_json(self._folder / f"{test.name}.json", content_of(result) | {"samples": self._stand.samples})
+        path = self._folder / f"{test.name}.json"
+        if state != STOPPED or not path.exists():  # what an earlier session measured is not lost for a test that was not made
+            write_json(path, content_of(result) | {"samples": self._stand.samples})
         return result
 
     def _log_run(self) -> str:
@@ -185,7 +189,7 @@ def run_test(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
     """Make a test and switch every motor off, whatever happens; signals end it in good order.
 
     Raises:
-        TroubleError, NoAnswerError, RefusedError, ConnectionError, InputError: it could not be made.
+        TroubleError, NoAnswerError, RefusedError, ConnectionError, InputError: it could not be made, or (PartlyError) in part.
         QuitError: somebody asked for a stop.
         PowerError: torque is not confirmed off.
     """

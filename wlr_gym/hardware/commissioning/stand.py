@@ -74,7 +74,7 @@ class Stand:
         self._next = 0.0
         self._silent = self._blocked = 0
         self._armed: set[str] = set()
-        self._is_on = False
+        self._on: set[str] = set()
         stall = robot.servo.leg.stall_torque, robot.servo.wheel.stall_torque
         self._stall = np.repeat(stall, 4)
         self._last = np.zeros(3 * len(JOINTS))
@@ -117,7 +117,7 @@ class Stand:
         Raises:
             QuitError: somebody asked for a stop.
         """
-        if self._is_on:
+        if self._on:
             self.sign_of_life(max(0.0, moment - self.clock.now()) + LONGEST_BUSY)
         self.clock.wait_until(moment)
         if asked := self.operator.take():
@@ -206,7 +206,7 @@ class Stand:
     def switch_on(self, joints: Iterable[str]) -> None:
         """Switch torque on and arm the watchdogs; the servos' registers say what happens then."""
         joints = list(joints)
-        self._is_on = True
+        self._on.update(joints)
         self.sign_of_life(LONGEST_BUSY)
         for joint in joints:
             k = JOINTS.index(joint)
@@ -217,13 +217,19 @@ class Stand:
             self.servos.set(joint, "bus_watchdog", watchdog_count(self.hardware.safety.watchdog))
 
     def switch_off(self, joints: Iterable[str]) -> None:
-        """Switch single motors off, and disarm their watchdogs; what they are to do stays in their registers."""
+        """Switch single motors off, and disarm their watchdogs; what they are to do stays in their registers.
+
+        With the last one the promise of a next sign of life ends: a person may take as long as he likes.
+        """
         self.check_watchdogs()
         for joint in joints:
             self.servos.set(joint, "torque_enable", 0)
             self.servos.set(joint, "bus_watchdog", 0)
             self._armed.discard(joint)
+            self._on.discard(joint)
             self._setpoints[JOINTS.index(joint)] = np.nan
+        if not self._on:
+            self.sign_of_life(math.inf)
 
     def _goal(self, joint: str) -> float:
         """Return the setpoint a servo holds, rad or rad/s."""
@@ -316,7 +322,7 @@ class Stand:
                 if joint not in left:
                     servos.set(joint, "bus_watchdog", 0)
             self.prepare([joint for joint in JOINTS if joint not in left])
-        self._is_on = False
+        self._on.clear()
         self.sign_of_life(math.inf)
         return left
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.hardware.commissioning.contract import Reading, StandQuantity, StandTest
-from wlr_gym.hardware.commissioning.errors import TroubleError
+from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandQuantity, StandTest
+from wlr_gym.hardware.commissioning.errors import SlippedError, TroubleError
 from wlr_gym.hardware.commissioning.person import Person
 from wlr_gym.hardware.commissioning.stand import LARGEST_LEAN, LOW_PWM, PERIOD, Stand
 from wlr_gym.robot import JOINTS, LEGS, WHEEL_SLICE, WHEELS
@@ -108,14 +108,14 @@ def _measure_load(stand: Stand, person: Person) -> list[Reading]:
         stand.samples |= {f"load_{wheel}": loads[:, k].tolist(), f"pwm_{wheel}": pwms[:, k].tolist()}
         slope = float(np.polyfit(pwms[:, k], loads[:, k], 1)[0])
         found += [Reading("load_per_pwm", wheel, slope), Reading("running_load", wheel, float(loads[:, k].mean()))]
-    stand.switch_off(WHEELS)  # before the legs are prepared: on a slow line that takes longer than the watchdogs wait
-    stand.prepare(LEGS)
+    stand.switch_off(WHEELS)  # before legs are prepared: on a slow line that takes longer than the watchdogs wait
     return found + [Reading("running_load", leg, _leg_load(stand, leg)) for leg in LEGS]
 
 
 def _leg_load(stand: Stand, leg: str) -> float:
     """Return the mean load of a free leg on a slow way, part of stall torque: a weak motor needs more for the same friction."""
     k = JOINTS.index(leg)
+    stand.prepare([leg])
     stand.slow(leg, _LEG_SPEED)
     stand.switch_on([leg])
     start = stand.step().position[k]
@@ -156,16 +156,38 @@ LOAD = StandTest(
 
 
 def _measure_stall(stand: Stand, person: Person) -> list[Reading]:
-    stand.prepare(JOINTS)
-    found = []
+    found: list[Reading] = []
+    slipped = []
     for joint in (*WHEELS, *LEGS):
-        found += _stall(stand, person, joint)
+        try:
+            found += _stall(stand, person, joint)
+        except SlippedError as error:
+            slipped.append(str(error))
+        person.release(joint)
+    if slipped:
+        raise PartlyError(f"not measured: {'; '.join(slipped)}", found)
     return found
 
 
 def _stall(stand: Stand, person: Person, joint: str) -> list[Reading]:
+    """Return what a held joint shows; a person may let it slip once."""
+    try:
+        found, share = _pull(stand, person, joint)
+    except SlippedError as error:
+        found, share = _pull(stand, person, joint, f"{error}. Once more. ")
+    current = person.supply_current() if joint in WHEELS else None  # legs measure theirs: it is their load
+    return found if current is None else [*found, Reading("stall_current", joint, current / share)]
+
+
+def _pull(stand: Stand, person: Person, joint: str, trouble: str = "") -> tuple[list[Reading], float]:
+    """Return the readings of a joint that a person holds, and what part of the stall current the supply gives meanwhile.
+
+    Raises:
+        SlippedError: it gave way.
+    """
     k = JOINTS.index(joint)
-    person.brake(joint)
+    person.brake(joint, trouble)
+    stand.prepare([joint])  # now: a hand may have moved it
     asked = stand.weaken(joint)
     stand.switch_on([joint])
     start = stand.step().position[k]
@@ -181,14 +203,10 @@ def _stall(stand: Stand, person: Person, joint: str) -> list[Reading]:
     stand.switch_off([joint])
     speed, way = float(np.mean([readings.velocity[k] for readings in rows])), rows[-1].position[k] - start
     if abs(speed) > _HELD_SPEED or (joint in LEGS and abs(way) > _HELD_WAY):
-        raise TroubleError(f"{joint} turned by {way:.2f} rad, in the end at {speed:.2f} rad/s: hold it firmly")
+        raise SlippedError(f"{joint} turned by {way:.2f} rad, in the end at {speed:.2f} rad/s: hold it firmly")
     load = float(np.mean([stand.load(readings.effort)[k] for readings in rows]))
     found = [Reading("stall_pwm", joint, pwm / asked), Reading("stall_load", joint, load / (pwm * supply))]
-    current = person.supply_current() if joint in WHEELS else None  # legs measure theirs: it is their load
-    person.release(joint)
-    if current is not None:
-        found.append(Reading("stall_current", joint, current / (pwm * pwm * supply)))
-    return found
+    return found, pwm * pwm * supply
 
 
 STALL = StandTest(
