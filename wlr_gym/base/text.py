@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from wlr_gym.base.errors import InputError
 
@@ -26,6 +26,11 @@ def duration(seconds: float) -> str:
 def counted(count: int, word: str) -> str:
     """Return ``1 trial``, ``2 trials``."""
     return f"{count} {word}{'' if count == 1 else 's'}"
+
+
+def tally(values: Mapping[str, object]) -> str:
+    """Return ``backlash 3, tether 1``."""
+    return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
 def pairs(what: str, words: Iterable[str], example: str) -> dict[str, str]:

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import refuse_existing, write_json
+from wlr_gym.base.text import tally
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, ray_address
 from wlr_gym.cli.progress import progress
@@ -259,7 +260,7 @@ def _measure(name: str, size: Size) -> Any:
 
 
 def _machine_line(found: dict[str, Any]) -> str:
-    packages = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    packages = tally(found["versions"])
     return f"{found['processor']}, {found['cores']} cores, {found['system']}; {packages}"
 
 

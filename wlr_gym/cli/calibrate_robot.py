@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.text import tally
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
@@ -105,7 +106,7 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
     with _dialogue():
         found = find_servos(name, bus.port, likely) or find_servos(name, bus.port, others)
     servo = check_new_servo(found, bus, options.joint)
-    registers = ", ".join(f"{item} {count}" for item, count in bus.eeprom.items())
+    registers = tally(bus.eeprom)
     print(f"found: {servo}\n{options.joint} gets id {id}, {bus.baud_rate} bit/s, {registers}")
     try:
         if not _yes(ask, "Write it?"):

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from wlr_gym.base.errors import InputError, nearest, unknown_name
+from wlr_gym.base.seeds import require_seed
 
 #: Columns of a help text.
 WIDTH = 80
@@ -26,8 +27,6 @@ WIDTH = 80
 _WRITTEN = {int: "INT", float: "FLOAT", str: "STR", Path: "PATH"}
 _EXPECTED = {int: "a whole number", float: "a number", str: "a value", Path: "a path"}
 _HELP = ("-h", "--help")
-#: Largest ``--seed``: every library that a command seeds takes it.
-LARGEST_SEED = 2**32 - 1
 #: Shells that commands and options are completed in.
 SHELLS = ("bash", "zsh", "fish")
 
@@ -52,9 +51,8 @@ def parse(kind: type, program: str, arguments: Sequence[str], description: str) 
         print(_wrapped(shown.getvalue()), end="")
         raise
     for name in ("seed", "noise_seed"):
-        seed = getattr(found, name, None)
-        if seed is not None and not 0 <= seed <= LARGEST_SEED:
-            raise InputError(f"--{name.replace('_', '-')} {seed}: expected 0 to {LARGEST_SEED}")
+        if (seed := getattr(found, name, None)) is not None:
+            require_seed(f"--{name.replace('_', '-')}", seed)
     return found
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.base.text import pairs
-from wlr_gym.cli.parsing import LARGEST_SEED
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -76,12 +76,12 @@ class HardwareOption:
         """
         camera = self.camera_file()
         if self.emulated:
-            from wlr_gym.hardware.emulator import Machine
+            from wlr_gym.hardware.emulator import Machine, MachineOptions
             from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot, with_flow_port
 
             hardware = with_flow_port(robot, hardware)
             if patch is None:
-                return emulated_link(Machine(robot, hardware), camera)
+                return emulated_link(Machine(robot, hardware, MachineOptions(seed=seed)), camera)
             return emulated_robot(robot, hardware, patch, camera=camera, seed=seed)
         from wlr_gym.hardware.link import serial_link
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file
+from wlr_gym.base.seeds import LARGEST_NOISE_SEED, require_seed
 from wlr_gym.data.compared_plants import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
@@ -133,8 +134,7 @@ def record_simulation(
     """
     if backend not in SIMULATORS:
         raise InputError(f"backend '{backend}' is no simulator; expected {', '.join(SIMULATORS)}")
-    if not 0 <= seed < 2**64:
-        raise InputError(f"seed = {seed}: expected 0 to {2**64 - 1}")
+    require_seed("seed =", seed, LARGEST_NOISE_SEED)
     patch = patch or load_patch(None)
     parameters = apply_patch(patch, profile_parameters(Parameters.nominal(robot), motion.profile))
     options, seeds = PlantOptions(control_period=motion.period), np.array([seed], np.uint64)

@@ -11,6 +11,7 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_text
+from wlr_gym.base.text import tally
 from wlr_gym.policy.file import needs_camera
 from wlr_gym.policy.onnx_file import open_policy
 
@@ -78,7 +79,7 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
     if "command" in training:
         facts["trained with"] = f"`{training['command']}`"
     facts["training"] = ", ".join(_training(content["agent"], training, config))
-    facts["versions"] = ", ".join(f"{name} {version}" for name, version in content.get("versions", {}).items())
+    facts["versions"] = tally(content.get("versions", {}))
     if "exported" in content:
         parity = content["exported"]["parity"]
         largest = max(parity["random"], parity["real"])
@@ -89,7 +90,7 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
 def _terms(columns: list[Mapping[str, Any]]) -> str:
     """``command 2, gyro 3``: the terms in their order, with how many numbers each has."""
     counts = Counter(column["name"].partition("[")[0] for column in columns)
-    return ", ".join(f"{term} {count}" for term, count in counts.items())
+    return tally(counts)
 
 
 def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("torch")
 pytest.importorskip("dynamixel_sdk")
@@ -217,6 +218,33 @@ def test_the_better_of_two_trainings_goes_on_and_is_trained_again_where_it_is_st
         assert record.command.endswith(str(tmp_path / "training_again"))
         monkeypatch.setattr(retraining, "_takes_rewards", lambda policy: False)
         assert "nothing was changed" in retraining.train_supervised(progress, found, ROBOT).said[-1]
+
+
+def test_the_other_training_of_the_largest_seed_has_the_smallest(tmp_path, monkeypatch):
+    seeds = []
+    monkeypatch.setattr(
+        retraining, "train", lambda environment, folder, config, **_: seeds.append(yaml.safe_load(config.read_text()))
+    )
+    progress = Progress(tmp_path, asked(seed=2**32 - 1))
+    for further in (0, 1):
+        folder = tmp_path / f"{further}"
+        retraining.train_in(progress, folder, tmp_path / "config.yaml", uncertainty.Family("training", {}), further=further)
+    assert [settings["seed"] for settings in seeds] == [2**32 - 1, 0]
+
+
+def test_a_step_of_the_acceptance_test_tells_how_far_it_is(tmp_path, monkeypatch):
+    told = []
+
+    def compare(new, old, asked, family, own, threads):
+        return Acceptance(new, asked.environment, 8, 1, (), 5.0, "", (Loss(family.name, old, 0.2, 0.3, -2.0, -1.0),))
+
+    monkeypatch.setattr(retraining, "compare_on", compare)
+    monkeypatch.setattr(retraining, "export_trained", lambda progress: "new")
+    monkeypatch.setattr(retraining, "watched", lambda progress, found, own, policy: episodes(5))
+    families = tuple(uncertainty.Family(name, {}) for name in ("as stated", "other floors"))
+    found = uncertainty.Uncertainty(Patch(), families[0], families, ())
+    retraining.accept_policy(Progress(tmp_path, asked(), lambda text, share: told.append((text, share))), found, ROBOT)
+    assert told == [("acceptance: as stated", 0.0), ("acceptance: other floors", 0.5)]
 
 
 def test_rewards_come_beside_those_of_the_recipe():

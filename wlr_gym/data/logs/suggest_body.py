@@ -222,6 +222,11 @@ def upward_axis(look: LogSignals) -> str | None:
     if not look.has("acc_x", "acc_y", "acc_z"):
         return None
     mean, _, g = _gravity(look)
+    return _pointing_up(mean, g)
+
+
+def _pointing_up(mean: Array, g: float) -> str | None:
+    """Return the axis along which readings (3,) that are so many g long show gravity; None where none clearly does."""
     axis = int(np.argmax(np.abs(mean)))
     if abs(g - 1.0) > _GRAVITY_SHARE or abs(mean[axis]) < _ALONG * np.linalg.norm(mean):
         return None
@@ -243,8 +248,8 @@ def _upward(look: LogSignals, units: dict[str, str]) -> str | None:
     """Return the accelerometer's axis that reads +g at rest; its unit by g."""
     if not look.has("acc_x", "acc_y", "acc_z"):
         return None
-    _, units["acc"], g = _gravity(look)
-    up = upward_axis(look)
+    mean, units["acc"], g = _gravity(look)
+    up = _pointing_up(mean, g)
     where = f"along its {up}" if up else "along none of its axes as gravity would be: which one points up is not decided"
     text = f"topic '{look.chosen['acc_x'].topic}', in {units['acc']}: reads {g:.3f} g in the median, {where}"
     look.note("acc", SURE if up else GUESS, text)

@@ -131,9 +131,9 @@ def _leg_load(stand: Stand, leg: str) -> float:
 
 def _require_speed(asked: float, reached: NDArray[np.float64]) -> None:
     """Raise :class:`TroubleError` where wheels are not at their speed: what they load then says nothing."""
-    slow = [f"{wheel} turns at {speed:.2f}" for wheel, speed in zip(WHEELS, reached, strict=True)]
-    slow = [text for text, speed in zip(slow, reached, strict=True) if abs(speed - asked) > _OFF_SPEED * asked]
-    if slow:
+    off = [(wheel, speed) for wheel, speed in zip(WHEELS, reached, strict=True) if abs(speed - asked) > _OFF_SPEED * asked]
+    if off:
+        slow = [f"{wheel} turns at {speed:.2f}" for wheel, speed in off]
         raise TroubleError(f"{', '.join(slow)} rad/s after {_EVEN:g} s, expected {asked:g} within {_OFF_SPEED:.0%}: {_WEAK}")
 
 
@@ -195,7 +195,7 @@ def _pull(stand: Stand, person: Person, joint: str, trouble: str = "") -> tuple[
         stand.lean(joint, LARGEST_LEAN)
     else:
         stand.spin({joint: 2.0})
-    stand.run(_HELD_TIME - _HELD_ROWS * 0.02)
+    stand.run(_HELD_TIME - _HELD_ROWS * PERIOD)
     rows = [stand.step() for _ in range(_HELD_ROWS)]
     person.watch_supply()
     pwm = float(abs(np.nanmean([stand.pwm()[k] for _ in range(_ROWS)])))

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import check_same_request, make_output_folder, resumes, write_json
+from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.base.settings import SettingsModel, parse_config
 
 STATE_FILE = "state.json"
@@ -61,7 +62,7 @@ class Asked(SettingsModel):
     learning_rate: float = Field(default=5e-4, gt=0)
     episodes: int = Field(default=256, ge=8)
     sensors: tuple[str, ...] = ()
-    seed: int = Field(default=0, ge=0, lt=2**32)
+    seed: int = Field(default=0, ge=0, le=LARGEST_SEED)
 
 
 class AdaptStep(SettingsModel):

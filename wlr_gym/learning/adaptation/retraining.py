@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
+from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
 from wlr_gym.learning.adaptation.supervised import more_often, stopped_episodes
@@ -46,8 +47,8 @@ _SCORES = 4
 #: Name of the settings of the training.
 SETTINGS_FILE = "training.yaml"
 TRAINING, OTHER, AGAIN = "training", "training_other", "training_again"
-#: Which of the first two trainings is gone on with, and the simulated errors of both.
-CHOICE_FILE = "chosen.json"
+#: Folder of what both policies do on simulated robots.
+ACCEPTANCE = "acceptance"
 #: Name of the policy that is kept, where it is the new one.
 POLICY_FILE = "policy.onnx"
 #: Robots, and s of their episodes, on whose observations the file is compared with the policy.
@@ -125,7 +126,8 @@ def train_in(
     if (folder / CONFIG_FILE).is_file():
         resume_training(folder, on_update=on_update)
         return
-    sizes: dict[str, Any] = {"steps": asked.steps, "rate": asked.learning_rate, "seed": asked.seed + further}
+    seed = (asked.seed + further) % (LARGEST_SEED + 1)
+    sizes: dict[str, Any] = {"steps": asked.steps, "rate": asked.learning_rate, "seed": seed}
     settings = training_settings(asked.policy, family, **sizes, sensors=asked.sensors, rewards=rewards)
     write_yaml(config, settings)
     train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
@@ -166,26 +168,23 @@ def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> Adap
 def _train_twice(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
     """Train on with two seeds, whose errors may differ by a quarter; the better on simulated robots with the fault goes on."""
     record = train_on(progress, found)
-    if not (progress.out / CHOICE_FILE).is_file():
-        train_in(progress, progress.out / OTHER, progress.folder("model") / f"{OTHER}.yaml", found.training, further=1)
-        policies = {name: str(progress.out / name / "policy") for name in (TRAINING, OTHER)}
-        losses = {name: tested(progress, new, found.families[0], own).losses for name, new in policies.items()}
-        write_json(progress.out / CHOICE_FILE, {name: float(loss[0].error) for name, loss in losses.items()})
-    errors = _choice(progress)
-    sizes = " and ".join(f"{one:.3f}" for one in errors.values())
+    train_in(progress, progress.out / OTHER, progress.folder("model") / f"{OTHER}.yaml", found.training, further=1)
+    for name in (TRAINING, OTHER):
+        acceptance_on(progress, str(progress.out / name / "policy"), found.families[0], own)
+    sizes = " and ".join(f"{one:.3f}" for one in _errors(progress).values())
     said = f"Trained twice: tracking error {sizes} on simulated robots with the fault as found; the better one goes on."
     return record.model_copy(update={"said": (*record.said, said)})
 
 
 def _better(progress: Progress) -> str:
-    errors = _choice(progress) or {TRAINING: 0.0}
+    errors = _errors(progress) or {TRAINING: 0.0}
     return str(progress.out / min(errors, key=lambda name: errors[name]) / "policy")
 
 
-def _choice(progress: Progress) -> dict[str, float]:
-    """Return the simulated tracking error of each training; empty: there was one."""
-    path = progress.out / CHOICE_FILE
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+def _errors(progress: Progress) -> dict[str, float]:
+    """Return the tracking error on simulated robots with the fault as found of each training that was tested there."""
+    files = {name: _test_file(progress, name, STATED) for name in (TRAINING, OTHER)}
+    return {name: read_acceptance(file).losses[0].error for name, file in files.items() if file.is_file()}
 
 
 def _takes_rewards(policy: str) -> bool:
@@ -202,7 +201,7 @@ def watched(progress: Progress, found: Uncertainty, own: Robot, policy: str) -> 
     """Return in which simulated episodes (N,) the supervision would stop a robot as the result states it; kept in a file."""
     asked, family = progress.asked, found.families[0]
     name = "old" if policy == asked.policy else Path(policy).parent.name
-    path = progress.folder("acceptance") / f"stopped_{name}.json"
+    path = progress.folder(ACCEPTANCE) / f"stopped_{name}.json"
     if not path.is_file():
         keywords = {"randomization": dict(family.randomization), "effects": list(family.effects) or None, "robot": own}
         keywords |= {"precision": "float32", "episode_length": WATCHED_SECONDS, **having(asked.sensors)}
@@ -235,7 +234,7 @@ def export_trained(progress: Progress) -> str:
 def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
     """Test the trained policy against the old one over all that the result leaves open; ``policy`` is the one that is kept."""
     asked, new = progress.asked, trained_policy(progress)
-    tests = [tested(progress, new, family, own) for family in found.families]
+    tests = [acceptance_on(progress, new, family, own, k / len(found.families)) for k, family in enumerate(found.families)]
     losses = tuple(loss for test in tests for loss in test.losses)
     worse = [loss for loss in losses if not loss.bound <= LARGEST_LOSS]
     better = next(loss for loss in losses if loss.floors == STATED).bound < 0.0
@@ -264,13 +263,18 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
     return AdaptStep(said=(verdict,), command=command, numbers=numbers)
 
 
-def tested(progress: Progress, new: str, family: Family, own: Robot) -> Acceptance:
-    """Return how a new policy does against the old one on the robots of a family; kept in a file."""
-    path = progress.folder("acceptance") / f"{Path(new).parent.name}_{family.name.replace(' ', '_')}.json"
+def acceptance_on(progress: Progress, new: str, family: Family, own: Robot, share: float = 0.0) -> Acceptance:
+    """Return how a new policy does against the old one on the robots of a family; kept in a file. ``share``: of the step."""
+    path = _test_file(progress, Path(new).parent.name, family.name)
     if not path.is_file():
-        progress.tell(f"acceptance: {family.name}", 0.0)
+        progress.folder(ACCEPTANCE)
+        progress.tell(f"acceptance: {family.name}", share)
         write_acceptance(path, compare_on(new, progress.asked.policy, progress.asked, family, own, progress.threads))
     return read_acceptance(path)
+
+
+def _test_file(progress: Progress, training: str, family: str) -> Path:
+    return progress.out / ACCEPTANCE / f"{training}_{family.replace(' ', '_')}.json"
 
 
 def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.seeds import require_seed
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings
@@ -87,8 +88,7 @@ def evaluate(
     for name, given in (("baselines", baselines), ("sweeps", sweeps)):
         if isinstance(given, str):
             raise InputError(f"{name} = {given!r}: expected a list of names, such as [{given!r}]")
-    if not 0 <= seed < 2**63:
-        raise InputError(f"seed = {seed}: expected 0 to {2**63 - 1}")
+    require_seed("seed =", seed, 2**63 - 1)
     subject = read_subjects([policy])[0]
     environment = env_id or trained_environment(subject.sources[0]) or "WLR-Velocity-v0"
     task = task_name_of(environment)

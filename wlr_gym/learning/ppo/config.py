@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
+from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.base.settings import SettingsModel
 from wlr_gym.robot import LEGS, WHEELS
 
@@ -43,7 +44,7 @@ class PpoConfig(SettingsModel):
         tasks: task name -> settings that differ there (``load_agent_config`` lays them over the others).
     """
 
-    seed: int = Field(0, ge=0, lt=2**32)
+    seed: int = Field(0, ge=0, le=LARGEST_SEED)
     total_steps: int = Field(5_000_000, gt=0)
     schedule_steps: int | None = Field(None, gt=0)
     num_envs: int = Field(512, gt=0)

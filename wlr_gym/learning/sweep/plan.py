@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml
 from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.learning.training import settings_of, with_robot
@@ -86,7 +87,7 @@ class SearchPlan(SettingsModel):
     seed: int = Field(0, ge=0)
 
 
-Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
 
 
 class SweepPlan(SettingsModel):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.seeds import LARGEST_NOISE_SEED, require_seed
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,7 @@ class RobotOptions:
     def __post_init__(self) -> None:
         if self.effects and not self.emulated:
             raise InputError("effects: a real robot has its own; they are for simulators and the emulated robot")
-        if not 0 <= self.seed < 2**64:
-            raise InputError(f"seed {self.seed}: expected 0 to {2**64 - 1}")
+        require_seed("seed", self.seed, LARGEST_NOISE_SEED)
 
 
 def read_robot_options(given: object) -> RobotOptions:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.text import tally
 from wlr_gym.learning.adaptation.driving import paired
 from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
 from wlr_gym.studies.bench.adapt_study import CONTENDERS, HELPS
@@ -51,8 +52,7 @@ def markdown(lines: Sequence[Line]) -> str:
     header = ["case", "shared law", *(f"{CONTENDERS[name]}" for name in CONTENDERS), "found", "kept", "regained (%)"]
     header += ["driven for it (s)", "took (min)"]
     rows = [_row(name, case) for name, case in table.items()]
-    commits = Counter(line["commit"] for line in lines)
-    text = [f"Contenders driven by commit: {', '.join(f'{name} {count}' for name, count in commits.items())}.", ""]
+    text = [f"Contenders driven by commit: {tally(Counter(line['commit'] for line in lines))}.", ""]
     text += ["| " + " | ".join(header) + " |", "|" + "---|" * len(header), *("| " + " | ".join(row) + " |" for row in rows)]
     return "\n".join([*text, "", *summary(table), ""])
 

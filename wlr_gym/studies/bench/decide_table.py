@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from wlr_gym.base.text import tally
 from wlr_gym.studies.bench.blind.score import FAILED, at_least, at_most
 from wlr_gym.studies.bench.decide_study import CONTENDERS
 
@@ -17,8 +18,7 @@ Line = Mapping[str, Any]
 def markdown(lines: Sequence[Line]) -> str:
     """Return how often each contender decided rightly after how much driving, pairs of contenders, and every case."""
     taking_part = [name for name in CONTENDERS if any(one["contender"] == name for one in lines)]
-    commits = Counter(one["commit"] for one in lines)
-    text = [f"Robots analysed by commit: {', '.join(f'{name} {count}' for name, count in commits.items())}.", ""]
+    text = [f"Robots analysed by commit: {tally(Counter(one['commit'] for one in lines))}.", ""]
     text += [
         "| drives | decided rightly, of robots with an effect | wrongly | failed | driving per right decision |"
         " nothing hidden: rightly | false alarms |",

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from wlr_gym.base.text import tally
+
 #: Whether a target is reached: ``not shown`` is a value that reaches it with a 95 % bound that does not; empty: no target.
 Met = Literal["yes", "no", "not shown", ""]
 
@@ -119,7 +121,7 @@ def _confidence(numbers: Mapping[str, Any]) -> ScoreLine:
 
 def markdown(report: Mapping[str, Any]) -> str:
     """Return the report as Markdown tables: numbers beside targets, severities, confusion matrix."""
-    rows = [f"Sets analysed by commit: {', '.join(f'{commit} {sets}' for commit, sets in report['commits'].items())}.", ""]
+    rows = [f"Sets analysed by commit: {tally(report['commits'])}.", ""]
     rows += ["| | measured (95 % bound) | target | met |", "|---|---|---|---|"]
     rows += [f"| {line.what} | {line.value} | {line.target} | {line.met} |" for line in lines(report)]
     rows += ["", "| severity | sets | found | right name first | in the set |", "|---|---|---|---|---|"]
@@ -133,5 +135,5 @@ def markdown(report: Mapping[str, Any]) -> str:
     rows += ["| hidden | what the results say |", "|---|---|"]
     for hidden, said in sorted(report["confusion"].items()):
         ordered = sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0]))
-        rows.append(f"| {hidden} | {', '.join(f'{name} {count}' for name, count in ordered)} |")
+        rows.append(f"| {hidden} | {tally(dict(ordered))} |")
     return "\n".join(rows) + "\n"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -252,9 +252,9 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
     by_severity = {}
     for severity in severities:
         chosen = [pair for pair in pairs if pair[0]["severity"] == severity]
-        hits = {"found": [_alarm(r) for _, r in chosen], "top1": [_top(t, r) for t, r in chosen]}
-        hits["in_set"] = [_in_set(t, r) for t, r in chosen]
-        by_severity[str(severity)] = {key: _share(at_least, hit) for key, hit in hits.items()}
+        hits: dict[str, Callable[[Truth, Result], bool]]
+        hits = {"found": lambda _, result: _alarm(result), "top1": _top, "in_set": _in_set}
+        by_severity[str(severity)] = {key: _share(at_least, [hit(*pair) for pair in chosen]) for key, hit in hits.items()}
     matched = [match for truth, result in clear for match in _matched(truth, result)]
     shapes = [error for true, found in matched if (error := shape_error(true, found)) is not None]
     orders = [right for true, found in matched if (right := order_found(true, found)) is not None]
