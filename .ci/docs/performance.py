@@ -142,9 +142,9 @@ def write_readme(text: str, rows: list[Row]) -> str:
         wide, narrow = (f"{ratios[f'{precision}, {what}']:.0f}{TIMES}" for precision in ("float64", "float32"))
         cells.append(f"{what}: {wide} as fast (float64), {narrow} (float32)")
     command = "`wlr bench --only engine` ([performance](docs/performance.md))"
-    error = "rms error (distance from the engine's contact model) over ten motions"
-    what = f"engine against MuJoCo (float64), a batch of 320 robots against one, {error}"
-    head = f"{what}, core of an {engine[0]['measured']['processor']}"
+    error = "rms distance from the engine's contact model"
+    what = "engine against MuJoCo (float64), a batch of 320 robots against one"
+    head = f"{what}, core of an {engine[0]['measured']['processor']}; error: {error}"
     row = f"| {head} | {'; '.join(cells)} | {command} |"
     return re.sub(r"^\| engine against .*$", lambda _: row, text, flags=re.MULTILINE)
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
-from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
 from wlr_gym.learning.adaptation.supervised import more_often, stopped_episodes
@@ -46,7 +45,7 @@ WATCHED, WATCHED_SECONDS = 512, 10.0
 _SCORES = 4
 #: Name of the settings of the training.
 SETTINGS_FILE = "training.yaml"
-TRAINING, OTHER, AGAIN = "training", "training_other", "training_again"
+TRAINING, AGAIN = "training", "training_again"
 #: Folder of what both policies do on simulated robots.
 ACCEPTANCE = "acceptance"
 #: Name of the policy that is kept, where it is the new one.
@@ -102,19 +101,12 @@ def training_settings(
     }
 
 
-def train_in(
-    progress: Progress,
-    folder: Path,
-    config: Path,
-    family: Family,
-    rewards: Mapping[str, Any] | None = None,
-    further: int = 0,
-) -> None:
+def train_in(progress: Progress, folder: Path, config: Path, family: Family, rewards: Mapping[str, Any] | None = None) -> None:
     """Train on from the policy with a family, in ``folder``; an interrupted training resumes from its newest checkpoint.
 
     Args:
         progress: what was asked for. folder: of the run. config: file that the settings are written to.
-        family: what it trains with. rewards: terms beside those of the recipe. further: what is added to the seed.
+        family: what it trains with. rewards: terms beside those of the recipe.
     """
     asked = progress.asked
 
@@ -126,8 +118,7 @@ def train_in(
     if (folder / CONFIG_FILE).is_file():
         resume_training(folder, on_update=on_update)
         return
-    seed = (asked.seed + further) % (LARGEST_SEED + 1)
-    sizes: dict[str, Any] = {"steps": asked.steps, "rate": asked.learning_rate, "seed": seed}
+    sizes: dict[str, Any] = {"steps": asked.steps, "rate": asked.learning_rate, "seed": asked.seed}
     settings = training_settings(asked.policy, family, **sizes, sensors=asked.sensors, rewards=rewards)
     write_yaml(config, settings)
     train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
@@ -149,9 +140,9 @@ def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
 
 
 def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
-    """Train on twice and take the better; once more, wheels that stick being a cost, where the supervision would stop it."""
-    record = _train_twice(progress, found, own)
-    old, new = (watched(progress, found, own, policy) for policy in (progress.asked.policy, _better(progress)))
+    """Train on; once more, wheels that stick being a cost, where the supervision would stop the new policy more often."""
+    record, trained = train_on(progress, found), str(progress.out / TRAINING / "policy")
+    old, new = (watched(progress, found, own, policy) for policy in (progress.asked.policy, trained))
     if not more_often(new, old):
         return record
     shares = f"{new.mean():.0%} of episodes, and the old policy in {old.mean():.0%}"
@@ -163,28 +154,6 @@ def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> Adap
     said = f"The supervision would stop it in {shares}: trained once more, wheels that stick being a cost."
     command = _command(progress, config, progress.out / AGAIN)
     return record.model_copy(update={"said": (*record.said, said), "command": command})
-
-
-def _train_twice(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
-    """Train on with two seeds, whose errors may differ by a quarter; the better on simulated robots with the fault goes on."""
-    record = train_on(progress, found)
-    train_in(progress, progress.out / OTHER, progress.folder("model") / f"{OTHER}.yaml", found.training, further=1)
-    for name in (TRAINING, OTHER):
-        acceptance_on(progress, str(progress.out / name / "policy"), found.families[0], own)
-    sizes = " and ".join(f"{one:.3f}" for one in _errors(progress).values())
-    said = f"Trained twice: tracking error {sizes} on simulated robots with the fault as found; the better one goes on."
-    return record.model_copy(update={"said": (*record.said, said)})
-
-
-def _better(progress: Progress) -> str:
-    errors = _errors(progress) or {TRAINING: 0.0}
-    return str(progress.out / min(errors, key=lambda name: errors[name]) / "policy")
-
-
-def _errors(progress: Progress) -> dict[str, float]:
-    """Return the tracking error on simulated robots with the fault as found of each training that was tested there."""
-    files = {name: _test_file(progress, name, STATED) for name in (TRAINING, OTHER)}
-    return {name: read_acceptance(file).losses[0].error for name, file in files.items() if file.is_file()}
 
 
 def _takes_rewards(policy: str) -> bool:
@@ -211,9 +180,9 @@ def watched(progress: Progress, found: Uncertainty, own: Robot, policy: str) -> 
 
 
 def trained_policy(progress: Progress) -> str:
-    """Return the policy of the last training, or the better of two: that of its end, where the learning rate has fallen."""
+    """Return the policy of the last training: that of its end, where the learning rate has fallen."""
     again = progress.out / AGAIN / "policy"
-    return str(again) if again.is_dir() else _better(progress)
+    return str(again if again.is_dir() else progress.out / TRAINING / "policy")
 
 
 def export_trained(progress: Progress) -> str:
@@ -265,16 +234,11 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
 
 def acceptance_on(progress: Progress, new: str, family: Family, own: Robot, share: float = 0.0) -> Acceptance:
     """Return how a new policy does against the old one on the robots of a family; kept in a file. ``share``: of the step."""
-    path = _test_file(progress, Path(new).parent.name, family.name)
+    path = progress.folder(ACCEPTANCE) / f"{Path(new).parent.name}_{family.name.replace(' ', '_')}.json"
     if not path.is_file():
-        progress.folder(ACCEPTANCE)
         progress.tell(f"acceptance: {family.name}", share)
         write_acceptance(path, compare_on(new, progress.asked.policy, progress.asked, family, own, progress.threads))
     return read_acceptance(path)
-
-
-def _test_file(progress: Progress, training: str, family: str) -> Path:
-    return progress.out / ACCEPTANCE / f"{training}_{family.replace(' ', '_')}.json"
 
 
 def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:
