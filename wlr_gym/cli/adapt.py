@@ -67,7 +67,7 @@ class AdaptOptions(JsonOption, PatchOption, SensorsOption):
     """Episodes of the task before and after, each."""
     drive_seconds: float = 10.0
     """Length of such an episode."""
-    steps: int = 2_500_000
+    steps: int = 7_500_000
     """Environment steps of the training."""
     learning_rate: float = 5e-4
     """Its learning rate at the start."""

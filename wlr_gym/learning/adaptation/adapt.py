@@ -59,7 +59,7 @@ def adapt(
     budget_seconds: float | None = None,
     drives: int = 6,
     drive_seconds: float = 10.0,
-    steps: int = 2_500_000,
+    steps: int = 7_500_000,
     learning_rate: float = 5e-4,
     episodes: int = 256,
     sensors: Sequence[str] = (),

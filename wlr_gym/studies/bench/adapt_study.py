@@ -79,7 +79,7 @@ class AdaptStudy:
     cases: tuple[AdaptCase, ...]
     drives: int = 24
     seconds: float = 10.0
-    steps: int = 2_500_000
+    steps: int = 7_500_000
     episodes: int = 256
     excitations: tuple[str, ...] = ("straight", "turns", "stop_and_go", "posture")
     budget_runs: int = 1
