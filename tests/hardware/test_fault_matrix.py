@@ -146,11 +146,10 @@ def play(rig, phase, fault, seconds, struck):
     loop.operator.spare = None
     rig.swing = 0.0
     moving(rig, 0.3)
-    if phase == "running":
+    if phase in ("running", "stopping"):
         strike()
-    moving(rig, seconds)
-    if phase == "stopping":
-        strike()
+    if phase != "stopping":
+        moving(rig, seconds)
     loop.stop()
 
 

@@ -223,7 +223,7 @@ def test_an_emulated_servo_of_24_v_measures_its_supply():
     servo.shaft.voltage = 10.0  # of a 12 V battery
     servo.advance(0.01)
     assert servo["hardware_error_status"] == INPUT_VOLTAGE
-    servo.shaft.pwm = 0.5
+    servo.shaft.output = lambda: (0, 0.5)
     assert servo["present_pwm"] == round(0.5 * 885)
 
 
@@ -231,7 +231,7 @@ def test_an_emulated_servo_counts_as_its_file_says(tmp_path):
     table = load_table(str(own_servo(tmp_path, counts={"turn": 16384, "full_pwm": 2009})))
     servo = EmulatedServo("leg", table, {"operating_mode": 4})
     servo.shaft.position = 2.5 * math.pi
-    servo.shaft.pwm = -1.0
+    servo.shaft.output = lambda: (0, -1.0)
     assert servo["present_position"] == round(1.25 * 16384)
     assert servo["present_pwm"] == -2009
     write = table["goal_position"]

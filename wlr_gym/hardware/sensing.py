@@ -203,7 +203,7 @@ class Sensing:
 
 def is_far(readings: JointReadings, before: RobotStatus, possible: np.ndarray) -> Mask:
     """Return which joints (8,) say that they are further away from where they were than is possible (8,), rad."""
-    return readings.answered & (np.abs(np.nan_to_num(readings.position) - before.position) > possible)
+    return readings.answered & (np.abs(readings.position - before.position) > possible)
 
 
 def filled(readings: JointReadings, again: JointReadings, fill: Mask) -> JointReadings:

@@ -179,8 +179,9 @@ def encode_fast_status(answers: Sequence[Status]) -> list[bytes]:
     start = HEADER + bytes([BROADCAST]) + word(length) + bytes([Instruction.STATUS])
     for answer in answers:
         piece = start + bytes([answer.error, answer.id]) + answer.data
-        end = word(crc16(piece, crc))
-        crc = crc16(end, crc16(piece, crc))
+        crc = crc16(piece, crc)
+        end = word(crc)
+        crc = crc16(end, crc)
         pieces.append(piece + end)
         start = b""
     return pieces

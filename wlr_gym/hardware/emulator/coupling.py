@@ -89,7 +89,8 @@ class PlantCoupling:
         self._damping_factor = np.divide(self._damping, known, where=known > 0, out=np.ones(len(JOINTS)))
         leg, wheel = robot.servo.leg, robot.servo.wheel
         self._nominal_stall = np.where(_IS_LEG, leg.stall_torque, wheel.stall_torque)
-        self._nominal_line, self._nominal_winding = law.line_constants(robot), law.winding(robot)
+        self._nominal_line = law.line_constants(robot)
+        self._nominal_winding = np.stack(law.winding(robot), axis=1).tolist()
         self.nominal_supply: float = float(self._parameters["servo.supply_voltage"][0])
         self.supply: float = self.nominal_supply
         seeds = np.array([seed], np.uint64)
@@ -103,36 +104,42 @@ class PlantCoupling:
         self._reference = np.zeros((2, len(JOINTS)))  # of the emulator's own laws
         self._plant_reference: Array | None = None  # of the plant's, at this tick
         self._turned = np.zeros(len(JOINTS))  # rad by which wheels were turned beyond what the plant's encoders count
+        self._output: list[tuple[int, float]] | None = None  # of the motors, at this tick
         self._tuning: list[tuple[float, ...]] = [(-1.0,)] * len(JOINTS)
+        self._settled: list[MotorDrive | None] = [None] * len(JOINTS)  # what the plant does by itself from tick to tick
+        self._plant_supply = self._parameters["servo.supply_voltage"]
         for k, servo in enumerate(servos):
-            servo.shaft.reference = partial(self._reference_of, k)
+            servo.shaft.reference, servo.shaft.output = partial(self._reference_of, k), partial(self._output_of, k)
         self._show_sensors()
 
     def step(self) -> None:
         """Let the motors do for one tick what the firmware asks."""
         self._command_plant()
-        self.sensors = self.plant.step(self._setpoints, self._torque)
+        self.sensors = self.plant.step(self._setpoints, None if self._torque.all() else self._torque)
         self._plant_reference = None
         self._show_sensors()
 
     # ---- firmware to plant ----
 
     def _command_plant(self) -> None:
-        tuning = list(self._tuning)
+        retune = self.supply != self._plant_supply[0]
         for k, servo in enumerate(self._servos):
-            drive = servo.drive()
-            self._torque[0, k] = drive.on
-            is_well = servo.encoder.is_true and servo.health.strength == 1.0
-            native = drive.mode in _NATIVE_MODES[bool(_IS_LEG[k])] and drive.goal_pwm >= 1.0 and is_well
-            if drive.on and self._own_law[k] and native:
-                self._torque[0, k] = False  # one tick, in which the plant's profile generator comes back to the joint
+            drive, is_well = servo.drive(), servo.is_well
+            if drive is self._settled[k] and is_well:
+                continue
+            native = drive.mode in _NATIVE_MODES[k < len(LEGS)] and drive.goal_pwm >= 1.0 and is_well
+            comes_back = drive.on and native and self._own_law[k]  # a tick off: the plant's profile generator goes to the joint
+            self._settled[k] = None if comes_back or (drive.on and not native) else drive
+            self._torque[0, k] = drive.on and not comes_back
             if not self._torque[0, k]:
                 self._own_law[k] = False
                 continue
             setpoint = self._native_setpoint if native else self._voltage_setpoint
-            self._setpoints[0, k], tuning[k] = setpoint(k, drive, servo)
-        if tuning != self._tuning or self.supply != self._parameters["servo.supply_voltage"][0]:
-            self._tune(tuning)
+            self._setpoints[0, k], tuning = setpoint(k, drive, servo)
+            if tuning != self._tuning[k]:
+                self._tuning[k], retune = tuning, True
+        if retune:
+            self._tune()
 
     def _native_setpoint(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> tuple[float, tuple[float, ...]]:
         """Return the plant's setpoint for a mode that the plant has itself, and its gains and profile."""
@@ -158,7 +165,7 @@ class PlantCoupling:
         if not self._own_law[k]:
             self._reference[:, k] = shaft.reference()
             self._own_law[k] = True
-        constant, resistance = (values[k] for values in self._nominal_winding)
+        constant, resistance = self._nominal_winding[k]
         back_emf = constant * shaft.true_velocity
         if drive.mode == PWM_MODE:
             return drive.goal_pwm * supply
@@ -175,43 +182,48 @@ class PlantCoupling:
         else:
             kp, kd = drive.velocity_integral_gain, drive.velocity_gain
             new = law.wheel_profile_step(stood, moved, drive.goal_velocity, acceleration, step, shaft.position, kp, supply)
-        self._reference[:, k] = new[:2]
+        self._reference[0, k], self._reference[1, k] = new[0], new[1]
         voltage = law.controller_voltage(kp, kd, new[0], new[1], shaft.position, shaft.velocity, limit)
         if drive.mode == CURRENT_POSITION_MODE:
             room = resistance * abs(drive.goal_current)
             voltage = np.clip(voltage, back_emf - room, back_emf + room)
         return float(voltage)
 
-    def _tune(self, tuning: list[tuple[float, ...]]) -> None:
+    def _tune(self) -> None:
         """Hand gains, profiles and supply to the plant."""
-        for k, values in enumerate(tuning):
+        for k, values in enumerate(self._tuning):
             if len(values) == len(_TUNED):
                 for name, value in zip(_TUNED, values, strict=True):  # registers go beyond what a plant takes
                     self._parameters[name][0, k] = np.clip(value, SPECS[name].low, SPECS[name].high)
-        self._parameters["servo.supply_voltage"][0] = self.supply
-        self._tuning = tuning
+        self._plant_supply[0] = self.supply
         self.plant.set_parameters(self._parameters)
 
     # ---- plant to firmware ----
 
     def _show_sensors(self) -> None:
-        sensors = self.sensors
-        effort = self._sign * sensors.joint_effort[0]
+        sensors, self._output = self.sensors, None
         position = self._zero + self._sign * (sensors.joint_position[0] + self._turned)
         velocity = self._sign * sensors.joint_velocity[0]
-        counts = np.rint((effort + self._torque[0] * self._idle_effort * velocity) / self._effort_count)
+        load = self._sign * sensors.joint_effort[0] / self._nominal_stall
         volt = float(sensors.supply_voltage[0])
-        constant, resistance = self._nominal_line
-        inferred = resistance / constant * effort + constant * velocity  # the plant does not tell its voltage
-        voltage = np.where(self._own_law, self._own_voltage, inferred)
-        pwm = np.where(self._torque[0], voltage / max(self.supply, 1e-3), 0.0)
-        load = effort / self._nominal_stall
-        columns = zip(position.tolist(), velocity.tolist(), counts.tolist(), pwm.tolist(), load.tolist(), strict=True)
-        for servo, (p, v, e, u, strain) in zip(self._servos, columns, strict=True):
+        columns = zip(self._servos, position.tolist(), velocity.tolist(), load.tolist(), strict=True)
+        for servo, p, v, strain in columns:
             shaft = servo.shaft
-            shaft.effort, shaft.pwm, shaft.load, shaft.voltage = int(e), u, strain, volt
+            shaft.load, shaft.voltage = strain, volt
             shaft.true_position, shaft.true_velocity = p, v
             shaft.position, shaft.velocity = servo.encoder.read(p, v)
+
+    def _output_of(self, k: int) -> tuple[int, float]:
+        """Return counts of current or load, and part of the supply, of motor ``k``; worked out when a register is read."""
+        if self._output is None:
+            effort, velocity = self._sign * self.sensors.joint_effort[0], self._sign * self.sensors.joint_velocity[0]
+            counts = np.rint((effort + self._torque[0] * self._idle_effort * velocity) / self._effort_count)
+            constant, resistance = self._nominal_line
+            inferred = resistance / constant * effort + constant * velocity  # the plant does not tell its voltage
+            voltage = np.where(self._own_law, self._own_voltage, inferred)
+            pwm = np.where(self._torque[0], voltage / max(self._plant_supply[0], 1e-3), 0.0)
+            self._output = list(zip(counts.astype(int).tolist(), pwm.tolist(), strict=True))
+        return self._output[k]
 
     def _reference_of(self, k: int) -> tuple[float, float]:
         """Return where the profile generator of joint ``k`` stands: rad and rad/s, encoder frame."""

@@ -85,6 +85,10 @@ class Fault:
     after: float = 0.0
     duration: float = math.inf
 
+    def is_at(self, places: Sequence[str]) -> bool:
+        """Whether it is at any of ``places``."""
+        return not self.where or any(place in self.where for place in places)
+
     def __str__(self) -> str:
         kind = FAULTS[self.kind]
         parts = [self.kind, *self.where]
@@ -155,10 +159,14 @@ class FaultBoard:
     def active(self, now: float, kind: str, places: Sequence[str]) -> Fault | None:
         """Return a fault of ``kind`` that holds at any of ``places`` now; None where there is none."""
         for start, end, fault in self._faults:
-            hit = fault.kind == kind and start <= now < end
-            if hit and (not fault.where or any(place in fault.where for place in places)):
+            if fault.kind == kind and start <= now < end and fault.is_at(places):
                 return fault
         return None
+
+    def values(self, now: float, places: Sequence[str]) -> dict[str, float]:
+        """Return the kinds of fault that hold at any of ``places`` now, and the value of the first of each."""
+        hits = [fault for start, end, fault in self._faults if start <= now < end and fault.is_at(places)]
+        return {fault.kind: fault.value for fault in reversed(hits)}
 
     @property
     def any(self) -> bool:

@@ -130,30 +130,26 @@ class BusLine:
 
     def apply_faults(self, now: float) -> None:
         """Let the faults that hold now act on the servos."""
-        active = self._faults.active
         for servo in self.servos:
-            places = (servo.name, self.name)
-            unpowered = bool(active(now, "dead", places) or active(now, "brownout", places))
+            values = self._faults.values(now, (servo.name, self.name))
+            unpowered = "dead" in values or "brownout" in values
             if servo.dead and not unpowered:
                 servo.boot()
             servo.set_power(not unpowered)
-            heat = active(now, "overheat", places)
-            servo.health.heating_rate = heat.value if heat else 0.0
+            servo.health.heating_rate = values.get("overheat", 0.0)
             if unpowered:
                 continue
-            if active(now, "overload", places):
+            if "overload" in values:
                 servo.raise_error(OVERLOAD)
-            if active(now, "reboot_matching_tick", places):
+            if "reboot_matching_tick" in values:
                 servo.boot(keep_clock=True)
-            if active(now, "torque_lost", places):
+            if "torque_lost" in values:
                 servo.write(servo.table["torque_enable"].address, b"\0")
-            if (limit := active(now, "limit_changed", places)) is not None:
-                servo.set("goal_pwm", round(limit.value))
-            weak = active(now, "slow_servo", places)
-            servo.health.strength = weak.value if weak else 1.0
-            jump = active(now, "encoder_jump", places)
-            servo.encoder.offset = jump.value if jump else 0.0
-            servo.encoder.is_frozen = bool(active(now, "encoder_frozen", places))
+            if "limit_changed" in values:
+                servo.set("goal_pwm", round(values["limit_changed"]))
+            servo.health.strength = values.get("slow_servo", 1.0)
+            servo.encoder.offset = values.get("encoder_jump", 0.0)
+            servo.encoder.is_frozen = "encoder_frozen" in values
 
     # ---- who answers ----
 

@@ -45,6 +45,8 @@ class EmulatedWorld:
         self.machine.step()
         for name, emissions in self.machine.take_output().items():
             self.queue(name, emissions)
+        if not self.machine.faults.any and all(self._plugged.values()):
+            return
         for name, was in self._plugged.items():
             self._plugged[name] = self.machine.plugged(name)
             if was and not self._plugged[name]:

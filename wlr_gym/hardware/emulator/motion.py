@@ -15,6 +15,8 @@ from wlr_gym.hardware.emulator.registers import Registers
 
 #: Part of a turn by which Homing Offset acts in position mode.
 HOMING_IN_POSITION_MODE = 0.25
+#: Bit of Drive Mode: profiles say how long a way takes, not how fast it is.
+TIME_BASED = 4
 
 
 @dataclass
@@ -24,10 +26,9 @@ class Shaft:
     Attributes:
         position, velocity: rad from encoder count 0, rad/s, as the encoder says.
         true_position, true_velocity: as it is.
-        effort: counts of Present Current or Present Load, positive as the encoder counts.
         load: motor torque over stall torque, 0 to about 1.
         voltage: V at the servo.
-        pwm: part of the supply on the motor, -1 to 1.
+        output: asks for the counts of Present Current or Present Load, and for the part of the supply on the motor, -1 to 1.
         reference: asks where the profile generator stands: rad and rad/s.
     """
 
@@ -35,10 +36,9 @@ class Shaft:
     velocity: float = 0.0
     true_position: float = 0.0
     true_velocity: float = 0.0
-    effort: int = 0
     load: float = 0.0
     voltage: float = 12.0
-    pwm: float = 0.0
+    output: Callable[[], tuple[int, float]] = lambda: (0, 0.0)
     reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
 
 
@@ -172,7 +172,7 @@ def motor_drive(registers: Registers, frame: EncoderFrame, profile_start: float,
 def _profile(registers: Registers, way: float) -> tuple[float, float]:
     """Profile velocity and acceleration in SI units; time-based profiles for the ``way`` (rad) to the goal."""
     velocity, acceleration = registers.get("profile_velocity"), registers.get("profile_acceleration")
-    if not registers.get("drive_mode") & 4:
+    if not registers.get("drive_mode") & TIME_BASED:
         si = registers.table.per_count
         return velocity * si("profile_velocity"), acceleration * si("profile_acceleration")
     duration, ramp = velocity * 1e-3, min(acceleration, velocity / 2) * 1e-3

@@ -20,6 +20,7 @@ class Registers:
 
     Attributes:
         memory: the bytes.
+        get: item -> the count it was set to last.
     """
 
     def __init__(self, table: ControlTable, present: Mapping[str, Callable[[], int]], changed: Callable[[str], None]) -> None:
@@ -28,25 +29,21 @@ class Registers:
         self._present = present
         self._changed = changed
         items = table.items.values()
-        self._places = {item.name: (item.address, item.address + item.size, item.signed) for item in items}
+        self._counts = dict.fromkeys(table.items, 0)  # what the bytes say; both are written by set alone
+        self.get: Callable[[str], int] = self._counts.__getitem__
         self._at = {item.address + k: item for item in items for k in range(item.size)}
         self._pointers = {
             table[f"indirect_data_{k}"].address: table[f"indirect_address_{k}"]
             for k in range(1, 1 + sum(item.name.startswith("indirect_data") for item in items))
         }
-        self._kept_up: dict[tuple[int, int], list[Item]] = {}
+        self._plans: dict[tuple[int, int], tuple[list[Item], list[tuple[int, int]]]] = {}  # while no pointer is written
 
     # ---- by name ----
 
     def __getitem__(self, name: str) -> int:
         """Return the count an item holds now."""
-        self._refresh(self.table[name])
-        return self.get(name)
-
-    def get(self, name: str) -> int:
-        """Return the count an item was set to last."""
-        start, stop, signed = self._places[name]
-        return int.from_bytes(self.memory[start:stop], "little", signed=signed)
+        item = self.table[name]
+        return self._refresh(item) if name in self._present else self.get(name)
 
     def set(self, name: str, count: int) -> None:
         """Put a count into an item past all access rules.
@@ -56,6 +53,9 @@ class Registers:
         """
         item = self.table[name]
         self.memory[item.address : item.address + item.size] = item.encode(count)
+        self._counts[name] = int(count)
+        if name.startswith("indirect_address"):
+            self._plans.clear()
         self._changed(name)
 
     def load_defaults(self, in_eeprom: bool) -> None:
@@ -73,34 +73,31 @@ class Registers:
         """Return ``length`` bytes from ``address``; gaps read as 0."""
         if length == 0 or address + length > TABLE_SIZE:
             return Error.ACCESS, b""
-        if not self._pointers.keys().isdisjoint(range(address, address + length)):
-            runs = self._runs(address, length)
-            return Error.NONE, b"".join(self._read_plain(place, size) for place, size in runs)
-        return Error.NONE, self._read_plain(address, length)
-
-    def _runs(self, address: int, length: int) -> list[tuple[int, int]]:
-        """Return the neighbouring bytes, as (address, length), that a block with indirect data stands for."""
-        runs: list[tuple[int, int]] = []
-        for place in map(self._resolve, range(address, address + length)):
-            if runs and sum(runs[-1]) == place:
-                runs[-1] = runs[-1][0], runs[-1][1] + 1
-            else:
-                runs.append((place, 1))
-        return runs
-
-    def _read_plain(self, address: int, length: int) -> bytes:
         block = (address, length)
-        if block not in self._kept_up:
-            inside = {item.address: item for place in range(address, address + length) if (item := self._at.get(place))}
-            self._kept_up[block] = [item for item in inside.values() if item.name in self._present]
-        for item in self._kept_up[block]:
+        if block not in self._plans:
+            self._plans[block] = self._plan(*block)
+        kept_up, runs = self._plans[block]
+        for item in kept_up:
             self._refresh(item)
-        return bytes(self.memory[address : address + length])
+        return Error.NONE, b"".join([self.memory[start:stop] for start, stop in runs])
 
-    def _refresh(self, item: Item) -> None:
-        compute = self._present.get(item.name)
-        if compute is not None:
-            self.memory[item.address : item.address + item.size] = item.encode(compute())
+    def _plan(self, address: int, length: int) -> tuple[list[Item], list[tuple[int, int]]]:
+        """Return the items to work out before a block is read, and the bytes (start, stop) that it stands for."""
+        places = [self._resolve(place) for place in range(address, address + length)]
+        inside = {item.name: item for place in places if (item := self._at.get(place))}
+        runs: list[tuple[int, int]] = []
+        for place in places:
+            if runs and runs[-1][1] == place:
+                runs[-1] = runs[-1][0], place + 1
+            else:
+                runs.append((place, place + 1))
+        return [item for item in inside.values() if item.name in self._present], runs
+
+    def _refresh(self, item: Item) -> int:
+        """Work an item out that the servo keeps up to date; return its count."""
+        count = self._present[item.name]()
+        self.memory[item.address : item.address + item.size] = item.encode(count)
+        return count
 
     def _resolve(self, address: int) -> int:
         """Follow an Indirect Data byte to the byte it stands for."""

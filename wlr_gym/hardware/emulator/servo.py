@@ -20,7 +20,7 @@ from wlr_gym.hardware.dynamixel.tables import (
     Item,
 )
 from wlr_gym.hardware.emulator.health import Health
-from wlr_gym.hardware.emulator.motion import EncoderFrame, MotorDrive, Shaft, ShaftEncoder, motor_drive
+from wlr_gym.hardware.emulator.motion import TIME_BASED, EncoderFrame, MotorDrive, Shaft, ShaftEncoder, motor_drive
 from wlr_gym.hardware.emulator.registers import GOAL_REGISTERS, Registers
 
 # Not in the e-manual: chosen.
@@ -64,6 +64,7 @@ class EmulatedServo:
         self.encoder: ShaftEncoder = ShaftEncoder()
         self.health: Health = Health()
         self.dead = False
+        self._volt = table.counts.voltage
         self._drive: MotorDrive | None = None
         self._frame = EncoderFrame(table)
         self.registers: Registers = Registers(table, self._make_present_values(), self._register_changed)
@@ -218,7 +219,7 @@ class EmulatedServo:
 
     def _take_goal(self, name: str) -> None:
         self._goal_given = True
-        if name == "goal_position":
+        if name == "goal_position" and self._get("drive_mode") & TIME_BASED:  # a new mode asks by itself
             self._profile_start = self.shaft.reference()[0]
         if self._get("drive_mode") & 8 and not self._get("torque_enable"):
             self._torque(True)
@@ -261,6 +262,11 @@ class EmulatedServo:
 
     # ---- motion ----
 
+    @property
+    def is_well(self) -> bool:
+        """Whether encoder and motor do what they should."""
+        return self.encoder.is_true and self.health.strength == 1.0
+
     def drive(self) -> MotorDrive:
         """Return what the firmware asks of the motor."""
         if self._drive is None:
@@ -281,7 +287,7 @@ class EmulatedServo:
         limit = self._get("bus_watchdog")
         if limit > 0 and self._get("torque_enable") and self._since_packet > limit * _WATCHDOG_UNIT:
             self._watchdog_stop()
-        if error := self.health.advance(step, self.shaft, self._get, self.table.counts.voltage):
+        if error := self.health.advance(step, self.shaft, self._get, self._volt):
             self.raise_error(error)
 
     def pause(self, duration: float) -> None:
@@ -317,8 +323,8 @@ class EmulatedServo:
         speed, volt = si("present_velocity"), self.table.counts.voltage
         return {
             "realtime_tick": lambda: int(self._clock * 1000 + 1e-6) % 32768,
-            "present_pwm": lambda: self._frame.direction * round(shaft.pwm * full_pwm),
-            effort: lambda: self._frame.direction * shaft.effort,
+            "present_pwm": lambda: self._frame.direction * round(shaft.output()[1] * full_pwm),
+            effort: lambda: self._frame.direction * shaft.output()[0],
             "present_velocity": lambda: self._frame.direction * round(shaft.velocity / speed),
             "present_position": lambda: self._frame.count(shaft.position),
             "velocity_trajectory": lambda: self._frame.direction * round(shaft.reference()[1] / speed),

@@ -90,7 +90,7 @@ class EmulatedStand:
     def wheel_current(self) -> float:
         """Return what the wheels draw from the supply, A: motor currents times the part of the time they are switched on."""
         shafts = [self.machine.servos[wheel].shaft for wheel in WHEELS]
-        return sum(abs(shaft.pwm) * abs(shaft.load) for shaft in shafts) * self.stall_current
+        return sum(abs(shaft.output()[1]) * abs(shaft.load) for shaft in shafts) * self.stall_current
 
 
 def _stand_forces(**angles: float) -> list[Force]:

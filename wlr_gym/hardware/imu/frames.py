@@ -42,7 +42,7 @@ class ImuFrame:
 
 def gyro_per_count(gyro_range: int) -> float:
     """Return rad/s per count at a full scale of ``gyro_range`` deg/s."""
-    return np.deg2rad(gyro_range) / 32768
+    return float(np.deg2rad(gyro_range)) / 32768
 
 
 def accel_per_count(accel_range: int) -> float:
@@ -52,7 +52,7 @@ def accel_per_count(accel_range: int) -> float:
 
 def to_counts(values: ArrayLike, per_count: float) -> tuple[int, int, int]:
     """Return three SI values as counts, clipped to the sensor's range as the sensor does."""
-    x, y, z = np.clip(np.rint(np.asarray(values, np.float64) / per_count), -32768, 32767).astype(int).tolist()
+    x, y, z = (min(max(round(value / per_count), -32768), 32767) for value in np.asarray(values, np.float64).tolist())
     return x, y, z
 
 

@@ -65,7 +65,13 @@ def clip(x: Value, low: Value, high: Value) -> Value:
 
 def where_positive(condition: Value, a: Value, b: Value) -> Value:
     """``a`` where ``condition > 0``, else ``b`` (also where the condition is NaN)."""
-    return _apply("where", lambda c, x, y: np.where(np.asarray(c) > 0, x, y)[()], condition, a, b)
+    return _apply("where", _where, condition, a, b)
+
+
+def _where(condition: Value, a: Value, b: Value) -> Value:
+    if isinstance(condition, float) and isinstance(a, float) and isinstance(b, float):  # ten times as fast as numpy
+        return a if condition > 0 else b
+    return np.where(np.asarray(condition) > 0, a, b)[()]
 
 
 def sign(x: Value) -> Value:

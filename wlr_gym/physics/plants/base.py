@@ -51,13 +51,13 @@ class Layout:
             start += len(channel.elements)
         self.width = start
         self.elements: tuple[str, ...] = tuple(element for channel in channels for element in channel.elements)
+        self._columns = {name: part if self.channels[name].labels else part.start for name, part in self.slices.items()}
 
     def view(self, values: Array, name: str) -> Array:
         """Return the columns of ``name``: shape (N,) for a scalar channel, (N, size) otherwise."""
-        if name not in self.slices:
+        if name not in self._columns:
             raise unknown_name("channel", name, self.channels)
-        columns = values[:, self.slices[name]]
-        return columns if self.channels[name].labels else columns[:, 0]
+        return values[:, self._columns[name]]
 
 
 _WHEEL_XY = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in ("x", "y"))

@@ -300,7 +300,7 @@ class GibbsAppellPlant(Simulator):
             self._memory,
         )
         if self._formulas:  # in full precision: single precision would lose it step by step
-            _scatter(self._memory, self._width, self._all, self._time[:, None], slice(0, 1))
+            self._memory[:, 0].flat[: self._count] = self._time
         arguments = (self._lanes, self._constants, *inputs, self._truth.values, self._raw)
         # Whoever is done takes the next: a thread whose core has other work as well holds nobody up.
         chunks = iter(self._chunks)
