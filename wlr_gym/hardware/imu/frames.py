@@ -52,7 +52,7 @@ def accel_per_count(accel_range: int) -> float:
 
 def to_counts(values: ArrayLike, per_count: float) -> tuple[int, int, int]:
     """Return three SI values as counts, clipped to the sensor's range as the sensor does."""
-    x, y, z = (min(max(round(value / per_count), -32768), 32767) for value in np.asarray(values, np.float64).tolist())
+    x, y, z = (round(min(max(value / per_count, -32768.0), 32767.0)) for value in np.asarray(values, np.float64).tolist())
     return x, y, z
 
 
