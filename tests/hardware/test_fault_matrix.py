@@ -106,13 +106,13 @@ class Watch:
     def look(self):
         rig = self.rig
         self.angles.append(true_angles(rig))
-        setpoints = rig.goal_counts()
+        setpoints, on = rig.goal_counts(), rig.torque()
         # setpoints of a servo that is off mean nothing, and its watchdog sets its own
-        driven = rig.torque() & [servo["bus_watchdog"] >= 0 for servo in rig.machine.servos.values()]
+        driven = on & [servo["bus_watchdog"] >= 0 for servo in rig.machine.servos.values()]
         both = driven & self.driven
         self.jump = max(self.jump, float((np.abs(setpoints - self.setpoints) / LARGEST_STEP)[both].max(initial=0.0)))
         self.setpoints, self.driven = setpoints, driven
-        if rig.torque().any():
+        if on.any():
             self.off_at = None
         elif self.off_at is None:
             self.off_at = rig.machine.time
