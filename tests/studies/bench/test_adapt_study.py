@@ -60,7 +60,7 @@ def test_it_resumes_contender_by_contender_where_the_truth_helps_most_first(tmp_
     assert order[2] == order[3] == ("a", "wide")
     assert [name for name, contender in order[-4:]] == ["b", "b", "a", "a"]
     assert len(lines) == 10
-    with pytest.raises(InputError, match="steps: 2500000, requested 7"):
+    with pytest.raises(InputError, match="steps: 7500000, requested 7"):
         adapt_study.run_adapt_study(adapt_study.AdaptStudy(tmp_path, chosen, steps=7), lambda text: None)
 
 

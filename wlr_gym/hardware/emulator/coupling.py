@@ -124,7 +124,7 @@ class PlantCoupling:
     def _command_plant(self) -> None:
         retune = self.supply != self._plant_supply[0]
         for k, servo in enumerate(self._servos):
-            drive, is_well = servo.drive(), servo.is_well
+            drive, is_well = servo.drive(), servo.encoder.is_true and servo.health.strength == 1.0
             if drive is self._settled[k] and is_well:
                 continue
             native = drive.mode in _NATIVE_MODES[k < len(LEGS)] and drive.goal_pwm >= 1.0 and is_well

@@ -64,7 +64,6 @@ class EmulatedServo:
         self.encoder: ShaftEncoder = ShaftEncoder()
         self.health: Health = Health()
         self.dead = False
-        self._volt = table.counts.voltage
         self._drive: MotorDrive | None = None
         self._frame = EncoderFrame(table)
         self.registers: Registers = Registers(table, self._make_present_values(), self._register_changed)
@@ -262,11 +261,6 @@ class EmulatedServo:
 
     # ---- motion ----
 
-    @property
-    def is_well(self) -> bool:
-        """Whether encoder and motor do what they should."""
-        return self.encoder.is_true and self.health.strength == 1.0
-
     def drive(self) -> MotorDrive:
         """Return what the firmware asks of the motor."""
         if self._drive is None:
@@ -287,7 +281,7 @@ class EmulatedServo:
         limit = self._get("bus_watchdog")
         if limit > 0 and self._get("torque_enable") and self._since_packet > limit * _WATCHDOG_UNIT:
             self._watchdog_stop()
-        if error := self.health.advance(step, self.shaft, self._get, self._volt):
+        if error := self.health.advance(step, self.shaft, self._get, self.table.counts.voltage):
             self.raise_error(error)
 
     def pause(self, duration: float) -> None:
