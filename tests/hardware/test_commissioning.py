@@ -128,15 +128,14 @@ def test_its_runs_are_measured_runs(nominal):
 # ---- a robot that differs --------------------------------------------------------------------------------------------
 
 
-def changed(name, factors):
+def changed(name, joint, factor):
     parameters = Parameters.nominal(ROBOT)
-    for joint, factor in factors.items():
-        parameters[name][0, JOINTS.index(joint)] *= factor
+    parameters[name][0, JOINTS.index(joint)] *= factor
     return parameters
 
 
-#: Test -> readings of the emulated robot that is as the files say; each is made once.
-EXPECTED: dict[str, list[Reading]] = {}
+#: Tests in their order, and one of them -> its readings of the emulated robot that is as the files say; each is made once.
+EXPECTED: dict[tuple[str, ...], list[Reading]] = {}
 
 
 def make(folder, emulated, *tests, person=None, expected=EXPECTED):
@@ -147,9 +146,10 @@ def make(folder, emulated, *tests, person=None, expected=EXPECTED):
     def remembering(test, stand, person):
         if person is not commissioning._model_person:
             return made(test, stand, person)
-        if test.name not in expected:
-            expected[test.name] = made(test, stand, person)
-        return expected[test.name]
+        key = (*tests, test.name)
+        if key not in expected:
+            expected[key] = made(test, stand, person)
+        return expected[key]
 
     whole = Commissioning(ROBOT, NOMINAL, link, person or EmulatedPerson(emulated), folder, RunMeta())
     with mock.patch.object(runner, "run_test", remembering), whole as commissioning:
@@ -166,18 +166,19 @@ def found_in(results):
 
 
 @pytest.mark.parametrize(
-    ("name", "factors", "test", "quantities"),
+    ("name", "joint", "factor", "test", "quantities"),
     [
-        ("servo.stall_torque", {"wheel_rf": 0.7, "leg_rf": 0.7}, "stall", {"stall_load"}),
-        ("servo.torque_scale", {"leg_lr": 0.5}, "load", {"running_load"}),
-        ("servo.kp", {"wheel_lr": 0.7}, "velocity_step", {"velocity_loop_time", "integral_cycle"}),
-        ("servo.coulomb_friction", {"wheel_rr": 2.0}, "load", {"running_load"}),
-        ("servo.kp", {"wheel_lf": 0.4}, "watchdog", {"watchdog_stop_time"}),
+        ("servo.stall_torque", "wheel_rf", 0.7, "stall", {"stall_load"}),
+        ("servo.stall_torque", "leg_rf", 0.7, "stall", {"stall_load"}),
+        ("servo.torque_scale", "leg_lr", 0.5, "load", {"running_load"}),
+        ("servo.kp", "wheel_lr", 0.7, "velocity_step", {"velocity_loop_time", "integral_cycle"}),
+        ("servo.coulomb_friction", "wheel_rr", 2.0, "load", {"running_load"}),
+        ("servo.kp", "wheel_lf", 0.4, "watchdog", {"watchdog_stop_time"}),
     ],
 )
-def test_a_servo_that_differs_is_found_and_named(tmp_path, name, factors, test, quantities):
-    results = make(tmp_path, EmulatedStand(ROBOT, NOMINAL, parameters=changed(name, factors)), test)
-    assert found_in(results) == {(quantity, joint) for quantity in quantities for joint in factors}
+def test_a_servo_that_differs_is_found_and_named(tmp_path, name, joint, factor, test, quantities):
+    results = make(tmp_path, EmulatedStand(ROBOT, NOMINAL, parameters=changed(name, joint, factor)), test)
+    assert found_in(results) == {(quantity, joint) for quantity in quantities}
     assert not results[test].is_good
 
 
