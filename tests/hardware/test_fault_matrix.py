@@ -146,10 +146,11 @@ def play(rig, phase, fault, seconds, struck):
     loop.operator.spare = None
     rig.swing = 0.0
     moving(rig, 0.3)
-    if phase in ("running", "stopping"):
+    if phase == "running":
         strike()
-    if phase != "stopping":
-        moving(rig, seconds)
+    moving(rig, seconds)
+    if phase == "stopping":
+        strike()
     loop.stop()
 
 

@@ -127,7 +127,7 @@ class PlantCoupling:
             drive, is_well = servo.drive(), servo.encoder.is_true and servo.health.strength == 1.0
             if drive is self._settled[k] and is_well:
                 continue
-            native = drive.mode in _NATIVE_MODES[k < len(LEGS)] and drive.goal_pwm >= 1.0 and is_well
+            native = drive.mode in _NATIVE_MODES[bool(_IS_LEG[k])] and drive.goal_pwm >= 1.0 and is_well
             comes_back = drive.on and native and self._own_law[k]  # a tick off: the plant's profile generator goes to the joint
             self._settled[k] = None if comes_back or (drive.on and not native) else drive
             self._torque[0, k] = drive.on and not comes_back

@@ -85,10 +85,6 @@ class Fault:
     after: float = 0.0
     duration: float = math.inf
 
-    def is_at(self, places: Sequence[str]) -> bool:
-        """Whether it is at any of ``places``."""
-        return not self.where or any(place in self.where for place in places)
-
     def __str__(self) -> str:
         kind = FAULTS[self.kind]
         parts = [self.kind, *self.where]
@@ -158,15 +154,18 @@ class FaultBoard:
 
     def active(self, now: float, kind: str, places: Sequence[str]) -> Fault | None:
         """Return a fault of ``kind`` that holds at any of ``places`` now; None where there is none."""
-        for start, end, fault in self._faults:
-            if fault.kind == kind and start <= now < end and fault.is_at(places):
-                return fault
-        return None
+        return next((fault for fault in self._holding(now, places) if fault.kind == kind), None)
 
     def values(self, now: float, places: Sequence[str]) -> dict[str, float]:
         """Return the kinds of fault that hold at any of ``places`` now, and the value of the first of each."""
-        hits = [fault for start, end, fault in self._faults if start <= now < end and fault.is_at(places)]
-        return {fault.kind: fault.value for fault in reversed(hits)}
+        return {fault.kind: fault.value for fault in reversed(self._holding(now, places))}
+
+    def _holding(self, now: float, places: Sequence[str]) -> list[Fault]:
+        return [
+            fault
+            for start, end, fault in self._faults
+            if start <= now < end and (not fault.where or any(place in fault.where for place in places))
+        ]
 
     @property
     def any(self) -> bool:

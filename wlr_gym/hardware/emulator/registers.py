@@ -29,7 +29,7 @@ class Registers:
         self._present = present
         self._changed = changed
         items = table.items.values()
-        self._counts = dict.fromkeys(table.items, 0)  # what the bytes say; both are written by set alone
+        self._counts = dict.fromkeys(table.items, 0)  # of items that are set; set alone writes it
         self.get: Callable[[str], int] = self._counts.__getitem__
         self._at = {item.address + k: item for item in items for k in range(item.size)}
         self._pointers = {

@@ -232,7 +232,7 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
     return AdaptStep(said=(verdict,), command=command, numbers=numbers)
 
 
-def acceptance_on(progress: Progress, new: str, family: Family, own: Robot, share: float = 0.0) -> Acceptance:
+def acceptance_on(progress: Progress, new: str, family: Family, own: Robot, share: float) -> Acceptance:
     """Return how a new policy does against the old one on the robots of a family; kept in a file. ``share``: of the step."""
     path = progress.folder(ACCEPTANCE) / f"{Path(new).parent.name}_{family.name.replace(' ', '_')}.json"
     if not path.is_file():
