@@ -36,7 +36,7 @@ class Registers:
             table[f"indirect_data_{k}"].address: table[f"indirect_address_{k}"]
             for k in range(1, 1 + sum(item.name.startswith("indirect_data") for item in items))
         }
-        self._plans: dict[tuple[int, int], tuple[list[Item], list[tuple[int, int]]]] = {}  # while no pointer is written
+        self._plans: dict[tuple[int, int], tuple[list[Item], list[int]]] = {}  # while no pointer is written
 
     # ---- by name ----
 
@@ -76,22 +76,16 @@ class Registers:
         block = (address, length)
         if block not in self._plans:
             self._plans[block] = self._plan(*block)
-        kept_up, runs = self._plans[block]
+        kept_up, places = self._plans[block]
         for item in kept_up:
             self._refresh(item)
-        return Error.NONE, b"".join([self.memory[start:stop] for start, stop in runs])
+        return Error.NONE, bytes([self.memory[place] for place in places])
 
-    def _plan(self, address: int, length: int) -> tuple[list[Item], list[tuple[int, int]]]:
-        """Return the items to work out before a block is read, and the bytes (start, stop) that it stands for."""
+    def _plan(self, address: int, length: int) -> tuple[list[Item], list[int]]:
+        """Return the items to work out before a block is read, and the addresses of the bytes that it stands for."""
         places = [self._resolve(place) for place in range(address, address + length)]
-        inside = {item.name: item for place in places if (item := self._at.get(place))}
-        runs: list[tuple[int, int]] = []
-        for place in places:
-            if runs and runs[-1][1] == place:
-                runs[-1] = runs[-1][0], place + 1
-            else:
-                runs.append((place, place + 1))
-        return [item for item in inside.values() if item.name in self._present], runs
+        inside = [item for place in places if (item := self._at.get(place)) and item.name in self._present]
+        return list(dict.fromkeys(inside)), places
 
     def _refresh(self, item: Item) -> int:
         """Work an item out that the servo keeps up to date; return its count."""
