@@ -11,6 +11,7 @@ from wlr_gym.base.files import write_json, write_text
 from wlr_gym.base.html import commands, document, section, table
 from wlr_gym.base.text import duration
 from wlr_gym.learning.adaptation.plan import STEPS, AdaptStep, Progress
+from wlr_gym.learning.evaluation.acceptance import COLUMNS
 
 PAGE_FILE, NUMBERS_FILE = "adapt.html", "adapt.json"
 FORMAT = 1
@@ -94,8 +95,7 @@ def _step(record: AdaptStep) -> str:
     said = "".join(f"<p>{escape(line)}</p>" for line in record.said)
     numbers = record.numbers
     if "rows" in numbers:
-        header = ("robots", "against", "tracking error", "its", "loss (%)", "upper bound (%)", "accepted")
-        said += table(header, numbers["rows"], range(2, 6))
+        said += table(("robots", *COLUMNS), numbers["rows"], range(2, 6))
     if "old" in numbers and isinstance(numbers["old"], list):
         said += _episodes(numbers)
     return said + (commands([record.command]) if record.command else "")

@@ -192,10 +192,13 @@ def fingerprint(environment: str, policies: Iterable[Source], floors: Sequence[A
     return hashlib.sha256(json.dumps(played, sort_keys=True).encode()).hexdigest()
 
 
+#: Columns of a row of acceptance after its first, the floors or robots.
+COLUMNS = ("against", "tracking error", "its tracking error", "loss (%)", "upper bound (%)", "not worse")
+
+
 def acceptance_rows(result: Acceptance) -> list[list[str]]:
     """Return the table as text: a header, then one row per family of floors and reference."""
-    header = ["floors", "against", "tracking error", "its", "loss (%)", "upper bound (%)", "accepted"]
-    return [header, *(_row(loss, result.largest_loss) for loss in result.losses)]
+    return [["floors", *COLUMNS], *(_row(loss, result.largest_loss) for loss in result.losses)]
 
 
 def _row(loss: Loss, largest: float) -> list[str]:
