@@ -20,7 +20,7 @@ from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
 from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay, robot_of
 from wlr_gym.data.robot_file import note_robot
-from wlr_gym.data.run_states import local_fit
+from wlr_gym.data.run_states import camera_pose, local_fit
 from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
@@ -405,3 +405,15 @@ def test_noise_is_that_of_the_robot_file_with_quantisation():
     assert noise["eff_wheel_lf"] == pytest.approx(np.hypot(0.005, 1e-3 * 1.5 / np.sqrt(12)))  # XL430: 0.1 % of stall torque
     assert noise["volt"] == pytest.approx(np.hypot(0.03, 0.1 / np.sqrt(12)))
     assert (noise["gyro_x"], noise["acc_z"], noise["cam_x"], noise["cam_yaw"]) == (0.0009, 0.03, 0.001, 0.005)
+
+
+def test_a_robot_that_the_camera_found_again_is_where_it_saw_it():
+    """Positions are no angles: 4.2 m without a frame, more than 3.14, are no jump to undo; headings are."""
+    t = np.arange(0.0, 16.0, 0.02)
+    seen = {"cam_x": 0.35 * t, "cam_y": -0.35 * t, "cam_yaw": np.where(t < 8.0, 3.1, 3.1 - 2.0 * np.pi)}
+    table = pandas.DataFrame({"t": t, **seen})
+    table.loc[(t > 3.0) & (t < 15.0), list(seen)] = np.nan
+    x, y, yaw = camera_pose(Run(table, RunMeta(), Path("run_01.parquet")))
+    np.testing.assert_array_equal(x, table["cam_x"])
+    np.testing.assert_array_equal(y, table["cam_y"])
+    np.testing.assert_allclose(yaw[np.isfinite(yaw)], 3.1)

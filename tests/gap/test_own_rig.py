@@ -107,6 +107,21 @@ def test_runs_that_are_none_are_refused_with_file_and_column(runs, tmp_path, cha
         read_rig_runs(tmp_path, AXIS)
 
 
+def test_one_run_in_two_formats_is_not_two(runs, tmp_path):
+    table = pd.read_csv(runs / "run_01.csv")
+    table.to_csv(tmp_path / "run_01.csv", index=False)
+    table.to_parquet(tmp_path / "run_01.parquet")
+    with pytest.raises(InputError, match=r"run_01\.csv and run_01\.parquet are the same run"):
+        read_rig_runs(tmp_path, AXIS)
+
+
+def test_a_candidate_has_the_meaning_of_its_own_law(runs):
+    problem, _ = open_own_rig(runs, AXIS)
+    assert isinstance(problem, OwnRigProblem)
+    _, candidates = problem.candidates(Setting(np.array([one.nominal for one in AXIS.parameters])), [], [])
+    assert {one.name: one.doc for one in candidates} == {name: law.doc for name, law in AXIS.laws.items()}
+
+
 def without_sigma():
     return (dataclasses.replace(AXIS.parameters[0], sigma=0.0),)
 

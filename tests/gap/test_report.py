@@ -217,12 +217,20 @@ def test_commands_can_be_typed(tmp_path):
 
 
 def test_a_patch_that_cannot_be_loaded_is_not_advertised(tmp_path):
-    rig = FoundEffect("torque_saturation", ("servo",), {}, 0.9, 400.0)
+    rig = FoundEffect("torque_saturation", ("servo",), {}, 0.9, 400.0, doc="torque falls behind the current")
     page = page_of(replace(examples.EFFECT_FOUND, effects=(rig,)), tmp_path)
     assert "The robot's simulators cannot load it: " in page.text
     assert "wlr train" not in page.text
-    assert "An effect of the test rig's own model." in page.text
+    assert "What is missing: torque falls behind the current." in page.text
     assert "No formula" not in page.text
+
+
+def test_a_law_of_a_rig_is_not_taken_for_the_librarys_of_the_same_name(tmp_path):
+    own = FoundEffect("viscous_friction", ("axis",), {}, 0.9, 400.0, doc="friction that grows with speed: -viscous speed")
+    text = page_of(replace(examples.EFFECT_FOUND, effects=(own,)), tmp_path).text
+    assert "What is missing: friction that grows with speed: -viscous speed." in text
+    assert "back-EMF" not in text
+    assert "Law:" not in text
 
 
 def test_an_unknown_effect_has_a_formula_or_says_that_it_has_none(tmp_path):

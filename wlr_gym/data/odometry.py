@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.read import Run
-from wlr_gym.data.run_states import has_camera, unwrapped
+from wlr_gym.data.run_states import camera_pose, has_camera
 from wlr_gym.robot import CORNER_SIGNS, LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ def rolled_poses(run: Run, robot: Robot) -> Array:
     if not has_camera(run):
         return poses
     frames = np.flatnonzero(np.isfinite(run["cam_x"] + run["cam_y"] + run["cam_yaw"]))
-    seen = np.stack([run["cam_x"], run["cam_y"], unwrapped(run["cam_yaw"])], axis=1)
+    seen = camera_pose(run).T
     last = np.maximum(np.searchsorted(frames, np.arange(len(t)), side="right") - 1, 0)
     anchors = frames[last]  # before the first frame: that one
     turned = seen[anchors, 2] - poses[anchors, 2]

@@ -157,19 +157,19 @@ def _joints(run: Run, times: Array, parameters: Parameters, degree: int) -> tupl
 def _camera(run: Run, times: Array, parameters: Parameters, degree: int) -> list[tuple[Array, Array]]:
     """Marker x, y and yaw in the floor frame, each with its rate, at the given times."""
     exposed = run["t"] - parameters["camera.delay"][0]
-    x, y, yaw = (local_fit(exposed, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW, degree) for name in ("x", "y", "yaw"))
+    x, y, yaw = (local_fit(exposed, seen, times, CAMERA_WINDOW, degree) for seen in camera_pose(run))
     mount, scale = parameters["camera.mount_yaw"][0], parameters["camera.scale"][0]
     cosine, sine = np.cos(mount) / scale, np.sin(mount) / scale
     turned_x, turned_y = ((cosine * x[k] - sine * y[k], sine * x[k] + cosine * y[k]) for k in (0, 1))
     return [(turned_x[0], turned_y[0]), (turned_x[1], turned_y[1]), yaw]
 
 
-def unwrapped(angle: Array) -> Array:
-    """Undo jumps of 2 pi in an angle with missing samples."""
-    known = np.isfinite(angle)
-    result = angle.copy()
-    result[known] = np.unwrap(angle[known])
-    return result
+def camera_pose(run: Run) -> Array:
+    """Return what the camera saw: x, y (m) and yaw (rad, without jumps of 2 pi), (3, rows); NaN between frames."""
+    seen = np.stack([run["cam_x"], run["cam_y"], run["cam_yaw"]])
+    known = np.isfinite(seen[2])
+    seen[2, known] = np.unwrap(seen[2, known])
+    return seen
 
 
 def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:

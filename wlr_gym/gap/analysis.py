@@ -85,6 +85,7 @@ class FoundEffect:
         gain: fall of minus two log posterior on the fitted runs when it was added, beside the effects selected before it.
         formula, units: of an unknown effect; empty otherwise.
         validity: where the formula was tried, by what it reads: beyond that it is untested.
+        doc: what is missing, of a test rig's own law; empty = as the library says.
     """
 
     name: str
@@ -95,6 +96,7 @@ class FoundEffect:
     formula: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
     validity: Mapping[str, Range] = field(default_factory=dict)
+    doc: str = ""
 
 
 @dataclass(frozen=True)

@@ -124,6 +124,7 @@ class Candidate:
         unknowns: its parameters, in the order of all value tuples.
         starts: ways to a first guess; the best one is used.
         formula, units: of an effect that the library does not hold; empty otherwise.
+        doc: what is missing without it, where the library's effect of this name is not meant; empty = it is.
         fixed: parameters of the effect that are not fitted.
         convert: from fitted values to the effect's parameters, where the data are more nearly linear in other numbers (mass and
             moments of a load, not its place); None = they are the same.
@@ -142,6 +143,7 @@ class Candidate:
     convert: Callable[[Sequence[float]], Mapping[str, float]] | None = None
     tolerances: tuple[Tolerance | None, ...] = ()
     within: Callable[[Sequence[float]], tuple[float, ...]] | None = None
+    doc: str = ""
 
     @property
     def label(self) -> str:

@@ -37,11 +37,9 @@ again.</p>"""
 
 
 def _effect(effect: FoundEffect) -> str:
-    known = EFFECTS.get(effect.name)
-    if effect.name == UNKNOWN_EFFECT:
-        meaning = "Nothing in the library explains it."
-    else:
-        meaning = f"What is missing: {known.doc}." if known else "An effect of the test rig's own model."
+    known = None if effect.doc else EFFECTS.get(effect.name)
+    doc = known.doc if known else effect.doc
+    meaning = f"What is missing: {doc}." if doc else "Nothing in the library explains it."
     law = effect.formula or (known.equation if known else "")
     unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
     rows = [(name, estimate(found)) for name, found in effect.parameters.items()]

@@ -8,6 +8,7 @@ from wlr_gym.gap.problem import Candidate, Probe, Start, Unknown
 from wlr_gym.gap.rig.effects import RIG_EFFECTS, RigEffect
 from wlr_gym.gap.rig.model import JOINT
 from wlr_gym.physics.effects.effect import PatchEffect
+from wlr_gym.physics.effects.registry import EFFECTS
 from wlr_gym.physics.effects.search import Change
 
 
@@ -30,7 +31,7 @@ def rig_candidates(present: Collection[str]) -> tuple[list[Probe], list[Candidat
                 Start(tuple(tuple(probe(name, change) for change in changes) for changes in guess.directions), guess.values)
                 for guess in effect.guesses
             )
-            candidates.append(Candidate(name, (JOINT,), _unknowns(effect), starts))
+            candidates.append(Candidate(name, (JOINT,), _unknowns(effect), starts, doc="" if name in EFFECTS else effect.doc))
     return list(probes.values()), candidates
 
 

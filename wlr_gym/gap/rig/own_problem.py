@@ -242,7 +242,7 @@ def _candidate(rig: Rig, name: str, law: RigLaw) -> tuple[list[Probe], Candidate
 
     start = Start(tuple((probe.key,) for probe in probes), values)
     unknowns = tuple(_unknown(key, one, neutral[key]) for key, one in law.parameters.items())
-    return probes, Candidate(name, (rig.name,), unknowns, (start,))
+    return probes, Candidate(name, (rig.name,), unknowns, (start,), doc=law.doc)
 
 
 def _unknown(name: str, one: EffectParameter, neutral: float) -> Unknown:

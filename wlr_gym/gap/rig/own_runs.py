@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,9 @@ def read_rig_runs(folder: str | Path, rig: Rig) -> list[RigRun]:
     paths = sorted(path for path in folder.iterdir() if path.suffix in _READERS)
     if not paths:
         raise InputError(f"{folder}: holds no *.csv or *.parquet: expected runs of '{rig.name}', one file each")
+    for before, after in pairwise(paths):
+        if before.stem == after.stem:
+            raise InputError(f"{folder}: {before.name} and {after.name} are the same run; keep one of them")
     return [_run(path, rig) for path in paths]
 
 

@@ -13,12 +13,12 @@ from wlr_gym.data.replay import held_setpoints
 from wlr_gym.data.run_states import (
     CAMERA_WINDOW,
     JOINT_WINDOW,
+    camera_pose,
     frame_near,
     has_camera,
     local_fit,
     start_state,
     starts_at_rest,
-    unwrapped,
 )
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
 from wlr_gym.physics.plants.base import PlantState
@@ -82,7 +82,7 @@ class RunClock:
         effort[~self.torque_on[rows, WHEEL_SLICE].T] = np.nan
         pose = np.full((2, 3, len(rows)), np.nan)
         if has_camera(run):
-            fits = [local_fit(self.t, unwrapped(run[f"cam_{name}"]), times, CAMERA_WINDOW) for name in ("x", "y", "yaw")]
+            fits = [local_fit(self.t, seen, times, CAMERA_WINDOW) for seen in camera_pose(run)]
             pose = np.where(frame_near(run, times), np.stack(fits, axis=1), np.nan)
         tick = np.floor((times - self.begin) / CLOCK + 1e-9).astype(int)
         return Anchors(tick, np.transpose(legs), effort.T, pose[0].T, pose[1].T)
