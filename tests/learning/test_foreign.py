@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import NormalizeObservation, RescaleAction
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
@@ -13,7 +14,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("onnxscript")
 
 from stable_baselines3 import PPO, SAC, TD3  # noqa: E402
-from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize  # noqa: E402
 
 ID = "WLR-Velocity-v0"
 TASK = {"observer": {"camera": False}, "observations": {"estimated_slip_velocity": None}}
@@ -85,6 +86,25 @@ def test_a_plain_network(env, tmp_path):
     np.testing.assert_allclose(act(tmp_path / "p.onnx", env, seen), expected, atol=1e-5)
     contract = contract_of(tmp_path / "p.onnx")
     assert (contract["agent"], contract["training"]["environment"]) == ("imported", ID)
+
+
+def test_the_normaliser_around_the_environment_is_part_of_the_policy(env, tmp_path):
+    around = VecNormalize(VecMonitor(env), clip_obs=0.5)
+    around.reset()
+    network = torch.nn.Linear(env.observation_space.shape[0], 8)
+    wlr_gym.import_policy(network, around, tmp_path / "p.onnx")
+    seen = readings(env)
+    with torch.no_grad():
+        expected = network(torch.as_tensor(around.normalize_obs(seen))).clamp(-1, 1).numpy()
+    np.testing.assert_allclose(act(tmp_path / "p.onnx", env, seen), expected, atol=1e-5)
+
+
+def test_a_wrapper_that_no_file_holds_is_refused(env, tmp_path):
+    network = torch.nn.Linear(env.observation_space.shape[0], 8)
+    for wrapped in (VecFrameStack(env, 2), RescaleAction(gym.make(ID), -0.5, 0.5), NormalizeObservation(gym.make(ID))):
+        with pytest.raises(InputError, match=rf"the wrapper {type(wrapped).__name__} changes observations or actions"):
+            wlr_gym.import_policy(network, wrapped, tmp_path / "p.onnx")
+    assert not (tmp_path / "p.onnx").exists()
 
 
 class Branch(torch.nn.Linear):

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,10 +26,15 @@ require_package("stable_baselines3", "train")
 import torch  # noqa: E402
 from stable_baselines3.common.policies import ActorCriticPolicy  # noqa: E402
 from stable_baselines3.common.save_util import load_from_zip_file  # noqa: E402
-from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecFrameStack, VecNormalize  # noqa: E402
 from stable_baselines3.sac.policies import SACPolicy  # noqa: E402
 from stable_baselines3.td3.policies import TD3Policy  # noqa: E402
 
+#: Wrappers that change what a network sees or does.
+_CHANGING = (
+    gymnasium.ObservationWrapper, gymnasium.ActionWrapper, gymnasium.vector.VectorObservationWrapper,
+    gymnasium.vector.VectorActionWrapper, VecFrameStack,
+)  # fmt: skip
 #: The name that the contract gives as agent.
 AGENT = "imported"
 #: Robots that drive, and for how long (s), while file and network are compared.
@@ -51,7 +57,7 @@ def import_policy(
             says is what the file is fed.
         out: file to write, ending in ``.onnx``.
         normalizer: what observations went through before the network, folded into the file: a torch module, a
-            ``VecNormalize`` or the path of a saved one. None = nothing.
+            ``VecNormalize`` or the path of a saved one. None = the ``VecNormalize`` around ``env``, or nothing.
 
     Returns:
         The largest differences between the actions of file and network: over random observations, and over those of robots
@@ -71,7 +77,7 @@ def import_policy(
     contract = bare.contract()
     width, actions = len(contract["observation"]), len(contract["action"])
     source = network if isinstance(network, torch.nn.Module) else sb3_network(Path(network))
-    whole = _Whole(_normalizer(normalizer, width), source)
+    whole = _Whole(_normalizer(_worn(env, bare) if normalizer is None else normalizer, width), source)
     task = bare.core.settings.task
     config = {"environment": {"task": dict(task)} if isinstance(task, Mapping) else {}}  # its robot is in the contract
     content = policy_content(AGENT, config, contract, {"environment": bare.spec.id})
@@ -161,6 +167,21 @@ class _Standardise(torch.nn.Module):
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return torch.clamp((observation - self.mean) * self.scale, -self.limit, self.limit)
+
+
+def _worn(env: Any, bare: Any) -> VecNormalize | None:
+    """Return the normaliser around an environment; other wrappers that change what a network sees or does are refused."""
+    found, layer = None, env
+    while layer is not bare:
+        if isinstance(layer, VecNormalize):
+            found = layer
+        elif isinstance(layer, _CHANGING):
+            raise InputError(
+                f"env: the wrapper {type(layer).__name__} changes observations or actions: expected the environment without "
+                "it, and what it does in the network or as normalizer"
+            )
+        layer = layer.venv if isinstance(layer, VecEnvWrapper) else layer.env
+    return found
 
 
 def _normalizer(given: Any, width: int) -> torch.nn.Module:

@@ -11,11 +11,13 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("onnxruntime")
 
 from wlr_gym.cli import OK, run_command
+from wlr_gym.hardware.deployment import Deployment
 from wlr_gym.hardware.emulator.memory import EmulatedWorld
 from wlr_gym.learning.adaptation.driving import paired
 from wlr_gym.learning.adaptation.robots import EmulatedRobot, RealRobot
 from wlr_gym.learning.evaluation import robot_episodes
 from wlr_gym.learning.evaluation.robot_episodes import drive_episode
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import load_robot
 
@@ -55,6 +57,28 @@ def test_an_episode_is_scored_by_the_true_motion(backend, monkeypatch):
     assert episode.measures["yaw_rate_error"] == pytest.approx(np.sqrt(np.mean(turn**2)), rel=1e-9)
     scaled = np.sqrt((np.mean(speed**2) / 0.02**2 + np.mean(turn**2) / 0.06**2) / 2.0)  # scales of configs/task/velocity.yaml
     assert episode.tracking_error == pytest.approx(scaled, rel=1e-9)
+
+
+def test_a_real_robot_is_scored_by_the_pose_of_its_observer_too():
+    """On a floor without slip the observer knows where the robot is."""
+    core = make_core("WLR-Posture-v0", 1, {"randomization": "none", "episode_length": 4.0})
+    core.seed(0, 0)
+    core.begin_episodes(core.everyone, {})
+    estimated, true = (robot_episodes._Score(core.task, core, truth) for truth in (None, core.plant))
+    for score in (estimated, true):
+        score.begin()
+    action = np.zeros((1, 8), np.float32)
+    action[:, 4:] = 0.1, 0.5, 0.1, 0.5
+    for _ in range(150):
+        command = core.command.copy()
+        core.step(action, core.everyone)
+        for score in (estimated, true):
+            score.take(command)
+    driven = Deployment("time is over", True, 150, None, None, np.zeros(150))
+    found, expected = (score.episode(0, driven).measures for score in (estimated, true))
+    for name in ("lateral_error", "heading_error"):
+        assert expected[name] > 0.005
+        assert found[name] == pytest.approx(expected[name], rel=0.05)
 
 
 @pytest.mark.slow

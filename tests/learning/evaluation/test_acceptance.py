@@ -2,11 +2,17 @@
 
 from pathlib import Path
 
+import gymnasium
 import pytest
+import yaml
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import main
+from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.user_tasks import register_task
 from wlr_gym.learning.evaluation.acceptance import (
     ACCEPTANCE_FILE,
     FAMILIES,
@@ -40,6 +46,24 @@ def test_a_worse_policy_is_refused_whatever_its_mean_says():
     assert loss.loss > 100.0
     assert loss.bound > loss.loss
     assert loss.loss == pytest.approx(100.0 * (loss.error / loss.reference_error - 1.0))
+
+
+def test_a_task_of_ones_own_is_played_on_its_own_floors(tmp_path):
+    task = yaml.safe_load((data_directory("configs") / "task" / "velocity.yaml").read_text())
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**task, "name": "mine", "randomization": "ice"}))
+    own = register_task(tmp_path / "mine.yaml")
+    try:
+        result = accept("pid", own, references=["do_nothing"], episodes=2, seeds=1)
+    finally:
+        del ENVIRONMENTS[own], gymnasium.registry[own]
+    assert [one.floors for one in result.losses] == ["ice"]
+
+
+def test_floors_may_be_a_path_or_settings(tmp_path):
+    (tmp_path / "floor.yaml").write_text("{base: ice}\n")
+    for floors, said in ((tmp_path / "floor.yaml", str(tmp_path / "floor.yaml")), (RandomizationConfig(name="mine"), "mine")):
+        result = accept("pid", references=["do_nothing"], floors=[floors], episodes=2, seeds=1)
+        assert [one.floors for one in result.losses] == [said]
 
 
 def test_the_file_holds_the_result(tmp_path):

@@ -15,7 +15,7 @@ from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.learning.evaluation.card import MAIN
-from wlr_gym.learning.evaluation.scoring import evaluate
+from wlr_gym.learning.evaluation.scoring import evaluate, randomization_said
 from wlr_gym.learning.evaluation.subjects import Source, identity, read_subjects
 from wlr_gym.learning.evaluation.sweeps import FLOORS
 from wlr_gym.policy import policy_environment, shipped_names, trained_environment
@@ -124,7 +124,8 @@ def accept(
     subject = read_subjects([policy])[0]
     environment = env_id or trained_environment(subject.sources[0]) or "WLR-Velocity-v0"
     task = task_name_of(environment)
-    chosen = FAMILIES.get(task, ("nominal",)) if floors is None else tuple(floors)
+    own = (read_task(task_source_of(environment)).randomization,)
+    chosen = tuple(FAMILIES.get(task, own) if floors is None else floors)
     given = references_of(subject.sources[0], environment) if references is None else references
     against = tuple(one for one in given if read_subjects([one])[0] != subject)
     if not against:
@@ -167,7 +168,8 @@ def _part_of(tell: Tell, family: str, families: int) -> Tell:
 
 
 def _name(family: Any) -> str:
-    return family if isinstance(family, str) else str(family.get("name", "given"))
+    said = randomization_said(family)
+    return said if isinstance(said, str) else str(said.get("name", "given"))
 
 
 def references_of(policy: Source, environment: str) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,12 +30,17 @@ def rows(scores: Mapping[str, Scores], metrics: Sequence[Metric], *, short: bool
     ``short`` gives half the width of the interval instead of its ends.
     """
     header = ["metric", "unit", *scores]
-    return [header, *([m.key, m.unit, *(cell(own[m.key], m.digits, short) for own in scores.values())] for m in metrics)]
+    return [header, *([m.key, m.unit, *(_value(m, own, short) for own in scores.values())] for m in metrics)]
 
 
-def cell(estimate: Estimate, digits: int, short: bool = False) -> str:
+def _value(metric: Metric, scores: Scores, short: bool) -> str:
+    largest = math.inf if metric.key == "reward" else LARGEST  # a reward is no quotient
+    return cell(scores[metric.key], metric.digits, short, largest)
+
+
+def cell(estimate: Estimate, digits: int, short: bool = False, largest: float = LARGEST) -> str:
     """Return ``mean [low, high]``, or ``mean ± half``; ``-`` where there is nothing or nothing to compare with."""
-    if not abs(estimate.mean) <= LARGEST:
+    if not abs(estimate.mean) <= largest:
         return "-"
     if short:
         return f"{_text(estimate.mean, digits)} ± {_text((estimate.high - estimate.low) / 2, digits)}"
@@ -106,7 +112,7 @@ def seed_rows(card: Card, name: str, *, short: bool = False) -> Table:
     ]
 
     def row(title: str, scores: Scores) -> list[str]:
-        return [title, *(cell(scores[m.key], m.digits, short) for m in metrics)]
+        return [title, *(_value(m, scores, short) for m in metrics)]
 
     table = [["training seed", *(m.key if m.unit == "-" else f"{m.key} ({m.unit})" for m in metrics)]]
     table += [row(seed, scores) for seed, scores in seeds.scores.items()]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.measured import measured_truth
 from wlr_gym.envs.registry import task_source_of
@@ -85,15 +86,17 @@ def drive_episode(
         log: folder for the run; None = none is written.
 
     Raises:
-        InputError: a policy that does not fit, ports that cannot be opened.
+        InputError: a policy that does not fit, or without a slip observer on a real robot; ports that cannot be opened.
     """
     keywords = {"backend": "dynamixel", "hardware": RobotOptions(emulated=True), "episode_length": seconds}
     core = make_core(environment, 1, environment_for(policy, keywords))
     core.plant.close()
     plant, truth = robot.start(log, seed)
     core.plant = plant
-    score = _Score(_whole_task(environment, policy), core, truth)
     try:
+        if truth is None and core.observer is None:
+            raise InputError(f"policy '{policy}': it has no slip observer, which is what tells how a real robot moves")
+        score = _Score(_whole_task(environment, policy), core, truth)
         with stop_on_signals(plant.loop.operator):
             driven = deploy(core, make_policy(policy, core.contract()), seed, watcher=score)
     finally:
@@ -147,11 +150,13 @@ class _Score:
     def _truth(self) -> Array:
         if self._true is not None:
             return self._true.truth().values.copy()
-        core = self._core
-        found = measured_truth(core.sensors)
-        if core.observer is not None:
-            speed = ESTIMATE_LAYOUT.view(core.observer.values, "linear_velocity_in_body")
-            found[:, TRUTH_LAYOUT.slices["linear_velocity_in_body"]][:, :2] = speed
+        observer = self._core.observer
+        assert observer is not None
+        found = measured_truth(self._core.sensors)
+        for channel in ("position", "linear_velocity_in_body"):
+            found[:, TRUTH_LAYOUT.slices[channel]][:, :2] = ESTIMATE_LAYOUT.view(observer.values, channel)
+        half = 0.5 * ESTIMATE_LAYOUT.view(observer.values, "yaw")
+        TRUTH_LAYOUT.view(found, "quaternion")[:, [0, 3]] = np.stack([np.cos(half), np.sin(half)], axis=-1)
         return np.nan_to_num(found)
 
     def episode(self, seed: int, driven: Deployment) -> RobotEpisode:

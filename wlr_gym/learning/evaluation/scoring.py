@@ -11,6 +11,7 @@ from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.describe import contract
+from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
 from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, work
@@ -108,7 +109,7 @@ def evaluate(
     results = play(environment, subjects, conditions, seed, lambda text, done: tell(text, done / total), watch)
     said = {
         "environment": environment, "backend": main, "episodes": f"{episodes} x {seeds} seeds", "first seed": seed,
-        "randomization": randomization or "the task's", "robot": _named(robot), "effects": patch.summary(),
+        "randomization": randomization_said(randomization), "robot": _named(robot), "effects": patch.summary(),
     }  # fmt: skip
     if sensors is not None:
         said["sensors that not every robot has"] = ", ".join(sensors) or "none"
@@ -119,6 +120,15 @@ def evaluate(
         said |= {"second simulator": f"{others[0]}, {fewer} episodes"}
     said |= {"sweeps": f"{sweep_episodes} episodes per point"} if chosen else {}
     return Card(results, chosen, said, {subject.name: identity(subject) for subject in subjects}, training_seeds)
+
+
+def randomization_said(given: Any) -> str | dict[str, Any]:
+    """Return a randomisation as a card says it: its name or path, or its content."""
+    if given is None:
+        return "the task's"
+    if isinstance(given, RandomizationConfig):
+        return given.model_dump(mode="json", exclude_unset=True)
+    return dict(given) if isinstance(given, Mapping) else str(given)
 
 
 def _named(robot: RobotSource | None) -> str:
