@@ -171,7 +171,8 @@ class _Standardise(torch.nn.Module):
 
 def _worn(env: Any, bare: Any) -> VecNormalize | None:
     """Return the normaliser around an environment; other wrappers that change what a network sees or does are refused."""
-    found, layer = None, env
+    found: VecNormalize | None = None
+    layer: Any = env
     while layer is not bare:
         if isinstance(layer, VecNormalize):
             found = layer
