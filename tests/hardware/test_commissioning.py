@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -30,11 +31,12 @@ from robot_rig import hardware_file
 from wlr_gym.hardware.commissioning import runner
 from wlr_gym.hardware.commissioning.contract import Reading, StandTest
 from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
-from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, TroubleError
+from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TroubleError
 from wlr_gym.hardware.commissioning.person import TerminalPerson
 from wlr_gym.hardware.commissioning.registry import TESTS, choose
 from wlr_gym.hardware.commissioning.runner import Commissioning, run_test
 from wlr_gym.hardware.commissioning.stand import Stand
+from wlr_gym.hardware.dynamixel import tables
 from wlr_gym.hardware.emulator import MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
@@ -315,6 +317,39 @@ def stood():
     link.open()
     yield emulated, Stand(ROBOT, NOMINAL, link)
     link.close()
+
+
+def test_a_leg_that_a_hand_moved_far_gets_no_torque(stood):
+    emulated, stand = stood
+    stand.prepare(["leg_lf"])
+    for far, on in ((-0.1, ["leg_lf"]), (-0.8, [])):
+        stand.prepare(["leg_lf"])
+        counts = stand.servos.get("leg_lf", "present_position") + round(far / (2.0 * math.pi) * 4096.0)
+        stand.servos.set("leg_lf", "goal_position", counts)
+        if on:
+            stand.switch_on(["leg_lf"])
+        else:
+            with pytest.raises(TroubleError, match=r"leg_lf: [+-]0\.80 rad from its setpoint, expected 0\.12 at most"):
+                stand.switch_on(["leg_lf"])
+        assert motors_on(emulated.machine) == on
+        stand.switch_off(["leg_lf"])
+
+
+def test_a_stop_that_came_during_a_question_comes_before_torque(stood):
+    emulated, stand = stood
+    stand.operator.ask_to_stop("SIGINT")
+    with pytest.raises(QuitError, match="SIGINT"):
+        stand.switch_on(WHEELS)
+    assert motors_on(emulated.machine) == []
+
+
+def test_only_enter_is_consent():
+    for answer in ("n", "no", "x", "s"):
+        person = TerminalPerson(lambda text, answer=answer: answer)
+        for ask in (lambda person: person.ready("Latency."), lambda person: person.brake("wheel_lf")):
+            with pytest.raises(SkippedError):
+                ask(person)
+    TerminalPerson(lambda text: "").ready("Latency.")
 
 
 def spinning(then):
@@ -780,6 +815,49 @@ def test_the_list_names_every_test(capsys):
     assert main(["commission", "--list"]) == 0
     shown = capsys.readouterr().out
     assert all(name in shown for name in TESTS)
+
+
+def test_what_was_measured_stays_when_somebody_leaves(monkeypatch, tmp_path):
+    emulated = EmulatedStand(ROBOT, NOMINAL)
+    beside(monkeypatch, emulated)
+
+    def leave(text):
+        if "A read of" in text:
+            raise KeyboardInterrupt
+        return ""
+
+    tests = ("latency", "silent_servo")
+    with pytest.raises(KeyboardInterrupt):
+        run(CommissionOptions(out=tmp_path, tests=tests), leave)
+    assert set(load_hardware(tmp_path / "hardware.yaml").measured.adapter_latency) == set(NOMINAL.buses)
+    run(CommissionOptions(out=tmp_path, tests=("silent_servo",), force=True, yes=True), Human(emulated))
+    assert set(load_hardware(tmp_path / "hardware.yaml").measured.adapter_latency) == set(NOMINAL.buses)
+
+
+def test_a_hardware_file_of_ones_own_is_no_folder_for_results(tmp_path, capsys):
+    file = tmp_path / "hardware.yaml"
+    file.write_text((data_directory("configs") / "hardware/nominal.yaml").read_text())
+    text = file.read_text()
+    words = ["commission", "--emulated", "--out", str(tmp_path), "--tests", "latency"]
+    assert main(words) == 2
+    assert "hardware.yaml: exists" in capsys.readouterr().err
+    assert main([*words, "--hardware", str(file), "--force"]) == 2
+    assert "its hardware.yaml is the file of --hardware" in capsys.readouterr().err
+    assert file.read_text() == text
+
+
+def test_the_copy_finds_a_servo_file_beside_the_original(tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    content = yaml.safe_load((data_directory("configs") / "hardware/nominal.yaml").read_text())
+    table = Path(tables.__file__).parent / "xm540_w150.yaml"
+    (tmp_path / "mine" / "my_servo.yaml").write_text(table.read_text())
+    content["buses"]["legs"]["model"] = "my_servo.yaml"
+    (tmp_path / "mine" / "hardware.yaml").write_text(yaml.safe_dump(content))
+    words = ["--emulated", "--hardware", str(tmp_path / "mine" / "hardware.yaml"), "--out", str(tmp_path / "out")]
+    assert main(["commission", *words, "--tests", "latency"]) == 0
+    copy = load_hardware(tmp_path / "out" / "hardware.yaml")
+    assert Path(copy.buses["legs"].model) == tmp_path / "mine" / "my_servo.yaml"
+    assert set(copy.measured.adapter_latency) == set(copy.buses)
 
 
 def test_json_goes_to_the_standard_output(tmp_path, capsys):

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from gymnasium.error import ResetNeeded
 from rich.console import Console
 
@@ -19,11 +20,14 @@ pytest.importorskip("serial")
 from robot_rig import HARDWARE, PERIOD, Phase, hardware_file, machine_of
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import FAILED, OK, run_command
-from wlr_gym.cli.deploy import DeployOptions, busy_note
+from wlr_gym.cli.deploy import DeployOptions, _emulator, busy_note
+from wlr_gym.cli.robot_options import wait_for_enter
 from wlr_gym.cli.robot_status import RobotView
 from wlr_gym.data.read import read_run
 from wlr_gym.data.replay import replay
+from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.deployment import REHEARSALS, act_again, loop_of, read_policy_log
 from wlr_gym.hardware.deployment import deploy as drive
 from wlr_gym.hardware.emulator.link import emulated_robot
@@ -476,3 +480,28 @@ def nothing_is_written_any_more(core, folder):
         with pytest.raises((StoppedError, ResetNeeded)):  # the latter where it was stopped before its episode began
             core.step(np.ones((1, 8), np.float32), core.everyone)
     assert seen() == before
+
+
+def test_an_emulated_robot_has_every_port_of_the_file(tmp_path):
+    """A port that stayed the file's own would be the real robot's."""
+    content = yaml.safe_load((data_directory("configs") / "hardware/nominal.yaml").read_text())
+    legs = content["buses"].pop("legs")
+    for name, joints in (("front", legs["joints"][:2]), ("rear", legs["joints"][2:])):
+        content["buses"][name] = {**legs, "port": f"/dev/real_{name}", "joints": joints}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
+    options = DeployOptions("pid", hardware=str(tmp_path / "mine.yaml"), emulated=True)
+    with _emulator(options, Console(stderr=True)) as ports:
+        wired = with_ports(load_hardware(options.hardware), ports)
+        assert set(ports) == {"wheels", "front", "rear", "imu"}
+        assert all("wlr-robot-" in bus.port for bus in (*wired.buses.values(), wired.imu))
+
+
+@pytest.mark.parametrize(("answer", "starts"), [("", True), ("y", True), ("n", False), ("q", False)])
+def test_only_enter_starts_the_robot(answer, starts):
+    console = Console(stderr=True)
+    console.input = lambda prompt: answer  # pyright: ignore[reportAttributeAccessIssue]
+    if starts:
+        wait_for_enter(console, "Free floor?")
+    else:
+        with pytest.raises(KeyboardInterrupt, match="asked not to start the robot"):
+            wait_for_enter(console, "Free floor?")

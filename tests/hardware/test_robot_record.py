@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import record, replay
 from wlr_gym.cli.robot_options import HardwareOption
 from wlr_gym.data import read_dataset, read_run, simulate_again
@@ -33,6 +34,13 @@ ROBOT = load_robot("emanual")
 
 def recorded(out, **options):
     return record.run(record.RecordOptions(out=out, **{"emulated": True, "seconds": 2.0, **options}))
+
+
+def test_a_robot_that_waits_for_an_operator_is_not_recorded(tmp_path):
+    text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(text.replace("deadman: null", "deadman: 0.5"))
+    with pytest.raises(InputError, match=r"safety\.deadman = 0\.5 s: motions have no key"):
+        recorded(tmp_path / "runs", hardware=str(tmp_path / "mine.yaml"), excitation=("posture",))
 
 
 def test_the_emulated_robot_is_driven_and_logged(tmp_path, capsys):

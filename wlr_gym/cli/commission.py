@@ -83,6 +83,8 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     if options.fault and not options.emulated:
         raise InputError("--fault is for the emulated robot: add --emulated")
     refuse_existing(options.out / REPORT, options.force)
+    if not (options.out / REPORT).is_file():  # a hardware file that no session wrote
+        refuse_existing(options.out / COPY, options.force)
     make_output_folder(options.out)
     return _commission(options, options.out, tests, ask or partial(ask_terminal, what="commissioning"), console)
 
@@ -127,6 +129,7 @@ def _commission(
     options: CommissionOptions, out: Path, tests: Sequence[StandTest], ask: Callable[[str], str], console: Console
 ) -> int:
     from wlr_gym.base.files import write_json
+    from wlr_gym.base.paths import find_config
     from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.commissioning.runner import Commissioning, content_of
     from wlr_gym.hardware.config import load_hardware
@@ -135,10 +138,13 @@ def _commission(
     named = _named(options, robot)
     earlier = _earlier(out / REPORT, named, tests, console)
     copy = out / COPY
+    if copy.exists() and copy.samefile(find_config("hardware", options.hardware)):
+        raise InputError(f"--out {out}: its {COPY} is the file of --hardware, and gets every value: choose another folder")
     measured = load_hardware(copy).measured if earlier and copy.is_file() else None
     link, person = _robot(options, robot, hardware, ask)
     meta = RunMeta(robot=robot.name, notes="wlr commission, on a stand")
     results: list[StandResult] = []
+    findings: list[StandFinding] = []
     with Commissioning(robot, hardware, link, person, out, meta) as commissioning:
         if faults := commissioning.faults():
             console.print("\n".join([*faults, "Nothing was switched on: mend this first (wlr doctor)."]), style="bold red")
@@ -149,14 +155,16 @@ def _commission(
                 console.print(f"{result.test}: made once more: {reason}")
             console.print(f"{result.test}: {result.state}{f': {result.reason}' if result.reason else ''}")
             write_json(out / REPORT, _together(earlier, [content_of(one) | {"robot": named} for one in results]))
-    findings = [finding for result in results for finding in result.findings]
+            findings = [finding for result in results for finding in result.findings]
+            if findings:
+                _write(copy, options, findings, measured)
     if options.json:
         print_json([content_of(one) for one in results])
     else:
         _print_table(findings, console)
     _print_end(findings, _untested(tests, results), console)
     if findings:
-        _save(options, out, findings, measured, ask, console)
+        _save(options, copy, findings, ask, console)
     return OK if all(result.is_good for result in results) else FAILED
 
 
@@ -176,31 +184,29 @@ def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Ca
 
 
 def _save(
-    options: CommissionOptions,
-    out: Path,
-    findings: Iterable[StandFinding],
-    earlier: Measured | None,
-    ask: Callable[[str], str],
-    console: Console,
+    options: CommissionOptions, copy: Path, findings: Iterable[StandFinding], ask: Callable[[str], str], console: Console
 ) -> None:
-    """Write the hardware file with what was measured: a copy in ``--out``, and, of a real robot, the file itself if wanted.
+    """Write what was measured into a real robot's own hardware file, if wanted; the copy has it already."""
+    from wlr_gym.base.paths import find_config
 
-    The copy keeps what an ``earlier`` session measured that this one continues.
-    """
+    console.print(f"written: {copy}")
+    source = find_config("hardware", options.hardware)
+    is_own = options.hardware.endswith((".yaml", ".yml")) and not options.emulated
+    if is_own and (options.yes or ask(f"Write the measured values into {source}? [y/N]").strip().lower() in ("y", "yes")):
+        _write(source, options, findings, None)
+        console.print(f"written: {source}")
+
+
+def _write(target: Path, options: CommissionOptions, findings: Iterable[StandFinding], earlier: Measured | None) -> None:
+    """Write the hardware file with what was measured, now or in an ``earlier`` session that this one continues."""
     from wlr_gym.base.paths import find_config
     from wlr_gym.hardware.calibration import save_hardware
     from wlr_gym.hardware.commissioning.comparison import with_measurements
     from wlr_gym.hardware.config import load_hardware
 
     source = find_config("hardware", options.hardware)
-    told = load_hardware(source)  # what the file says, not ports of the command line
-    changed = {out / COPY: with_measurements(told, findings, earlier)}
-    is_own = options.hardware.endswith((".yaml", ".yml")) and not options.emulated
-    if is_own and (options.yes or ask(f"Write the measured values into {source}? [y/N]").strip().lower() in ("y", "yes")):
-        changed[source] = with_measurements(told, findings)
-    for target, content in changed.items():
-        save_hardware(target, source, content, "measured", "Measured on the robot by wlr commission: docs/commissioning.md.")
-        console.print(f"written: {target}")
+    content = with_measurements(load_hardware(source), findings, earlier)  # what the file says, not ports of the command line
+    save_hardware(target, source, content, "measured", "Measured on the robot by wlr commission: docs/commissioning.md.")
 
 
 # ---- the report ------------------------------------------------------------------------------------------------------

@@ -293,6 +293,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
     import tempfile
 
     from wlr_gym.data.robot_file import write_robot
+    from wlr_gym.hardware.config import load_hardware
     from wlr_gym.robot import load_robot
 
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
@@ -317,9 +318,11 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
         assert process.stderr is not None
         try:
             console.print("starting the emulated robot ...", style="dim")
-            ports = {line.split()[0]: line.split()[1] for line in (process.stdout.readline() for _ in range(3)) if line}
-            if len(ports) < 3:
+            if not process.stdout.readline():
                 raise InputError(f"the emulated robot does not start: {process.stderr.read().strip()}")
+            ports = {name: str(links / name) for name in load_hardware(options.hardware).port_names}
+            if missing := [name for name in ports if not (links / name).exists()]:  # a port of the file may be a real robot's
+                raise InputError(f"the emulated robot has no port '{missing[0]}', which {options.hardware} has")
             yield ports | ({_POSES: str(Path(folder) / _POSES)} if options.camera is not None else {})
         finally:
             process.terminate()

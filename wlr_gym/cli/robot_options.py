@@ -192,11 +192,14 @@ def wait_for_enter(console: Console, question: str, action: str = "start the rob
 
     Raises:
         InputError: nobody there.
+        KeyboardInterrupt: anything else was typed, such as "n".
     """
     try:
-        console.input(f"[bold]{question} Enter to {action}, Ctrl-C not to. ")
+        answer = console.input(f"[bold]{question} Enter to {action}, Ctrl-C not to. ")
     except EOFError:
         raise InputError(f"nobody there to {action}: run it on a terminal{otherwise}") from None
+    if answer.strip().lower() not in ("", "y", "yes"):
+        raise KeyboardInterrupt(f"asked not to {action}")
 
 
 class NobodyThereError(InputError):

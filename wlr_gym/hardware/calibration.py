@@ -267,12 +267,18 @@ def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, no
     changed = hardware.model_dump(mode="json", exclude_unset=True)[section]
     content = {**read_yaml(source), section: changed}
     patched = _replace_section(source.read_text(encoding="utf-8"), section, f"# {note}\n" + _yaml({section: changed}))
-    robot = named_in(source, content.get("robot") or "nominal")
-    if robot.is_absolute() and path.parent.resolve() != source.parent.resolve():  # a robot file beside the source
-        content["robot"] = os.path.relpath(robot, path.parent.resolve())
-        patched = re.sub(
-            r"^robot:.*$", lambda _: _yaml({"robot": content["robot"]}).strip(), patched, count=1, flags=re.MULTILINE
-        )
+    if path.parent.resolve() != source.parent.resolve():  # files beside the source are named as they are seen from here
+
+        def seen(name: str) -> str:
+            file = named_in(source, name)
+            return os.path.relpath(file, path.parent.resolve()) if file.is_absolute() else name
+
+        if content.get("robot") and seen(content["robot"]) != content["robot"]:
+            content["robot"] = seen(content["robot"])
+            line = _yaml({"robot": content["robot"]}).strip()
+            patched = re.sub(r"^robot:.*$", lambda _: line, patched, count=1, flags=re.MULTILINE)
+        buses = content.get("buses") or {}
+        content |= {"buses": {name: {**bus, "model": seen(bus["model"])} for name, bus in buses.items()}} if buses else {}
 
     def write(temporary: Path) -> None:
         temporary.write_text(patched, encoding="utf-8")

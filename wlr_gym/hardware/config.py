@@ -175,6 +175,11 @@ class Hardware(SettingsModel):
     safety: SafetyLimits = SafetyLimits()
     measured: Measured = Measured()
 
+    @property
+    def port_names(self) -> tuple[str, ...]:
+        """What has a port: buses, ``imu``, and ``flow`` where there is one."""
+        return (*self.buses, "imu", *(["flow"] if self.flow is not None else []))
+
     @model_validator(mode="after")
     def _what_was_measured_is_of_this_robot(self) -> Hardware:
         for name in Measured.model_fields:
@@ -262,10 +267,8 @@ def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
     Raises:
         InputError: a name that is no bus.
     """
-    sensors = ["imu"] if hardware.flow is None else ["imu", "flow"]
-    unknown = set(ports) - set(hardware.buses) - {*sensors}
-    if unknown:
-        raise InputError(f"no bus '{sorted(unknown)[0]}'; the buses are {', '.join([*hardware.buses, *sensors])}")
+    if unknown := set(ports) - {*hardware.port_names}:
+        raise InputError(f"no bus '{sorted(unknown)[0]}'; the buses are {', '.join(hardware.port_names)}")
     buses = {name: bus.model_copy(update={"port": ports.get(name, bus.port)}) for name, bus in hardware.buses.items()}
     imu = hardware.imu.model_copy(update={"port": ports.get("imu", hardware.imu.port)})
     flow = None if hardware.flow is None else hardware.flow.model_copy(update={"port": ports.get("flow", hardware.flow.port)})

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.record import start_setpoints
 from wlr_gym.hardware.loop import StoppedError
@@ -43,8 +44,16 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     Args:
         plant: the robot, torque off.
         motion: setpoints; NaN = that motor off. Its servo profile must be the plant's.
+
+    Raises:
+        InputError: the robot waits for an operator's signs, which nobody gives here.
     """
     loop, robot = plant.loop, plant.robot
+    if loop.limits.deadman is not None:
+        raise InputError(
+            f"safety.deadman = {loop.limits.deadman:g} s: motions have no key or stick for an operator's sign: leave it empty, "
+            "and give wlr deploy --deadman"
+        )
     state = standing_state(robot, Parameters.nominal(robot))
     state.joint_position[0, LEG_SLICE] = start_setpoints(motion, robot)[LEG_SLICE]
     reason, ticks = "", 0

@@ -62,6 +62,8 @@ def _measure_silent_servo(stand: Stand, person: Person) -> list[Reading]:
     found = []
     for name, group in stand.servos.groups.items():
         first, *others = group.servos
+        if not others:  # nobody is behind or before the silent one
+            continue
         table = group.servos[first]
         block = Block(table, "realtime_tick", "present_position")
         for kind in ("ordinary", "fast"):

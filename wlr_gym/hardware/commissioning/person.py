@@ -64,10 +64,15 @@ class TerminalPerson:
             raise QuitError
         return answer
 
-    def ready(self, test: str) -> None:
-        """Say what the test is; Enter starts it, ``s`` skips it, ``q`` ends."""
-        if self._is_asked_before and self._answer(f"{test} Enter starts, s skips, q ends.") == "s":
+    def _enter(self, text: str) -> None:
+        """Show a text and wait for Enter; whatever else is typed is no consent."""
+        if self._answer(text) not in ("", "y", "yes"):
             raise SkippedError
+
+    def ready(self, test: str) -> None:
+        """Say what the test is; Enter starts it, ``q`` ends, anything else, such as ``s``, skips it."""
+        if self._is_asked_before:
+            self._enter(f"{test} Enter starts, s skips, q ends.")
 
     def turn(self, joint: str, angle: float) -> None:
         """Ask for a turn by hand."""
@@ -75,29 +80,29 @@ class TerminalPerson:
             way = f"swing its foot to the {'back' if angle > 0 else 'front'}"
         else:
             way = f"roll it {'forward' if angle > 0 else 'backward'}"
-        self._answer(f"{full_name(joint)}: {way} by about {abs(math.degrees(angle)):.0f} deg, leave it there, then Enter.")
+        self._enter(f"{full_name(joint)}: {way} by about {abs(math.degrees(angle)):.0f} deg, leave it there, then Enter.")
 
     def straighten(self, leg: str) -> None:
         """Ask for a leg that hangs straight."""
-        self._answer(f"{full_name(leg)}: hold it straight down, wheel's centre under the hip, then Enter.")
+        self._enter(f"{full_name(leg)}: hold it straight down, wheel's centre under the hip, then Enter.")
 
     def tilt(self, seconds: float, **angles: float) -> None:
         """Ask for a body that is turned."""
         names = {"roll": "right side down", "pitch": "nose down", "yaw": "nose to the left"}
         ways = [f"{names[name]} by about {math.degrees(angle):.0f} deg" for name, angle in angles.items()]
         way = " and ".join(ways) or "level, as it was before"
-        self._answer(f"Robot: press Enter, then turn it {way}, smoothly within {seconds:g} s, and keep it still there.")
+        self._enter(f"Robot: press Enter, then turn it {way}, smoothly within {seconds:g} s, and keep it still there.")
 
     def brake(self, joint: str, trouble: str = "") -> None:
         """Ask for a hand on a wheel, or at a leg's end."""
         where = "the tyre firmly, away from gears and leg; watch the supply"
         if joint in LEGS:
             where = "its end firmly, away from the hip; it will push to the back"
-        self._answer(f"{trouble}{full_name(joint)}: hold {where}. Then Enter.")
+        self._enter(f"{trouble}{full_name(joint)}: hold {where}. Then Enter.")
 
     def release(self, joint: str) -> None:
         """Say that it may be let go."""
-        self._answer(f"{full_name(joint)}: its motor is off, let go, then Enter.")
+        self._enter(f"{full_name(joint)}: its motor is off, let go, then Enter.")
 
     def watch_supply(self) -> None:
         """Do nothing: a human looks by himself."""

@@ -153,6 +153,8 @@ class Commissioning:
                 raise
             state, reason = FAILED, f"{error}, in {TRIES} tries"
             self._stand.begin()  # no run: motors that were stopped did not follow its commands
+        except SkippedError:
+            return StandResult(test.name, SKIPPED, repeated=repeated)
         except QuitError as asked:
             state, reason = STOPPED, str(asked) or "asked to"
         except PowerError as error:

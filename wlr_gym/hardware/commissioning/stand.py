@@ -36,6 +36,8 @@ PERIOD = 0.02
 TOP_SPEED = 3.0
 #: rad that a leg may be asked to move by, and rad/s it moves with.
 LARGEST_LEAN, LEAN_SPEED = 0.12, 0.5
+#: rad: by which two readings of a leg at rest may differ.
+_READING = 0.01
 #: Part of the supply on a motor that is held: a wheel pulls with 0.3 N m, 9 N at the rim, a leg with 1.5 N m, 11 N at its end.
 LOW_PWM = 0.2
 #: Part of the stall torque above which a motor that should turn freely is blocked, and rows in a row.
@@ -204,8 +206,17 @@ class Stand:
         self.servos.set(leg, "profile_velocity", max(1, count))
 
     def switch_on(self, joints: Iterable[str]) -> None:
-        """Switch torque on and arm the watchdogs; the servos' registers say what happens then."""
+        """Switch torque on and arm the watchdogs; the servos' registers say what happens then.
+
+        Raises:
+            QuitError: somebody asked for a stop, during a question too.
+            TroubleError: a leg would go farther than :data:`LARGEST_LEAN`.
+        """
+        if asked := self.operator.take():
+            raise QuitError(asked)
         joints = list(joints)
+        for leg in [joint for joint in joints if joint in LEGS]:
+            self._check_way(leg)
         self._on.update(joints)
         self.sign_of_life(LONGEST_BUSY)
         for joint in joints:
@@ -215,6 +226,15 @@ class Stand:
         self._armed.update(joints)
         for joint in sorted(joints, key=lambda joint: JOINTS.index(joint) % len(LEGS)):  # no bus is silent for long meanwhile
             self.servos.set(joint, "bus_watchdog", watchdog_count(self.hardware.safety.watchdog))
+
+    def _check_way(self, leg: str) -> None:
+        """See that a leg is no farther from its setpoint than any test asks: a hand may have moved it."""
+        counts = np.zeros(len(JOINTS))
+        k = JOINTS.index(leg)
+        counts[k] = self.servos.get(leg, "present_position")
+        way = self._goal(leg) - float(self.servos.joint_map.position(counts)[k])
+        if not abs(way) <= LARGEST_LEAN + _READING:
+            raise TroubleError(f"{leg}: {way:+.2f} rad from its setpoint, expected {LARGEST_LEAN:g} at most: turn it less")
 
     def switch_off(self, joints: Iterable[str]) -> None:
         """Switch single motors off, and disarm their watchdogs; what they are to do stays in their registers.
@@ -316,7 +336,7 @@ class Stand:
                 break
             self.clock.wait_until(self.clock.now() + _OFF_PAUSE)
             servos.reopen_gone()
-            left = servos.torque_off(1)
+            left = servos.torque_off(1, left)
         with contextlib.suppress(ConnectionError, NoAnswerError, RefusedError):
             for joint in JOINTS:
                 if joint not in left:
