@@ -170,6 +170,25 @@ def test_quaternions_of_tables(tmp_path):
         assert (np.nanmax(np.abs(found - yaw[: len(found)])) < 1e-9) == right, field
 
 
+@pytest.mark.parametrize("missing", [{"qw": [9]}, {"qw": [20], "qx": [30], "qy": [40], "qz": [50]}], ids=["one", "each"])
+def test_a_quaternion_with_empty_cells_is_a_lost_frame(tmp_path, frame, missing):
+    yaw = 0.01 * np.arange(len(frame))
+    posed = frame.assign(qw=np.cos(yaw / 2), qx=0.0, qy=0.0, qz=np.sin(yaw / 2), px=yaw, py=0.0)
+    known = suggest_map(written(tmp_path / "whole.csv", posed.to_csv(index=False))).map.model_dump()
+    pose = {name: {"topic": "table", "field": field} for name, field in
+        (("cam_x", "px"), ("cam_y", "py"), ("cam_yaw", "q.yaw"))}  # fmt: skip
+    for part, rows in missing.items():
+        posed.loc[rows, part] = np.nan
+    path = written(tmp_path / "a.csv", posed.to_csv(index=False))
+    (imported,) = import_log(path, tmp_path / "runs", {**known, "channels": {**known["channels"], **pose}})
+    found = pandas.read_parquet(imported.path)
+    lost = sorted(row for rows in missing.values() for row in rows)
+    assert np.flatnonzero(found["cam_yaw"].isna()).tolist() == np.flatnonzero(found["cam_x"].isna()).tolist() == lost
+    right = np.delete(np.arange(len(found)), lost)
+    assert np.allclose(found["cam_yaw"][right], yaw[right])
+    assert any(f"{len(lost)} lost frame" in note for note in imported.notes)
+
+
 @pytest.mark.parametrize(("x", "yaw", "is_pose"), [("x", "yaw", True), ("cam_x", "cam_heading", True), ("flow_x", "yaw", False),
     ("x", "imu_yaw", False), ("target_x", "target_yaw", False)])  # fmt: skip
 def test_a_pose_of_a_table_is_of_columns_that_hold_one(tmp_path, frame, x, yaw, is_pose):
