@@ -76,6 +76,28 @@ def test_decimal_commas_survive_rows_that_are_no_numbers(tmp_path, frame):
     check_same(read(written(tmp_path / "a.csv", "\n".join(lines))), frame)
 
 
+def test_the_decimal_sign_is_that_of_all_rows(tmp_path, frame):
+    whole = frame.copy()
+    whole.loc[0, frame.columns.drop("time_ms")] = 0.0
+    lines = whole.to_csv(index=False, sep=";", decimal=",").replace(",0;", ";").replace(",0\n", "\n").splitlines()
+    assert "," not in lines[1]
+    check_same(read(written(tmp_path / "a.csv", "\n".join(lines))), whole)
+    remarks = frame.assign(remark="").astype({"remark": object})
+    remarks.loc[3, "remark"] = "moved by 1,5 m"
+    check_same(read(written(tmp_path / "b.csv", remarks.to_csv(index=False, sep=";"))), frame)
+
+
+def test_a_table_of_rostopic(tmp_path, frame):
+    """Its line of names begins like a comment; headers hold a text."""
+    nanoseconds = 1_700_000_000_000_000_000 + (frame["time_ms"] * 1e6).round().astype("int64")
+    table = frame.drop(columns="time_ms").add_prefix("field.")
+    table.insert(0, "field.header.frame_id", "base")
+    table.insert(0, "%time", nanoseconds)
+    topic = read(written(tmp_path / "a.csv", table.to_csv(index=False))).topics["table"]
+    assert topic.received.tolist() == nanoseconds.tolist()
+    assert np.array_equal(topic.fields["field.ax"][1], frame["ax"])
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_a_row_that_was_cut_off_is_left_out_and_said(tmp_path, frame, text, encoding):
     lines = text.splitlines(keepends=True)
