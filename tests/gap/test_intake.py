@@ -1,6 +1,9 @@
 """Bad data are named with run, channel, time and remedy before anything is fitted; effects, losses and wear are no bad data."""
 
+from pathlib import Path
+
 import numpy as np
+import pandas
 import pytest
 from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 
@@ -9,6 +12,8 @@ from wlr_gym.data.write import write_run
 from wlr_gym.gap import analyse
 from wlr_gym.gap.analysis import NO_PROFILE
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
+from wlr_gym.gap.robot.intake.check import ChannelFault
+from wlr_gym.gap.robot.intake.joints import wrapped
 from wlr_gym.gap.robot.open import open_robot
 
 
@@ -203,3 +208,11 @@ def test_a_wheel_that_others_drag_keeps_its_sign(good, tmp_path):
     """Its effort brakes in whole runs, as its controller asks for."""
     dragged = record(lively, spaced(7.0), [EFFECTS[7]], noise=5).table
     assert not findings([dragged], tmp_path)
+
+
+@pytest.mark.parametrize("every", [0.02, 0.1, 0.2])
+def test_angles_that_start_anew_show_in_slow_rows_too(every):
+    t = np.arange(0.0, 20.0, every)
+    for angle, is_wrapped in ((3.0 * t % (2 * np.pi), True), (3.0 * t, False)):
+        run = Run(pandas.DataFrame({"t": t, "pos_wheel_lf": angle}), META, Path("run_01.csv"))
+        assert isinstance(wrapped(run, "pos_wheel_lf", ROBOT), ChannelFault) == is_wrapped

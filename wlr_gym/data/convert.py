@@ -7,7 +7,7 @@ from pathlib import Path
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import META_FILE, SUFFIXES, RunMeta
 from wlr_gym.data.read import read_dataset, read_run
-from wlr_gym.data.robot_file import note_robot, robot_of_meta
+from wlr_gym.data.robot_file import note_robot, own_robot
 from wlr_gym.data.write import write_meta, write_run
 
 
@@ -38,4 +38,5 @@ def convert(source: str | Path, target: str | Path, suffix: str | None = None) -
 
 def _moved(meta: RunMeta, source: Path, target: Path) -> RunMeta:
     """Return meta data for another folder; a robot file that stands beside the runs goes with them."""
-    return meta if meta.robot_hash is None else note_robot(target, robot_of_meta(meta, source), meta)
+    robot = own_robot(meta, source) if target.resolve() != source.resolve() else None
+    return meta if robot is None else note_robot(target, robot, meta)

@@ -41,6 +41,13 @@ def write_robot(path: Path, robot: Robot) -> None:
     write_text(path, f"# Every number of the robot of this folder; fingerprint {robot_hash(robot)}\n{text}")
 
 
+def noted(robot: Robot, meta: RunMeta) -> RunMeta:
+    """Return the meta data that :func:`note_robot` returns; nothing is written."""
+    if is_shipped(robot):
+        return meta.model_copy(update={"robot": robot.name, "robot_hash": None})
+    return meta.model_copy(update={"robot": ROBOT_FILE, "robot_hash": robot_hash(robot)})
+
+
 def note_robot(folder: Path, robot: Robot, meta: RunMeta) -> RunMeta:
     """Return the meta data of runs in ``folder`` so that they find their robot wherever the folder goes.
 
@@ -49,36 +56,52 @@ def note_robot(folder: Path, robot: Robot, meta: RunMeta) -> RunMeta:
     Raises:
         InputError: the folder holds another robot.
     """
-    if is_shipped(robot):
-        return meta.model_copy(update={"robot": robot.name, "robot_hash": None})
-    make_output_folder(folder)
-    write_robot(folder / ROBOT_FILE, robot)
-    return meta.model_copy(update={"robot": ROBOT_FILE, "robot_hash": robot_hash(robot)})
+    found = noted(robot, meta)
+    if found.robot == ROBOT_FILE:
+        make_output_folder(folder)
+        write_robot(folder / ROBOT_FILE, robot)
+    return found
 
 
-def robot_of_meta(meta: RunMeta, folder: Path) -> Robot:
+def names_file(robot: str | None) -> bool:
+    """Whether meta data name their robot by a file; its fingerprint may be noted or not."""
+    return robot is not None and Path(robot).suffix in {".yaml", ".yml"}
+
+
+def own_robot(meta: RunMeta, folder: Path) -> Robot | None:
+    """Return the robot that has to go with meta data to another folder; None = they name one that ships, or none.
+
+    Raises:
+        InputError: see :func:`robot_of_meta`.
+    """
+    return robot_of_meta(meta, folder) if names_file(meta.robot) else None
+
+
+def robot_of_meta(meta: RunMeta, folder: Path, file: str = META_FILE) -> Robot:
     """Return the robot that meta data name: a file (relative to them), a config, or the ``name`` inside one; None = nominal.
+
+    ``file`` in ``folder`` has them, for messages.
 
     Raises:
         InputError: no such robot (the message lists the shipped ones), or a file that changed since the runs were recorded.
     """
     if meta.robot is None:
         return load_robot()
-    if Path(meta.robot).suffix not in {".yaml", ".yml"}:
-        return load_robot(_shipped(meta.robot, folder))
+    if not names_file(meta.robot):
+        return load_robot(_shipped(meta.robot, folder / file))
     path = folder / meta.robot
     robot = load_robot(path)
     if meta.robot_hash not in (None, found := robot_hash(robot)):
         raise InputError(
-            f"{path}: its fingerprint is {found}, {META_FILE} says {meta.robot_hash}: it is not the robot of these runs any "
+            f"{path}: its fingerprint is {found}, {file} says {meta.robot_hash}: it is not the robot of these runs any "
             "more; name the one to use with --robot"
         )
     return robot
 
 
-def _shipped(name: str, folder: Path) -> Any:
+def _shipped(name: str, file: Path) -> Any:
     shipped = shipped_robots()
     if name not in shipped:
-        error = unknown_name("robot", name, shipped, str(folder / META_FILE))
-        raise InputError(f"{error}; a robot of your own is named by its file (a path from {META_FILE} on), or with --robot")
+        error = unknown_name("robot", name, shipped, str(file))
+        raise InputError(f"{error}; a robot of your own is named by its file (a path from {file.name} on), or with --robot")
     return shipped[name]

@@ -8,7 +8,9 @@ from foreign_logs import NAMES, lab_frame, made_up, rows_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
+from wlr_gym.data.format import COLUMNS
 from wlr_gym.data.logs import import_log, suggest_joints, suggest_map
+from wlr_gym.data.logs.units import factor
 from wlr_gym.physics.servo import current_law
 from wlr_gym.robot import JOINTS, load_robot
 
@@ -64,6 +66,14 @@ def test_a_unit_that_makes_no_sense_is_refused(tmp_path, robot, unit, name, read
     with pytest.raises(InputError, match=message):
         import_log(log, tmp_path / "runs", read_as(log, read, name), robot=robot)
     assert not (tmp_path / "runs").exists()
+
+
+def test_every_channel_has_units_or_says_that_it_has_none():
+    robot = load_robot()
+    assert all(factor(column, one.unit, robot, "map") == 1.0 for column, one in COLUMNS.items() if one.unit != "-")
+    assert factor("cam_age", "ms", robot, "map") == factor("flow_age", "ms", robot, "map") == 1e-3
+    with pytest.raises(InputError, match=r"^map: channel 'flow_quality': unit 'ms': expected none"):
+        factor("flow_quality", "ms", robot, "map")
 
 
 def test_an_effort_whose_unit_only_its_size_shows_is_a_guess(tmp_path):

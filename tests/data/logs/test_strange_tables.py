@@ -76,6 +76,28 @@ def test_decimal_commas_survive_rows_that_are_no_numbers(tmp_path, frame):
     check_same(read(written(tmp_path / "a.csv", "\n".join(lines))), frame)
 
 
+def test_the_decimal_sign_is_that_of_all_rows(tmp_path, frame):
+    whole = frame.copy()
+    whole.loc[0, frame.columns.drop("time_ms")] = 0.0
+    lines = whole.to_csv(index=False, sep=";", decimal=",").replace(",0;", ";").replace(",0\n", "\n").splitlines()
+    assert "," not in lines[1]
+    check_same(read(written(tmp_path / "a.csv", "\n".join(lines))), whole)
+    remarks = frame.assign(remark="").astype({"remark": object})
+    remarks.loc[3, "remark"] = "moved by 1,5 m"
+    check_same(read(written(tmp_path / "b.csv", remarks.to_csv(index=False, sep=";"))), frame)
+
+
+def test_a_table_of_rostopic(tmp_path, frame):
+    """Its line of names begins like a comment; headers hold a text."""
+    nanoseconds = 1_700_000_000_000_000_000 + (frame["time_ms"] * 1e6).round().astype("int64")
+    table = frame.drop(columns="time_ms").add_prefix("field.")
+    table.insert(0, "field.header.frame_id", "base")
+    table.insert(0, "%time", nanoseconds)
+    topic = read(written(tmp_path / "a.csv", table.to_csv(index=False))).topics["table"]
+    assert topic.received.tolist() == nanoseconds.tolist()
+    assert np.array_equal(topic.fields["field.ax"][1], frame["ax"])
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_a_row_that_was_cut_off_is_left_out_and_said(tmp_path, frame, text, encoding):
     lines = text.splitlines(keepends=True)
@@ -168,6 +190,25 @@ def test_quaternions_of_tables(tmp_path):
         (imported,) = import_log(path, tmp_path / field, {**known.model_dump(), "channels": channels})
         found = pandas.read_parquet(imported.path)["cam_yaw"].to_numpy()
         assert (np.nanmax(np.abs(found - yaw[: len(found)])) < 1e-9) == right, field
+
+
+@pytest.mark.parametrize("missing", [{"qw": [9]}, {"qw": [20], "qx": [30], "qy": [40], "qz": [50]}], ids=["one", "each"])
+def test_a_quaternion_with_empty_cells_is_a_lost_frame(tmp_path, frame, missing):
+    yaw = 0.01 * np.arange(len(frame))
+    posed = frame.assign(qw=np.cos(yaw / 2), qx=0.0, qy=0.0, qz=np.sin(yaw / 2), px=yaw, py=0.0)
+    known = suggest_map(written(tmp_path / "whole.csv", posed.to_csv(index=False))).map.model_dump()
+    pose = {name: {"topic": "table", "field": field} for name, field in
+        (("cam_x", "px"), ("cam_y", "py"), ("cam_yaw", "q.yaw"))}  # fmt: skip
+    for part, rows in missing.items():
+        posed.loc[rows, part] = np.nan
+    path = written(tmp_path / "a.csv", posed.to_csv(index=False))
+    (imported,) = import_log(path, tmp_path / "runs", {**known, "channels": {**known["channels"], **pose}})
+    found = pandas.read_parquet(imported.path)
+    lost = sorted(row for rows in missing.values() for row in rows)
+    assert np.flatnonzero(found["cam_yaw"].isna()).tolist() == np.flatnonzero(found["cam_x"].isna()).tolist() == lost
+    right = np.delete(np.arange(len(found)), lost)
+    assert np.allclose(found["cam_yaw"][right], yaw[right])
+    assert any(f"{len(lost)} lost frame" in note for note in imported.notes)
 
 
 @pytest.mark.parametrize(("x", "yaw", "is_pose"), [("x", "yaw", True), ("cam_x", "cam_heading", True), ("flow_x", "yaw", False),

@@ -93,17 +93,17 @@ def _dialect(path: Path) -> _Dialect:
     skipped, separator = _lines_before(lines)
     if skipped >= len(lines):
         raise InputError(f"{path}: no row in it")
-    names, first = lines[skipped], lines[skipped + 1] if skipped + 1 < len(lines) else ""
-    separator = separator or _separator(names)
-    if skipped and _all_numbers(_split(names, separator)):  # names in the last comment, as numpy writes them
-        comment = lines[skipped - 1].lstrip("#%/ ")
-        if len(_split(comment, separator)) == len(_split(names, separator)):
-            names, first, skipped = comment, names, skipped - 1
-    fields = _split(names, separator)
+    separator = separator or _separator(lines[skipped])
+    fields = _split(lines[skipped], separator)
+    first = [field for field in fields if field][:1]
+    if skipped and first and _all_numbers(first):  # names in the last comment, as numpy and rostopic write them
+        comment = _split(lines[skipped - 1].lstrip("#%/ "), separator)
+        if len(comment) == len(fields):
+            fields, skipped = comment, skipped - 1
     if _all_numbers(fields):
-        raise InputError(f"{path}: its first line holds numbers, not the names of columns: '{names[:60]}'")
-    comma = separator != "," and re.search(r"\d,\d", first) is not None
-    return _Dialect(encoding, separator, "," if comma else ".", skipped + 1, tuple(_unique(fields, path)))
+        raise InputError(f"{path}: its first line holds numbers, not the names of columns: '{lines[skipped][:60]}'")
+    decimal = _decimal(lines[skipped + 1 :], separator) if separator != "," else "."
+    return _Dialect(encoding, separator, decimal, skipped + 1, tuple(_unique(fields, path)))
 
 
 def _lines_before(lines: list[str]) -> tuple[int, str]:
@@ -120,6 +120,13 @@ def _lines_before(lines: list[str]) -> tuple[int, str]:
 def _separator(names: str) -> str:
     found = max(",;\t", key=names.count)
     return found if names.count(found) else " "
+
+
+def _decimal(rows: list[str], separator: str) -> str:
+    """Return the sign that more fields of some rows have in a number; a row of whole numbers, or a remark, says nothing."""
+    cells = [cell for row in rows for cell in _split(row, separator)]
+    found = [number.group(1) for cell in cells if (number := re.fullmatch(r"[-+]?\d*([.,])\d+([eE][-+]?\d+)?", cell))]
+    return max(".,", key=found.count)
 
 
 def _split(line: str, separator: str) -> list[str]:

@@ -20,6 +20,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_table
+from wlr_gym.data.format import RunMeta
 from wlr_gym.data.logs.exported import read_exported
 from wlr_gym.data.logs.map import NO_PROFILE, LogMap, Resolved, map_text, read_map, resolve
 from wlr_gym.data.logs.messages import RUN
@@ -31,8 +32,9 @@ from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Log, Share
 from wlr_gym.data.logs.units import CURRENTS, check_effort, is_effort
 from wlr_gym.data.record import next_run
+from wlr_gym.data.robot_file import note_robot, noted, own_robot, robot_of_meta
 from wlr_gym.data.write import check_meta, write_meta, write_run
-from wlr_gym.robot import Robot, load_robot
+from wlr_gym.robot import Robot, load_robot, robot_hash
 
 MAP_FILE, RECORD_FILE = "map.yaml", "import.yaml"
 #: Share of an import that reading the log takes.
@@ -68,8 +70,9 @@ def suggest_map(
     Raises:
         InputError: a log that cannot be read, or that holds nothing known; see :func:`wlr_gym.data.logs.suggest.propose`.
     """
-    found = next(read_logs(log, most=MOST, tell=tell))
-    return propose(found, load_robot(robot) if robot else load_robot(), given)
+    meta = parse_config(RunMeta, (given or {}).get("meta") or {}, "map: meta")
+    chosen = _robot_of(meta, robot)
+    return propose(next(read_logs(log, most=MOST, tell=tell)), chosen, given)
 
 
 def import_log(
@@ -88,15 +91,16 @@ def import_log(
         out: folder of runs; made if it is not there.
         map: what topics and fields mean: a map, what a map file says, or its path. None = the one in ``out``, else proposed; a
             run of ours needs none.
-        robot: that the runs are of: name or file; None = as the map's ``meta`` says, else the nominal one.
+        robot: that the runs are of: name or file; None = as the map's ``meta`` says (a path from the map file on, of a map
+            that is no file from here), else the nominal one. It goes with the runs.
         split: s; a recording becomes runs of about this length, cut where the robot is quietest. None = one run, of long
             recordings several (:data:`wlr_gym.data.logs.parts.LONGEST`).
         suffix: format of the runs.
         tell: called with the share that was read.
 
     Raises:
-        InputError: an unreadable log, a map that does not fit, a run that a reader would refuse, another map in ``out``; the
-            message names file, topic and field, and nothing is written.
+        InputError: an unreadable log, a map that does not fit or names another robot, a run that a reader would refuse, another
+            map in ``out``; the message names file, topic and field, and nothing is written.
     """
     log, out = Path(log), Path(out)
     if split is not None and not split > 0.0:
@@ -112,9 +116,8 @@ def import_log(
     elif not isinstance(map, LogMap):
         data = read_map(map) if isinstance(map, str | Path) else dict(map)
         map = parse_config(LogMap, data, str(map) if isinstance(map, str | Path) else "map")
-    entry = robot or map.meta.robot
-    chosen = load_robot(entry) if entry else load_robot()
-    meta = map.meta.model_copy(update={"robot": map.meta.robot or robot or chosen.name})
+    chosen = _robot_of(map.meta, robot)
+    meta = noted(chosen, map.meta)
     resolved = resolve(map, chosen, "map")
     check_map_file(out / MAP_FILE, map)
     check_meta(out, meta)
@@ -124,9 +127,10 @@ def import_log(
         made = list(_make_runs(log, map, resolved, chosen, split, suffix, folder, check_new, tell))
         if not made:
             raise InputError(f"{log}: nothing in it")
+        write_meta(out, note_robot(out, chosen, meta))
         write_map(out / MAP_FILE, map)
-        said = (*(() if meta.states_profile else (NO_PROFILE,)), *(() if entry else _unnamed_robot(resolved, chosen)))
-        write_meta(out, meta)
+        is_named = robot is not None or map.meta.robot is not None
+        said = (*(() if meta.states_profile else (NO_PROFILE,)), *(() if is_named else _unnamed_robot(resolved, chosen)))
         imported = []
         for one in made:
             imported.append(_moved(replace(one, notes=(*one.notes, *said)), next_run(out, suffix)))
@@ -141,20 +145,43 @@ def check_map_file(path: Path, map: LogMap) -> None:
     Raises:
         InputError: the file is there, and says something else.
     """
-    if path.exists() and parse_config(LogMap, read_map(path), str(path)) != map:
+    if path.exists() and _beside_robot(parse_config(LogMap, read_map(path), str(path))) != _beside_robot(map):
         hint = f"import with it (--map {path}), move it away, or name another folder (--out)"
         raise InputError(f"{path}: is there already, and is another map: {hint}")
 
 
 def write_map(path: Path, map: LogMap) -> None:
-    """Write a map; one that is there and says the same is left alone.
+    """Write a map, and a robot file that it names beside it; one that is there and says the same is left alone.
 
     Raises:
         InputError: the one that is there says something else.
     """
     check_map_file(path, map)
     if not path.exists():
-        write_text(path, map_text(map))
+        robot = own_robot(map.meta, Path())
+        if robot is not None:
+            note_robot(path.parent, robot, map.meta)
+        write_text(path, map_text(_beside_robot(map)))
+
+
+def _beside_robot(map: LogMap) -> LogMap:
+    """Return a map as it is written: a robot file that it names stands beside it."""
+    robot = own_robot(map.meta, Path())
+    return map if robot is None else map.model_copy(update={"meta": noted(robot, map.meta)})
+
+
+def _robot_of(meta: RunMeta, robot: str | None) -> Robot:
+    """Return the robot of an import, as a map's meta data or ``robot`` says.
+
+    Raises:
+        InputError: no such robot, or the two say different ones.
+    """
+    named = robot_of_meta(meta, Path(), "map")
+    chosen = load_robot(robot) if robot else named
+    if meta.robot is not None and chosen != named:  # whole: the fingerprint leaves out what makes torques of currents
+        names = [f"'{one.name}' ({robot_hash(one)})" for one in (named, chosen)]
+        raise InputError(f"map: meta.robot = {meta.robot}: {names[0]}, and --robot {robot}: {names[1]}; expected one robot")
+    return chosen
 
 
 def is_own(log: Path) -> bool:

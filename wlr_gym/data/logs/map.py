@@ -15,6 +15,7 @@ from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_yam
 from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
 from wlr_gym.data.logs.names import words
 from wlr_gym.data.logs.units import factor
+from wlr_gym.data.robot_file import names_file
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 #: Names that stand for several channels.
@@ -144,13 +145,15 @@ def _handedness(axes: tuple[str, ...]) -> int:
 
 
 def read_map(path: str | Path) -> dict[str, Any]:
-    """Read a map file as it is written, to lay it over a proposed one.
+    """Read a map file as it is written, to lay it over a proposed one; a robot file's path goes on from here, not from the map.
 
     Raises:
         InputError: no YAML, an unknown key, a value of the wrong kind; the message names the nearest valid name.
     """
     data = read_yaml(path) or {}
-    parse_config(LogMap, data, str(path))
+    robot = parse_config(LogMap, data, str(path)).meta.robot
+    if robot is not None and names_file(robot):
+        data["meta"]["robot"] = str(Path(path).parent / robot)
     return data
 
 

@@ -60,11 +60,14 @@ def lost_frames(topic: Topic, field: str, use: str, where: str) -> Times:
 
 
 def _rotations(topic: Topic, stem: str, use: str, where: str) -> tuple[Times, Array, NDArray[np.bool_]]:
-    """Return times, quaternions (n, 4), and which of them are no rotations."""
+    """Return times, quaternions (n, 4), and which of them are no rotations: of a table's row some parts may be missing."""
     names = next((names for names in _quaternions(stem) if names[0] in topic.fields), _quaternions(stem)[0])
     parts = [topic.series(name, use, where) for name in names]
-    quaternion = np.stack([values for _, values in parts], axis=1)
-    return parts[0][0], quaternion, ~(np.linalg.norm(quaternion, axis=1) >= 0.5)
+    every = np.unique(np.concatenate([at for at, _ in parts]))
+    quaternion = np.full((len(every), len(parts)), np.nan)
+    for part, (at, values) in enumerate(parts):
+        quaternion[np.searchsorted(every, at), part] = values
+    return every, quaternion, ~(np.linalg.norm(quaternion, axis=1) >= 0.5)
 
 
 def quaternion_names(stem: str) -> set[str]:

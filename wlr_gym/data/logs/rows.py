@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, REQUIRED
+from wlr_gym.data.logs.joint_series import with_torque_off, without_wraps
 from wlr_gym.data.logs.map import LogMap, Resolved
 from wlr_gym.data.logs.poses import ANGLES, lost_frames, pose_angle, quaternion_names
 from wlr_gym.data.logs.takes import TAKES, bridged, hole
@@ -112,7 +113,7 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between:
     series: dict[str, tuple[Times, Array]] = {}
     odd = [*_odd_times(log, found, resolved, between), *_said_lost(lost, found, between)]
     for column, source in resolved.items():
-        at, values = _series(log, found, source, lost)
+        at, values = _series(log, found, resolved, column, lost)
         if len(at) < 2:
             text = f"topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2"
             if between is None or column in REQUIRED:
@@ -120,6 +121,10 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between:
             odd.append(f"'{column}' is left out: {text}")
             continue
         series[column] = (_known(at, series.values()), values)
+    for joint in JOINTS:
+        angles, said = without_wraps(series, joint)
+        series[f"pos_{joint}"] = (series[f"pos_{joint}"][0], angles)
+        odd += [said] if said else []
     resolved = {column: source for column, source in resolved.items() if column in series}
     times, notes = _row_times(log, found, resolved, series, between)
     times, more = _complete(times, series, resolved, log)
@@ -138,7 +143,7 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between:
         start = table[wheel][0]
         table[wheel] = table[wheel] - start
         samples[wheel] = Samples(samples[wheel].t, samples[wheel].values - start)
-    notes = [*odd, *notes, *more, *_silent(times, series, resolved)]
+    notes = [*odd, *notes, *more, *_silent(times, series, resolved), *_off(table)]
     table = {name: table[name] for name in COLUMNS if name in table}
     return MadeRun(table, samples, tuple(facts), origin, tuple(notes))
 
@@ -215,9 +220,14 @@ def _repetitions(times: Times) -> int:
     return len(times) - len(np.unique(times))
 
 
-def _series(log: Log, found: LogMap, source: Resolved, lost: Mapping[str, Times]) -> tuple[Times, Array]:
+def _series(
+    log: Log, found: LogMap, resolved: Mapping[str, Resolved], column: str, lost: Mapping[str, Times]
+) -> tuple[Times, Array]:
     """Return a channel's samples in SI units on the common clock, in the order of time; times once only."""
+    source = resolved[column]
     topic, clock = log.topic(source.topic), found.use(source.topic)
+    if column in COMMANDS and (angle := resolved[column.replace("cmd", "pos")]).topic == source.topic:
+        topic = with_torque_off(topic, source.field, angle.field)
     where = f"{log.name}: channel '{source.column}'"
     if source.field in topic.fields or source.field.rpartition(".")[2] not in ANGLES:
         at, raw = topic.series(source.field, clock.use, where)
@@ -232,17 +242,7 @@ def _series(log: Log, found: LogMap, source: Resolved, lost: Mapping[str, Times]
         keep &= np.isfinite(raw)
     if not keep.all():
         at, raw = at[keep], raw[keep]
-    values = source.factor * raw
-    if source.column in (f"pos_{joint}" for joint in JOINTS):
-        values = _without_wraps(values, at)
-    return at, source.sign * (values - source.zero)
-
-
-def _without_wraps(values: Array, at: Times) -> Array:
-    """Undo jumps of a turn in an angle that starts anew after a turn or half of one."""
-    steps = np.abs(np.diff(values))
-    wraps = (steps > 1.8 * np.pi) & (np.diff(at) < 1e8)
-    return np.unwrap(values) if wraps.any() and np.ptp(values) < 2.2 * np.pi else values
+    return at, source.sign * (source.factor * raw - source.zero)
 
 
 def rows_topic(found: LogMap, resolved: Mapping[str, Resolved]) -> str:
@@ -340,6 +340,13 @@ def _silent(times: Times, series: Mapping[str, tuple[Times, Array]], resolved: M
             said.add(resolved[name].topic)
             text = f"its last message is held over {held.sum()} rows ({held.sum() * step * 1e-9:.1f} s)"
             yield f"topic '{resolved[name].topic}': silent for up to {age.max() * 1e-9:.1f} s: {text}"
+
+
+def _off(table: Mapping[str, Array]) -> Iterator[str]:
+    off = np.isnan([table[name] for name in COMMANDS])
+    if off.any():
+        column = COMMANDS[int(np.argmax(off.any(axis=1)))]
+        yield f"{off.any(axis=0).sum()} rows have no setpoint, '{column}' among them: torque off"
 
 
 # ---- values at the rows' times ---------------------------------------------------------------------------------------

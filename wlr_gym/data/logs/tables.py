@@ -230,4 +230,4 @@ def numeric_topic(frame: pandas.DataFrame, times: NDArray[np.int64], wanted: Col
         values = frame[name].to_numpy(np.float64, na_value=np.nan)
         known = np.isfinite(values)
         fields[name] = (rows, values) if known.all() else (rows[known], values[known])
-    return Topic(TABLE, "table", np.asarray(times, np.int64), None, fields, known=frozenset(names))
+    return Topic(TABLE, TABLE, np.asarray(times, np.int64), None, fields, known=frozenset(names))

@@ -26,6 +26,7 @@ FACTORS: dict[str, dict[str, float]] = {
     "N m": {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2},
     "m/s2": {"m/s2": 1.0, "g": _G, "mg": _G * 1e-3},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "s": {"s": 1.0, "ms": 1e-3},
     "V": {"V": 1.0, "mV": 1e-3},
 }  # fmt: skip
 #: Currents mean a torque by the robot's nominal torque constants; a count is one of Present Current (legs), Load (wheels).
@@ -39,7 +40,7 @@ _MOVED = 0.5
 def units_of(column: str) -> Iterable[str]:
     """Return the units that a column may be in, in a log."""
     unit = COLUMNS[column].unit
-    return [*FACTORS[unit], *(CURRENTS if unit == "N m" else ())]
+    return [*FACTORS.get(unit, ()), *(CURRENTS if unit == "N m" else ())]
 
 
 def is_effort(column: str) -> bool:
@@ -91,8 +92,10 @@ def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
     of_encoder = {"rad": encoder.position, "rad/s": encoder.velocity}.get(si, 0.0)
     if unit == "count" and of_encoder > 0.0:
         return of_encoder
-    if unit in FACTORS[si]:
+    if unit in FACTORS.get(si, ()):
         return FACTORS[si][unit]
+    if si not in FACTORS:
+        raise InputError(f"{where}: channel '{column}': unit '{unit}': expected none, it is a number from 0 to 1")
     if si != "N m" or unit not in CURRENTS:
         raise unknown_name("unit", unit, units_of(column), f"{where}: channel '{column}'")
     joint = JOINTS.index(column.removeprefix("eff_"))

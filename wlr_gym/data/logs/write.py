@@ -16,7 +16,7 @@ from wlr_gym.base.files import replace_file
 from wlr_gym.data.logs.display import display_messages
 from wlr_gym.data.logs.messages import Sent, clock_offset, definition, nanoseconds, row_messages, run_message, typestore
 from wlr_gym.data.read import Run
-from wlr_gym.data.robot_file import robot_of_meta
+from wlr_gym.data.robot_file import own_robot
 
 #: Formats by name, and the suffix of what is written.
 FORMATS = {"mcap": ".mcap", "rosbag2": ".bag2"}
@@ -122,7 +122,7 @@ def messages_of(run: Run) -> Iterator[Sent]:
     if len(close):
         raise InputError(f"{run.path}: row {close[0] + 1}, column 't': less than 1 ns after the row before")
     columns = [str(name) for name in run.table.columns]
-    robot = robot_of_meta(run.meta, run.path.parent) if run.meta.robot_hash else None
+    robot = own_robot(run.meta, run.path.parent)
     yield run_message(columns, times[0], offset, run.meta, run.simulation, run.name, robot)
     shown = display_messages(run, times)
     names = [name for name in columns if name != "t"]

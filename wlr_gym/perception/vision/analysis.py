@@ -18,7 +18,7 @@ from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, sa
 from wlr_gym.data.body_pose import rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import robot_of
-from wlr_gym.data.robot_file import robot_of_meta
+from wlr_gym.data.robot_file import own_robot
 from wlr_gym.data.write import write_run
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import detect
@@ -204,7 +204,7 @@ def save_video_analysis(analysis: VideoAnalysis, folder: Path) -> list[Path]:
     """Write run, slip table, samples, summary and plots into ``folder``; return their paths."""
     name = analysis.run.name
     run = analysis.run
-    robot = robot_of_meta(run.meta, run.path.parent) if run.meta.robot_hash else None
+    robot = own_robot(run.meta, run.path.parent)
     paths = [write_run(folder / f"{name}.parquet", run.table, run.meta, robot=robot)]
     for file, table in (("slip.csv", analysis.slip.table()), ("frames.csv", frame_table(analysis.samples, analysis.offset))):
         replace_file(folder / file, lambda temporary, table=table: table.to_csv(temporary, index=False, float_format="%.9g"))

@@ -14,8 +14,8 @@ from wlr_gym.robot.description import Motor
 
 #: Rows that a correlation needs.
 LEAST_ROWS = 100
-#: s between rows within which a joint cannot turn by half a turn.
-LONGEST_STEP = 0.1
+#: Share of the time of half a turn at no-load speed in which no joint gets half a turn further, be it dragged.
+TOO_QUICK = 0.5
 #: rad; a joint that is asked to move more than this ...
 ASKED = 0.2
 #: ... and moves less than this share of it is dead.
@@ -49,8 +49,9 @@ ASKED_VOLTAGE = 0.1
 
 
 def wrapped(run: Run, channel: str, robot: Robot) -> Outcome:
-    """Whether an angle starts anew after a turn: no joint gets half a turn further between two rows."""
-    jumps = np.flatnonzero((np.abs(np.diff(run[channel])) > np.pi) & (np.diff(run["t"]) < LONGEST_STEP))
+    """Whether an angle starts anew after a turn: no joint gets half a turn further between rows so close together."""
+    longest = TOO_QUICK * np.pi / _motor(robot, place(channel)).no_load_speed
+    jumps = np.flatnonzero((np.abs(np.diff(run[channel])) > np.pi) & (np.diff(run["t"]) < longest))
     if not len(jumps):
         return Sound.YES
     row = int(jumps[0]) + 1
