@@ -101,7 +101,7 @@ def test_the_normaliser_around_the_environment_is_part_of_the_policy(env, tmp_pa
 
 def test_a_wrapper_that_no_file_holds_is_refused(env, tmp_path):
     network = torch.nn.Linear(env.observation_space.shape[0], 8)
-    for wrapped in (VecFrameStack(env, 2), RescaleAction(gym.make(ID), -0.5, 0.5), NormalizeObservation(gym.make(ID))):
+    for wrapped in (VecFrameStack(env, 2), RescaleAction(gym.make(ID), np.float32(-0.5), np.float32(0.5)), NormalizeObservation(gym.make(ID))):
         with pytest.raises(InputError, match=rf"the wrapper {type(wrapped).__name__} changes observations or actions"):
             wlr_gym.import_policy(network, wrapped, tmp_path / "p.onnx")
     assert not (tmp_path / "p.onnx").exists()

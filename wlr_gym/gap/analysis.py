@@ -84,8 +84,7 @@ class FoundEffect:
             enough, the runs agree and no other name improves it more; nothing is refitted.
         gain: fall of minus two log posterior on the fitted runs when it was added, beside the effects selected before it.
         formula, units: of an unknown effect; empty otherwise.
-        validity: where the formula was tried, by what it reads: beyond that it is untested.
-        doc: what is missing, of a test rig's own law; empty = as the library says.
+        validity: where the formula was tried, by what it reads. doc: of a rig's own law; empty = as the library says.
     """
 
     name: str

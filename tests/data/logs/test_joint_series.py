@@ -45,7 +45,8 @@ def test_setpoints_of_another_rate_hold(tmp_path, alone):
     commands = [f"cmd_{joint}" for joint in JOINTS]
     sparse = table.assign(**{name: table[name].where(table.index % 5 == 0) for name in commands})
     if alone:
-        late = table[["t", *commands]][::5].assign(t=table["t"][::5] + 0.003)
+        late = table.loc[::5, ["t", *commands]]
+        late["t"] += 0.003
         sparse = pandas.concat([table.drop(columns=commands), late]).sort_values("t")
     sparse.to_csv(tmp_path / "a.csv", index=False)
     found, _ = imported(tmp_path / "a.csv", TABLE, tmp_path / "runs")
