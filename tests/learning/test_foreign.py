@@ -3,10 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import yaml
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
+from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import contract_of, make_policy, policy_environment
 
 torch = pytest.importorskip("torch")
@@ -85,6 +88,16 @@ def test_a_plain_network(env, tmp_path):
     np.testing.assert_allclose(act(tmp_path / "p.onnx", env, seen), expected, atol=1e-5)
     contract = contract_of(tmp_path / "p.onnx")
     assert (contract["agent"], contract["training"]["environment"]) == ("imported", ID)
+
+
+def test_a_network_for_a_task_file(tmp_path):
+    task = read_task("velocity").model_dump(mode="json", exclude_none=True)
+    task["observations"].pop("gyro")
+    (tmp_path / "narrow.yaml").write_text(yaml.safe_dump(task, sort_keys=False))
+    env = gym.make(ID, task=str(tmp_path / "narrow.yaml"))
+    wlr_gym.import_policy(torch.nn.Linear(env.reset()[0].size, 8), env, tmp_path / "p.onnx")
+    core = make_core(ID, 1, policy_environment(tmp_path / "p.onnx"))
+    make_policy(tmp_path / "p.onnx", core.contract())
 
 
 class Branch(torch.nn.Linear):

@@ -22,6 +22,7 @@ from wlr_gym.envs.tasks.terms import (
     TERMINATIONS,
     ObservationTerm,
 )
+from wlr_gym.policy.sources import FED
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, RobotSource, load_robot
 
 
@@ -132,6 +133,19 @@ def load_task(
     """Load a task for a robot, its numbers scaled for it; see :func:`read_task`. None = the task's own robot."""
     chosen = load_robot(read_task(source, overrides).robot if robot is None else robot)
     return build_task(read_task(source, overrides, chosen), chosen)
+
+
+def fed_as(file: str | Path, source: str | Path | Mapping[str, Any], robot: RobotSource | None) -> str | Path | dict[str, Any]:
+    """Return the task of ``source`` with what decides what a policy is fed taken from a task file, its numbers for a robot.
+
+    A file with other commands is another task, which holds as a whole.
+    """
+    chosen = load_robot(read_task(source).robot if robot is None else robot)
+    own, fed = (read_task(one, None, chosen).model_dump(mode="json", exclude_none=True) for one in (source, file))
+    if own["commands"]["terms"].keys() != fed["commands"]["terms"].keys():
+        return file
+    conditions = {key: value for key, value in own.items() if key not in FED}
+    return {**conditions, **{key: fed[key] for key in FED if key in fed}, "scaling": {}}
 
 
 def build_task(config: TaskConfig, robot: Robot) -> Task:
