@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,14 +117,23 @@ class Task:
         functions = [COMPUTED[name].function for name in self.computed_terms]
         for names, registry in ((self.rewards, REWARDS), (self.terminations, TERMINATIONS), (self.measures, MEASURES)):
             functions += [registry[name].function for name in names]
+        return self.shows_estimate or any(map(_reads_estimate, functions))
+
+    @property
+    def shows_estimate(self) -> bool:
+        """Whether the policy is fed the slip observer's estimate, as it is or by a computed observation."""
         return any(c.source == "estimate" for c in self.policy) or any(
-            signal.startswith("estimate.") for function in functions for signal in signals_of(function)
+            _reads_estimate(COMPUTED[c.term].function) for c in self.policy if c.source == "computed"
         )
 
     @property
     def episode_steps(self) -> int:
         """Control steps until truncation."""
         return max(1, round(self.config.episode_length / self.config.control_period))
+
+
+def _reads_estimate(function: Callable[..., Any]) -> bool:
+    return any(signal.startswith("estimate.") for signal in signals_of(function))
 
 
 def load_task(
