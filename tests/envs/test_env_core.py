@@ -143,6 +143,21 @@ def test_latency_interpolates_or_holds(fake, delay, mode, expected):
     assert wheel_speeds(env, [1, 2, 4, 4]) == pytest.approx(expected, abs=1e-6)
 
 
+def test_an_angle_is_not_interpolated_over_its_end():
+    joints = {"delay": [0.01, 0.01], "mode": "interpolate"}
+    observed = {"path_error": {"scale": 1.0, "limit": 4.0}}
+    env: Any = gym.make("WLR-Path-v0", randomization="none", task={"latency": {"joints": joints}, "observations": observed})
+    env.reset(seed=0)
+    core, column = env.unwrapped.core, names(env.unwrapped).index("path_error[heading]")
+    shown = []
+    for heading in (3.1, 3.12, -3.14, -3.12):
+        core.computed[:, core.task.computed.index("path_error[heading]")] = heading
+        core.pipeline.observe(core.everyone, core._signals(), core.episodes, first=heading == 3.1)
+        core.episodes.steps += 1
+        shown.append(core.observation[0, column])
+    assert shown == pytest.approx([3.1, 3.11, 3.12, -3.13])
+
+
 def test_history_comes_newest_first_and_starts_filled(fake):
     env = make(
         randomization="none",

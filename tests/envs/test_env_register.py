@@ -52,6 +52,20 @@ def test_a_task_file_becomes_an_environment(registry, task):
     assert batch.reset(seed=0)[0].shape == (2, 4)
 
 
+def test_a_task_file_means_the_files_beside_it(registry, task, tmp_path, monkeypatch):
+    """Not those of the working folder, by whatever way it becomes an environment."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    for folder, name in ((tmp_path, "beside"), (elsewhere, "other")):
+        (folder / "own_robot.yaml").write_text(f"base: nominal\nname: {name}\n")
+        (folder / "own_floor.yaml").write_text(f"base: ice\nname: {name}\n")
+    task.write_text(task.read_text() + "robot: own_robot.yaml\nrandomization: own_floor.yaml\n")
+    monkeypatch.chdir(elsewhere)
+    for env in (gym.make("WLR-Velocity-v0", task=str(task)), gym.make(register_task(task))):
+        core = env.unwrapped.core  # type: ignore[attr-defined]
+        assert (core.task.robot.name, core.randomization.config.name) == ("beside", "beside")
+
+
 def test_a_task_travels_in_its_spec(registry, task, tmp_path):
     """A worker needs neither the id nor the file; Ray pickles, ``spawn`` starts a fresh Python."""
     env_id = register_task(task)

@@ -3,11 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import yaml
 from gymnasium.wrappers import NormalizeObservation, RescaleAction
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
+from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import contract_of, make_policy, policy_environment
 
 torch = pytest.importorskip("torch")
@@ -101,10 +104,21 @@ def test_the_normaliser_around_the_environment_is_part_of_the_policy(env, tmp_pa
 
 def test_a_wrapper_that_no_file_holds_is_refused(env, tmp_path):
     network = torch.nn.Linear(env.observation_space.shape[0], 8)
-    for wrapped in (VecFrameStack(env, 2), RescaleAction(gym.make(ID), np.float32(-0.5), np.float32(0.5)), NormalizeObservation(gym.make(ID))):
+    half = np.float32(0.5)
+    for wrapped in (VecFrameStack(env, 2), RescaleAction(gym.make(ID), -half, half), NormalizeObservation(gym.make(ID))):
         with pytest.raises(InputError, match=rf"the wrapper {type(wrapped).__name__} changes observations or actions"):
             wlr_gym.import_policy(network, wrapped, tmp_path / "p.onnx")
     assert not (tmp_path / "p.onnx").exists()
+
+
+def test_a_network_for_a_task_file(tmp_path):
+    task = read_task("velocity").model_dump(mode="json", exclude_none=True)
+    task["observations"].pop("gyro")
+    (tmp_path / "narrow.yaml").write_text(yaml.safe_dump(task, sort_keys=False))
+    env = gym.make(ID, task=str(tmp_path / "narrow.yaml"))
+    wlr_gym.import_policy(torch.nn.Linear(env.reset()[0].size, 8), env, tmp_path / "p.onnx")
+    core = make_core(ID, 1, policy_environment(tmp_path / "p.onnx"))
+    make_policy(tmp_path / "p.onnx", core.contract())
 
 
 class Branch(torch.nn.Linear):

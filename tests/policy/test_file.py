@@ -6,6 +6,8 @@ import json
 import pytest
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.envs.tasks import contract as task_contract
+from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.task_config import ObserverConfig
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
@@ -86,6 +88,27 @@ def test_currents_of_the_motors_are_not_refused(contract):
 def test_another_torque_speed_line_is_refused(contract, motor):
     with pytest.raises(InputError, match=r"robot\.(hash|servo) is .* \(robot 'wlr-nominal' in the policy, 'wlr-emanual'"):
         check_contract(contract, contract_with(motor), "policy")
+
+
+def flow_contract(changes, **sensors):
+    """Contract of the robot with a flow sensor, some of whose numbers are others, in a task that shows it."""
+    robot = load_robot({"base": "flow", "name": "flow", "sensors": {"flow": changes}})
+    return task_contract(load_task("velocity", robot, {"observations": {"flow": {}}, "sensors": sensors}), {})
+
+
+@pytest.mark.parametrize("sensors", [{}, {"flow": 0.5}])
+def test_another_flow_sensor_is_refused_where_the_policy_reads_it(contract, sensors):
+    reads, other = flow_contract({}, **sensors), flow_contract({"counts_per_pixel": 20.0})
+    none = task_contract(load_task("velocity", "emanual", {"observations": {"flow": {}}}), {})
+    check_contract(reads, flow_contract({}), "policy")
+    with pytest.raises(InputError, match=r"sensors\.flow\.counts_per_pixel is 10\.0 in the policy, 20\.0 in the environment"):
+        check_contract(reads, other, "policy")
+    if sensors:  # it did without at times
+        check_contract(reads, none, "policy")
+    else:
+        with pytest.raises(InputError, match=r"sensors\.flow is .* in the policy, None in the environment"):
+            check_contract(reads, none, "policy")
+    check_contract(contract, task_contract(load_task("velocity", "flow"), {}), "policy")
 
 
 @pytest.mark.parametrize("absent", DEFAULTS)

@@ -5,11 +5,17 @@ import shutil
 import gymnasium
 import numpy as np
 import pytest
+import yaml
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.envs.core import make_task
+from wlr_gym.envs.settings import Settings
+from wlr_gym.envs.tasks.describe import contract
+from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import (
     contract_of,
+    environment_for,
     find_policy,
     load_agent_config,
     load_policy,
@@ -22,6 +28,8 @@ from wlr_gym.policy import (
 )
 
 ID = "WLR-Velocity-v0"
+#: A robot that the numbers of a task follow.
+WIDE = {"base": "nominal", "name": "wide", "hip_position": {"x": 0.35, "y": 0.32}}
 #: A policy that is fed no gyroscope and wants its wheel commands scaled by 3; the rest are conditions.
 BLIND = {"observations": {"gyro": None, "command": {"scale": 4.0}}, "action": {"wheel_scale": 3.0}}
 KEYWORDS = {
@@ -50,9 +58,32 @@ def test_keywords_are_those_that_decide_what_a_policy_is_fed(tmp_path):
     core.close()
 
 
-def test_a_task_file_is_handed_on(tmp_path):
-    write_contract(tmp_path, "do_nothing", {"environment": {"task": "my_task.yaml"}}, {}, {})
-    assert policy_environment(tmp_path) == {"task": "my_task.yaml"}
+def task_file(folder, **changes):
+    """Path of a task file with the observations of velocity in another order, without the gyroscope."""
+    task = read_task("velocity").model_dump(mode="json", exclude_none=True)
+    task["observations"] = {name: one for name, one in reversed(task["observations"].items()) if name != "gyro"}
+    path = folder / "my_task.yaml"
+    path.write_text(yaml.safe_dump(task | changes, sort_keys=False))
+    return str(path)
+
+
+def test_of_a_task_file_only_what_a_policy_is_fed_holds(tmp_path):
+    rewards = read_task("velocity").rewards | {"action_rate": {"weight": -7.0}}
+    task = task_file(tmp_path, sensors={"camera": 1.0}, rewards=rewards, observer={"camera": False}, control_period=0.04)
+    trained = make_task("velocity", Settings(task=task, robot=WIDE))
+    write_contract(tmp_path, "do_nothing", {"environment": {"task": task}}, contract(trained, {}), {})
+    assert policy_environment(tmp_path)["task"]["observer"] == {"camera": False}
+    keywords = environment_for(tmp_path, {"task": {"sensors": {"camera": 0.0}}})
+    played = make_task("velocity", Settings(**keywords))
+    sources.check_contract(contract(trained, {}), contract(played, {}), "here")
+    assert played.config.sensors.camera == 0.0
+    assert played.config.rewards["action_rate"] == read_task("velocity").rewards["action_rate"]
+
+
+def test_a_task_file_with_other_commands_is_another_task(tmp_path):
+    task = task_file(tmp_path)
+    played = make_task("path", Settings(**sources.fed_environment({"task": task})))
+    assert played.config == read_task(task)
 
 
 @pytest.mark.parametrize("config", [{}, {"environment": None}, {"environment": {"task": {"rewards": {"slip": None}}}}])

@@ -26,13 +26,14 @@ from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_
 from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.envs.tasks.signals import PRESENCE, START
-from wlr_gym.envs.tasks.task import Task, bounds, load_task
+from wlr_gym.envs.tasks.task import Task, bounds, fed_as, load_task
 from wlr_gym.envs.tasks.task_config import RampConfig
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics import plants
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors
+from wlr_gym.policy.sources import FED_AS
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,17 +43,19 @@ OPTIONS = ("command", "parameters")
 
 def make_task(task_name: str | Mapping[str, Any], settings: Settings) -> Task:
     """Load the task of an environment with the user's overrides; a real robot is the one that its hardware file names."""
+    robot = settings.robot
+    if robot is None and settings.robot_options is not None:
+        robot = plants.robot_file(settings.robot_options)
     changes: dict[str, Any] = {}
     source: str | Path | Mapping[str, Any] = task_name
     if isinstance(settings.task, Mapping):
         changes = dict(settings.task)
+        if (file := changes.pop(FED_AS, None)) is not None:
+            source = fed_as(file, task_name, robot)
     elif settings.task is not None:
         source = settings.task
     if settings.episode_length is not None:
         changes["episode_length"] = settings.episode_length
-    robot = settings.robot
-    if robot is None and settings.robot_options is not None:
-        robot = plants.robot_file(settings.robot_options)
     return load_task(source, robot, changes)
 
 

@@ -40,13 +40,14 @@ READING = np.dtype(
     [("matrix", np.int64), ("column", np.int64), ("offset", np.float64), ("noise", np.float64), ("stream", np.uint64)]
 )
 #: One number of the policy observation: which reading, how old (control steps, on top of its device's latency), clipped and
-#: scaled. ``interpolate``: between the two readings around that age; else the newest that is at least that old.
+#: scaled. Between the two readings around that age it is interpolated where they differ by at most ``interpolate``; else it is
+#: the newest that is at least that old.
 SHOWN = np.dtype(
     [
         ("reading", np.int64),
         ("lag", np.int64),
         ("device", np.int64),
-        ("interpolate", np.int64),
+        ("interpolate", np.float64),
         ("limit", np.float64),
         ("scale", np.float64),
     ]
@@ -119,7 +120,8 @@ def _show(mask: Any, steps: Any, shown: Any, buffers: Any) -> None:
             value = ring[i, (now - whole + depth) % depth, column.reading]
             if rest > 0.0:
                 older = ring[i, (now - whole - 1 + depth) % depth, column.reading]
-                value = value + rest * (older - value) if column.interpolate == 1 else older
+                change = older - value
+                value = value + rest * change if abs(change) <= column.interpolate else older
             policy[i, d] = column.scale * min(max(value, -column.limit), column.limit)
 
 
@@ -216,6 +218,8 @@ def _shown(task: Task, read: list[ObservationColumn]) -> NDArray[np.void]:
     rows = []
     for c in task.policy:
         device = devices.index(c.device) if c.device in devices else len(devices)
-        interpolate = c.device in devices and modes[device] == "interpolate"
+        # Nothing turns by half a turn within a step: an angle that differs by more went over its end from pi to -pi.
+        most = math.pi if c.unit == "rad" else math.inf
+        interpolate = most if c.device in devices and modes[device] == "interpolate" else -1.0
         rows.append((places[c.term, c.element], c.lag, device, interpolate, c.limit, c.scale))
     return np.array(rows, SHOWN)

@@ -48,7 +48,8 @@ class EnvironmentOptions(TypedDict, total=False):
             of its file (``scaling``).
         randomization: name in ``configs/randomization/`` (``docs/randomization.md``), path of such a file or of a gap result
             (``.json``), or mapping; None = the task's.
-        task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file.
+        task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file. Its key
+            ``fed_as`` names a task file of which only what a policy is fed holds.
         effects: what is added after randomisation: path of a patch file or name of one in ``configs/effects/``, an effect as a
             mapping (``{"name": "friction_level", "parameters": {"mu": 0.4}}``), or a list of any of these; None = nothing.
             See ``docs/effects.md``.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.paths import find_config, named_in
+from wlr_gym.base.paths import find_config
 from wlr_gym.envs.registry import ENVIRONMENTS, register_definition, title_of
 from wlr_gym.envs.tasks.task_config import read_task
 
@@ -35,7 +35,5 @@ def register_task(path: str | Path) -> str:
     if present != source:
         raise InputError(f"{source}: '{env_id}' is the task '{present}' already; give it another name")
     definition = config.model_dump(mode="json", exclude_none=True)
-    for key in ("robot", "randomization"):
-        definition[key] = str(named_in(source, definition[key]))
     register_definition(env_id, source, definition)
     return env_id

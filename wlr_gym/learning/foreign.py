@@ -79,7 +79,7 @@ def import_policy(
     source = network if isinstance(network, torch.nn.Module) else sb3_network(Path(network))
     whole = _Whole(_normalizer(_worn(env, bare) if normalizer is None else normalizer, width), source)
     task = bare.core.settings.task
-    config = {"environment": {"task": dict(task)} if isinstance(task, Mapping) else {}}  # its robot is in the contract
+    config = {"environment": {"task": dict(task) if isinstance(task, Mapping) else task and str(task)}}  # robot: in contract
     content = policy_content(AGENT, config, contract, {"environment": bare.spec.id})
     with _acting(whole):
         _check(whole, width, actions)

@@ -12,6 +12,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import versions
 from wlr_gym.policy.agents import Config, Contract
+from wlr_gym.robot import load_robot
 from wlr_gym.robot.fingerprint import HASH_FORM
 
 FORMAT = 1
@@ -98,14 +99,27 @@ def check_contract(policy: Contract, environment: Contract, where: str) -> None:
     Raises:
         InputError: naming the first difference, with both values.
     """
+    for name, mine, theirs in _binding_differences(policy, environment):
+        raise InputError(
+            f"{where}: made for another environment: {name} is {mine!r} in the policy, {theirs!r} in the environment"
+            f"{_advice(name, mine, policy, environment)}"
+        )
+
+
+def _binding_differences(policy: Contract, environment: Contract) -> Iterator[tuple[str, Any, Any]]:
     for key in BINDING:
-        difference = next(differences(key, _entry(policy, key, key), _entry(environment, key, key)), None)
-        if difference is not None:
-            name, mine, theirs = difference
-            raise InputError(
-                f"{where}: made for another environment: {name} is {mine!r} in the policy, {theirs!r} in the environment"
-                f"{_advice(name, mine, policy, environment)}"
-            )
+        yield from differences(key, _entry(policy, key, key), _entry(environment, key, key))
+    if any(column.get("device") == "flow" for column in policy.get("observation") or ()):
+        mine, theirs = _flow_sensor(policy), _flow_sensor(environment)
+        does_without = (policy.get("sensors") or {}).get("flow", 1.0) < 1.0
+        if theirs is not None or not does_without:
+            yield from differences("robot.description.sensors.flow", mine, theirs)
+
+
+def _flow_sensor(environment: Contract) -> dict[str, Any] | None:
+    """Return the optical-flow sensor of a contract's robot, which is in no fingerprint."""
+    flow = load_robot((environment.get("robot") or {}).get("description") or "nominal").sensors.flow
+    return None if flow is None else flow.model_dump(mode="json")
 
 
 def _advice(name: str, mine: Any, policy: Contract, environment: Contract) -> str:

@@ -15,6 +15,8 @@ from wlr_gym.policy.onnx_file import SUFFIX, open_policy
 
 #: Of a task's settings, what decides which numbers a policy is fed and what its own mean. The others are conditions.
 FED = ("observations", "observer", "controller", "action", "control_period")
+#: Key of an environment's ``task``: the task file that these are taken from; the environment reads it, for its robot.
+FED_AS = "fed_as"
 
 
 @runtime_checkable
@@ -151,7 +153,10 @@ def policy_environment(source: str | Path) -> dict[str, Any]:
         return fed_environment(load_agent_config(source).get("environment") or {})
     contract = contract_of(source)
     robot = robot_of_contract(contract)
-    return fed_environment(contract["config"].get("environment") or {}) | ({} if robot is None else {"robot": robot})
+    own = fed_environment(contract["config"].get("environment") or {})
+    if FED_AS in own.get("task", {}):
+        own["task"]["observer"] = contract["environment"].get("observer")  # for those who ask whether it has a camera
+    return own | ({} if robot is None else {"robot": robot})
 
 
 def robot_of_contract(content: Mapping[str, Any]) -> Any:
@@ -193,7 +198,9 @@ def fed_environment(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return those of an environment's keywords that decide what a policy's inputs and outputs mean."""
     task = environment.get("task")
     if isinstance(task, Mapping):
-        task = {key: task[key] for key in FED if key in task}
+        task = {key: task[key] for key in (FED_AS, *FED) if key in task}
+    elif task is not None:
+        task = {FED_AS: str(task)}
     return {"task": task} if task else {}
 
 

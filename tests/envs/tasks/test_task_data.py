@@ -57,6 +57,16 @@ def test_bad_data_names_the_place_and_the_nearest_valid_name(robot, overrides, e
         load_task("velocity", robot, overrides)
 
 
+def test_the_contract_has_the_observer_where_the_policy_is_fed_its_estimate(robot):
+    blind = {name: None for name in load_task("velocity", robot).config.observations if name.startswith("estimated_")}
+    changes = {"observations": blind, "rewards": {"estimate_error": {"weight": -0.1}}, "observer": {"camera": False}}
+    task = load_task("velocity", robot, changes)
+    assert task.needs_observer
+    assert contract(task, {})["observer"] is None
+    shown = load_task("velocity", robot, {"observer": {"camera": False}})
+    assert contract(shown, {})["observer"] == {"camera": False}
+
+
 def test_a_known_term_that_is_not_there_may_be_removed(robot):
     """One set of changes serves several tasks."""
     assert load_task("velocity", robot, {"observations": {"path_error": None}}) == load_task("velocity", robot)

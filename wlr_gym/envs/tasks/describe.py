@@ -277,10 +277,10 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
 
     Keys: task, robot (name, hashes of its servos and of all its numbers; of another robot than ``nominal`` also its
     ``description``, every number of it), control_period, episode_length, observation (one entry per number, in order: name,
-    source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of the slip observer; None where no
-    term needs it), controller (gains of the hand-written one, where the task names them), sensors (how often they are present;
-    only where the task says it), latency, action (one entry per number: joint, quantity, unit, centre, scale, low, high),
-    commands and randomization.
+    source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of the slip observer; None where the
+    policy is not fed its estimate), controller (gains of the hand-written one, where the task names them), sensors (how often
+    they are present; only where the task says it), latency, action (one entry per number: joint, quantity, unit, centre, scale,
+    low, high), commands and randomization.
     """
     config = task.config
     return {
@@ -289,7 +289,7 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
         "control_period": config.control_period,
         "episode_length": config.episode_length,
         "observation": [_contract_column(column) for column in task.policy],
-        "observer": config.observer.model_dump(mode="json") if task.needs_observer else None,
+        "observer": config.observer.model_dump(mode="json") if task.shows_estimate else None,
         **({"sensors": said} if (said := config.sensors.model_dump(mode="json", exclude_none=True)) else {}),
         "latency": {device: latency.model_dump(mode="json") for device, latency in config.latency.items()},
         "action": [dict(vars(column)) for column in task.actions],

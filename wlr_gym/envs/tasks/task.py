@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from wlr_gym.envs.tasks.terms import (
     TERMINATIONS,
     ObservationTerm,
 )
+from wlr_gym.policy.sources import FED
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, RobotSource, load_robot
 
 
@@ -116,8 +117,13 @@ class Task:
         functions = [COMPUTED[name].function for name in self.computed_terms]
         for names, registry in ((self.rewards, REWARDS), (self.terminations, TERMINATIONS), (self.measures, MEASURES)):
             functions += [registry[name].function for name in names]
+        return self.shows_estimate or any(map(_reads_estimate, functions))
+
+    @property
+    def shows_estimate(self) -> bool:
+        """Whether the policy is fed the slip observer's estimate, as it is or by a computed observation."""
         return any(c.source == "estimate" for c in self.policy) or any(
-            signal.startswith("estimate.") for function in functions for signal in signals_of(function)
+            _reads_estimate(COMPUTED[c.term].function) for c in self.policy if c.source == "computed"
         )
 
     @property
@@ -126,12 +132,29 @@ class Task:
         return max(1, round(self.config.episode_length / self.config.control_period))
 
 
+def _reads_estimate(function: Callable[..., Any]) -> bool:
+    return any(signal.startswith("estimate.") for signal in signals_of(function))
+
+
 def load_task(
     source: str | Path | Mapping[str, Any], robot: RobotSource | None = None, overrides: Mapping[str, Any] | None = None
 ) -> Task:
     """Load a task for a robot, its numbers scaled for it; see :func:`read_task`. None = the task's own robot."""
     chosen = load_robot(read_task(source, overrides).robot if robot is None else robot)
     return build_task(read_task(source, overrides, chosen), chosen)
+
+
+def fed_as(file: str | Path, source: str | Path | Mapping[str, Any], robot: RobotSource | None) -> str | Path | dict[str, Any]:
+    """Return the task of ``source`` with what decides what a policy is fed taken from a task file, its numbers for a robot.
+
+    A file with other commands is another task, which holds as a whole.
+    """
+    chosen = load_robot(read_task(source).robot if robot is None else robot)
+    own, fed = (read_task(one, None, chosen).model_dump(mode="json", exclude_none=True) for one in (source, file))
+    if own["commands"]["terms"].keys() != fed["commands"]["terms"].keys():
+        return file
+    conditions = {key: value for key, value in own.items() if key not in FED}
+    return {**conditions, **{key: fed[key] for key in FED if key in fed}, "scaling": {}}
 
 
 def build_task(config: TaskConfig, robot: Robot) -> Task:

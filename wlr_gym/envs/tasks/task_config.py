@@ -226,7 +226,7 @@ def _for_robot(data: Any, changed_rules: Any, robot: Robot, where: str) -> Any:
     rules = overlay(written.scaling, changed_rules if isinstance(changed_rules, Mapping) else {})
     for place, rule in rules.items():
         check_rule(place, rule, where)
-    reference = load_robot(named_in(where, written.robot))
+    reference = load_robot(written.robot)
     return scaled(data, rules, robot, reference, where)
 
 
@@ -235,7 +235,16 @@ def _task_data(source: Any) -> tuple[Any, str]:
         return dict(source), "task"
     if not isinstance(source, (str, Path)):
         raise InputError(f"task = {source!r}: expected a name, a path or a mapping")
-    return read_config("task", source)
+    data, where = read_config("task", source)
+    return _with_places(data, where), where
+
+
+def _with_places(data: Any, where: str) -> Any:
+    """Return a task file's content with the files that it names seen from its own folder."""
+    if not isinstance(data, Mapping):
+        return data
+    named = {key: data[key] for key in ("robot", "randomization") if isinstance(data.get(key), str)}
+    return {**data, **{key: str(named_in(where, name)) for key, name in named.items()}}
 
 
 def _check_names(data: Mapping[str, Any], where: str) -> None:
