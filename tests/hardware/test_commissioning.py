@@ -779,10 +779,10 @@ def test_over_serial_ports(tmp_path, monkeypatch):
     with Server(emulated.machine, real_time=False) as server:
         monkeypatch.setattr("wlr_gym.hardware.link.MonotonicClock", lambda: ServedClock(server))
         mine = hardware_file(tmp_path, server.ports, patience=1.0, watchdog=NOMINAL.safety.watchdog)
-        words = ["--hardware", str(mine), "--yes", "--out", str(tmp_path), "--tests", "watchdog", "velocity_step"]
+        words = ["--hardware", str(mine), "--yes", "--out", str(tmp_path / "out"), "--tests", "watchdog", "velocity_step"]
         assert main(["commission", *words]) == 0
         assert motors_on(emulated.machine) == []
-    assert {result["state"] for result in results_of(tmp_path).values()} == {"done"}
+    assert {result["state"] for result in results_of(tmp_path / "out").values()} == {"done"}
     assert set(load_hardware(mine).measured.velocity_loop_time) == set(WHEELS)
 
 
