@@ -29,7 +29,7 @@ pytest.importorskip("serial")
 from robot_rig import hardware_file
 
 from wlr_gym.hardware.commissioning import runner
-from wlr_gym.hardware.commissioning.contract import Reading, StandTest
+from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandTest
 from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
 from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TroubleError
 from wlr_gym.hardware.commissioning.person import TerminalPerson
@@ -333,6 +333,18 @@ def test_a_leg_that_a_hand_moved_far_gets_no_torque(stood):
                 stand.switch_on(["leg_lf"])
         assert motors_on(emulated.machine) == on
         stand.switch_off(["leg_lf"])
+
+
+def test_a_leg_that_is_turned_too_far_costs_only_its_own_value(stood):
+    emulated, stand = stood
+
+    class Far(EmulatedPerson):
+        def turn(self, joint, angle):
+            super().turn(joint, 1.6 * angle)
+
+    with pytest.raises(PartlyError, match="turn it less") as caught:
+        run_test(TESTS["torque_on"], stand, Far(emulated))
+    assert {one.quantity for one in caught.value.readings} == {"wheel_follows_given", "wheel_follows_kept", "leg_follows_given"}
 
 
 def test_a_stop_that_came_during_a_question_comes_before_torque(stood):

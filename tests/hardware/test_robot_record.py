@@ -39,7 +39,7 @@ def recorded(out, **options):
 def test_a_robot_that_waits_for_an_operator_is_not_recorded(tmp_path):
     text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(text.replace("deadman: null", "deadman: 0.5"))
-    with pytest.raises(InputError, match=r"safety\.deadman = 0\.5 s: motions have no key"):
+    with pytest.raises(InputError, match=r"safety\.deadman = 0\.5 s: there is no key"):
         recorded(tmp_path / "runs", hardware=str(tmp_path / "mine.yaml"), excitation=("posture",))
 
 

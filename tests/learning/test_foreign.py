@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from gymnasium.wrappers import NormalizeObservation, RescaleAction
+from gymnasium.wrappers import ClipAction, NormalizeObservation, RescaleAction
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
@@ -105,9 +105,10 @@ def test_the_normaliser_around_the_environment_is_part_of_the_policy(env, tmp_pa
 def test_a_wrapper_that_no_file_holds_is_refused(env, tmp_path):
     network = torch.nn.Linear(env.observation_space.shape[0], 8)
     half = np.float32(0.5)
+    wlr_gym.import_policy(network, ClipAction(gym.make(ID, task=TASK)), tmp_path / "fits.onnx")
     for wrapped in (VecFrameStack(env, 2), RescaleAction(gym.make(ID), -half, half), NormalizeObservation(gym.make(ID))):
         with pytest.raises(InputError, match=rf"the wrapper {type(wrapped).__name__} changes observations or actions"):
-            wlr_gym.import_policy(network, wrapped, tmp_path / "p.onnx")
+            wlr_gym.import_policy(network, wrapped, tmp_path / "p.onnx", normalizer=torch.nn.Identity())
     assert not (tmp_path / "p.onnx").exists()
 
 
@@ -117,6 +118,7 @@ def test_a_network_for_a_task_file(tmp_path):
     (tmp_path / "narrow.yaml").write_text(yaml.safe_dump(task, sort_keys=False))
     env = gym.make(ID, task=str(tmp_path / "narrow.yaml"))
     wlr_gym.import_policy(torch.nn.Linear(env.reset()[0].size, 8), env, tmp_path / "p.onnx")
+    (tmp_path / "narrow.yaml").unlink()
     core = make_core(ID, 1, policy_environment(tmp_path / "p.onnx"))
     make_policy(tmp_path / "p.onnx", core.contract())
 

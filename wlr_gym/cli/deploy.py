@@ -296,6 +296,9 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.robot import load_robot
 
+    hardware = load_hardware(options.hardware)
+    if hardware.flow is not None and hardware.flow.driver == "spi":
+        raise InputError(f"{options.hardware}: flow: driver = spi: no emulated port is one: add --stepped")
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
         links = Path(folder) / "ports"
         words = ["--links", str(links), "--hardware", options.hardware, "--seed", str(options.seed)]
@@ -320,7 +323,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
             console.print("starting the emulated robot ...", style="dim")
             if not process.stdout.readline():
                 raise InputError(f"the emulated robot does not start: {process.stderr.read().strip()}")
-            ports = {name: str(links / name) for name in load_hardware(options.hardware).port_names}
+            ports = {name: str(links / name) for name in hardware.port_names}
             if missing := [name for name in ports if not (links / name).exists()]:  # a port of the file may be a real robot's
                 raise InputError(f"the emulated robot has no port '{missing[0]}', which {options.hardware} has")
             yield ports | ({_POSES: str(Path(folder) / _POSES)} if options.camera is not None else {})

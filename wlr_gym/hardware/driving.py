@@ -38,6 +38,19 @@ class DriveResult:
     statistics: dict[str, Any]
 
 
+def refuse_deadman(plant: RobotPlant) -> None:
+    """Refuse a robot that waits for an operator's signs, where nobody gives any: it would only be held.
+
+    Raises:
+        InputError: it does.
+    """
+    if (seconds := plant.loop.limits.deadman) is not None:
+        raise InputError(
+            f"safety.deadman = {seconds:g} s: there is no key or stick for an operator's sign: leave it empty, and give wlr "
+            "deploy --deadman"
+        )
+
+
 def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     """Go to the motion's first pose, drive it, stop; torque is off afterwards.
 
@@ -48,12 +61,8 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     Raises:
         InputError: the robot waits for an operator's signs, which nobody gives here.
     """
+    refuse_deadman(plant)
     loop, robot = plant.loop, plant.robot
-    if loop.limits.deadman is not None:
-        raise InputError(
-            f"safety.deadman = {loop.limits.deadman:g} s: motions have no key or stick for an operator's sign: leave it empty, "
-            "and give wlr deploy --deadman"
-        )
     state = standing_state(robot, Parameters.nominal(robot))
     state.joint_position[0, LEG_SLICE] = start_setpoints(motion, robot)[LEG_SLICE]
     reason, ticks = "", 0

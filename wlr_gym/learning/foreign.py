@@ -19,6 +19,7 @@ from wlr_gym.learning.evaluation.rollout import seen_observations
 from wlr_gym.learning.ppo.policy import ModulePolicy, acting_net
 from wlr_gym.policy.export import Parity, write_policy_file
 from wlr_gym.policy.file import policy_content
+from wlr_gym.policy.sources import FED_AS
 
 require_package("torch", "train")
 require_package("stable_baselines3", "train")
@@ -35,6 +36,8 @@ _CHANGING = (
     gymnasium.ObservationWrapper, gymnasium.ActionWrapper, gymnasium.vector.VectorObservationWrapper,
     gymnasium.vector.VectorActionWrapper, VecFrameStack,
 )  # fmt: skip
+#: Of these, those that do what happens anyway: actions are clipped, observations are flat.
+_HARMLESS = (gymnasium.wrappers.ClipAction, gymnasium.wrappers.FlattenObservation)
 #: The name that the contract gives as agent.
 AGENT = "imported"
 #: Robots that drive, and for how long (s), while file and network are compared.
@@ -77,9 +80,13 @@ def import_policy(
     contract = bare.contract()
     width, actions = len(contract["observation"]), len(contract["action"])
     source = network if isinstance(network, torch.nn.Module) else sb3_network(Path(network))
-    whole = _Whole(_normalizer(_worn(env, bare) if normalizer is None else normalizer, width), source)
+    worn = _worn(env, bare)
+    whole = _Whole(_normalizer(worn if normalizer is None else normalizer, width), source)
     task = bare.core.settings.task
-    config = {"environment": {"task": dict(task) if isinstance(task, Mapping) else task and str(task)}}  # robot: in contract
+    if task is not None and not isinstance(task, Mapping):  # a file, which may be elsewhere tomorrow: its content, scaled
+        written = bare.core.task.config.model_dump(mode="json", exclude_none=True)
+        task = {FED_AS: {**written, "robot": "nominal", "scaling": {}}}
+    config = {"environment": {"task": dict(task or {})}}  # its robot is in the contract
     content = policy_content(AGENT, config, contract, {"environment": bare.spec.id})
     with _acting(whole):
         _check(whole, width, actions)
@@ -176,7 +183,7 @@ def _worn(env: Any, bare: Any) -> VecNormalize | None:
     while layer is not bare:
         if isinstance(layer, VecNormalize):
             found = layer
-        elif isinstance(layer, _CHANGING):
+        elif isinstance(layer, _CHANGING) and not isinstance(layer, _HARMLESS):
             raise InputError(
                 f"env: the wrapper {type(layer).__name__} changes observations or actions: expected the environment without "
                 "it, and what it does in the network or as normalizer"

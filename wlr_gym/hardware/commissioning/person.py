@@ -102,7 +102,7 @@ class TerminalPerson:
 
     def release(self, joint: str) -> None:
         """Say that it may be let go."""
-        self._enter(f"{full_name(joint)}: its motor is off, let go, then Enter.")
+        self._answer(f"{full_name(joint)}: its motor is off, let go, then Enter.")
 
     def watch_supply(self) -> None:
         """Do nothing: a human looks by himself."""

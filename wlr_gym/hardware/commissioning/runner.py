@@ -154,7 +154,7 @@ class Commissioning:
             state, reason = FAILED, f"{error}, in {TRIES} tries"
             self._stand.begin()  # no run: motors that were stopped did not follow its commands
         except SkippedError:
-            return StandResult(test.name, SKIPPED, repeated=repeated)
+            return StandResult(test.name, SKIPPED, "no consent to go on", repeated=repeated)
         except QuitError as asked:
             state, reason = STOPPED, str(asked) or "asked to"
         except PowerError as error:

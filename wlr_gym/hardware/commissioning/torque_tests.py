@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wlr_gym.hardware.commissioning.contract import Reading, StandQuantity, StandTest
+from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandQuantity, StandTest
 from wlr_gym.hardware.commissioning.errors import TroubleError
 from wlr_gym.hardware.commissioning.person import Person
 from wlr_gym.hardware.commissioning.stand import Stand
@@ -68,7 +68,8 @@ WATCHDOG = StandTest(
 
 
 def _measure_torque_on(stand: Stand, person: Person) -> list[Reading]:
-    return _wheels_torque_on(stand) + _legs_torque_on(stand, person)
+    found = _wheels_torque_on(stand)
+    return found + _legs_torque_on(stand, person, found)
 
 
 def _wheels_torque_on(stand: Stand) -> list[Reading]:
@@ -91,7 +92,7 @@ def _speed(stand: Stand) -> np.ndarray:
     return np.mean([readings.velocity[WHEEL_SLICE] for readings in stand.run(0.2)], axis=0)
 
 
-def _legs_torque_on(stand: Stand, person: Person) -> list[Reading]:
+def _legs_torque_on(stand: Stand, person: Person, before: list[Reading]) -> list[Reading]:
     found = []
     stand.prepare(LEGS)
     for k, leg in enumerate(LEGS):
@@ -103,7 +104,10 @@ def _legs_torque_on(stand: Stand, person: Person) -> list[Reading]:
         found.append(Reading("leg_follows_given", leg, float((end - start) / _LEAN)))
     person.turn(LEGS[0], -_LEAN)
     start = stand.step().position[0]
-    stand.switch_on(LEGS[:1])
+    try:
+        stand.switch_on(LEGS[:1])
+    except TroubleError as error:  # turned too far: only this value is missing
+        raise PartlyError(str(error), before + found) from None
     end = stand.run(_LEAN_TIME)[-1].position[0]
     stand.switch_off(LEGS[:1])
     return [*found, Reading("leg_follows_kept", LEGS[0], float((end - start) / _LEAN))]

@@ -19,6 +19,7 @@ from wlr_gym.envs.tasks.compiled_terms import Scores, compile_scores
 from wlr_gym.envs.tasks.success import scales_of, tracking_error
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
 from wlr_gym.hardware.deployment import Deployment, deploy
+from wlr_gym.hardware.driving import refuse_deadman
 from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core
@@ -94,6 +95,7 @@ def drive_episode(
     plant, truth = robot.start(log, seed)
     core.plant = plant
     try:
+        refuse_deadman(plant)
         if truth is None and core.observer is None:
             raise InputError(f"policy '{policy}': it has no slip observer, which is what tells how a real robot moves")
         score = _Score(_whole_task(environment, policy), core, truth)
