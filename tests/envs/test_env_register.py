@@ -61,8 +61,9 @@ def test_a_task_file_means_the_files_beside_it(registry, task, tmp_path, monkeyp
         (folder / "own_floor.yaml").write_text(f"base: ice\nname: {name}\n")
     task.write_text(task.read_text() + "robot: own_robot.yaml\nrandomization: own_floor.yaml\n")
     monkeypatch.chdir(elsewhere)
-    for env in (gym.make("WLR-Velocity-v0", task=str(task)), gym.make(register_task(task))):
-        core = env.unwrapped.core  # type: ignore[attr-defined]
+    for env in (gym.make("WLR-Velocity-v0", task=str(task)).unwrapped, gym.make(register_task(task)).unwrapped):
+        assert isinstance(env, WlrEnv)
+        core = env.core
         assert (core.task.robot.name, core.randomization.config.name) == ("beside", "beside")
 
 

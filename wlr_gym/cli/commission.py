@@ -138,7 +138,8 @@ def _commission(
     named = _named(options, robot)
     earlier = _earlier(out / REPORT, named, tests, console)
     copy = out / COPY
-    if copy.exists() and copy.samefile(find_config("hardware", options.hardware)):
+    source = find_config("hardware", options.hardware)
+    if copy.exists() and copy.samefile(source):
         raise InputError(f"--out {out}: its {COPY} is the file of --hardware, and gets every value: choose another folder")
     measured = load_hardware(copy).measured if earlier and copy.is_file() else None
     link, person = _robot(options, robot, hardware, ask)
@@ -155,16 +156,17 @@ def _commission(
                 console.print(f"{result.test}: made once more: {reason}")
             console.print(f"{result.test}: {result.state}{f': {result.reason}' if result.reason else ''}")
             write_json(out / REPORT, _together(earlier, [content_of(one) | {"robot": named} for one in results]))
-            findings = [finding for result in results for finding in result.findings]
+            findings += result.findings
             if findings:
-                _write(copy, options, findings, measured)
+                _write(copy, source, findings, measured)
     if options.json:
         print_json([content_of(one) for one in results])
     else:
         _print_table(findings, console)
     _print_end(findings, _untested(tests, results), console)
     if findings:
-        _save(options, copy, findings, ask, console)
+        console.print(f"written: {copy}")
+        _save(options, source, findings, ask, console)
     return OK if all(result.is_good for result in results) else FAILED
 
 
@@ -184,27 +186,21 @@ def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Ca
 
 
 def _save(
-    options: CommissionOptions, copy: Path, findings: Iterable[StandFinding], ask: Callable[[str], str], console: Console
+    options: CommissionOptions, source: Path, findings: Iterable[StandFinding], ask: Callable[[str], str], console: Console
 ) -> None:
-    """Write what was measured into a real robot's own hardware file, if wanted; the copy has it already."""
-    from wlr_gym.base.paths import find_config
-
-    console.print(f"written: {copy}")
-    source = find_config("hardware", options.hardware)
+    """Write what was measured into a real robot's own hardware file, if wanted."""
     is_own = options.hardware.endswith((".yaml", ".yml")) and not options.emulated
     if is_own and (options.yes or ask(f"Write the measured values into {source}? [y/N]").strip().lower() in ("y", "yes")):
-        _write(source, options, findings, None)
+        _write(source, source, findings, None)
         console.print(f"written: {source}")
 
 
-def _write(target: Path, options: CommissionOptions, findings: Iterable[StandFinding], earlier: Measured | None) -> None:
+def _write(target: Path, source: Path, findings: Iterable[StandFinding], earlier: Measured | None) -> None:
     """Write the hardware file with what was measured, now or in an ``earlier`` session that this one continues."""
-    from wlr_gym.base.paths import find_config
     from wlr_gym.hardware.calibration import save_hardware
     from wlr_gym.hardware.commissioning.comparison import with_measurements
     from wlr_gym.hardware.config import load_hardware
 
-    source = find_config("hardware", options.hardware)
     content = with_measurements(load_hardware(source), findings, earlier)  # what the file says, not ports of the command line
     save_hardware(target, source, content, "measured", "Measured on the robot by wlr commission: docs/commissioning.md.")
 

@@ -292,8 +292,8 @@ def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], fre
     fixed = candidate.fixed if candidate.formula else {}
     given = {name: ParameterEstimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
     parameters = {**own, **given}
-    written = candidate.formula, dict(candidate.units)
-    return FoundEffect(candidate.name, candidate.where, parameters, frequency, gain, *written, doc=candidate.doc)
+    name, where, units = candidate.name, candidate.where, dict(candidate.units)
+    return FoundEffect(name, where, parameters, frequency, gain, candidate.formula, units, doc=candidate.doc)
 
 
 def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:

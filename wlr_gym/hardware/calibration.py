@@ -277,8 +277,8 @@ def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, no
             content["robot"] = seen(content["robot"])
             line = _yaml({"robot": content["robot"]}).strip()
             patched = re.sub(r"^robot:.*$", lambda _: line, patched, count=1, flags=re.MULTILINE)
-        buses = content.get("buses") or {}
-        content |= {"buses": {name: {**bus, "model": seen(bus["model"])} for name, bus in buses.items()}} if buses else {}
+        for bus in content["buses"].values():
+            bus["model"] = seen(bus["model"])
 
     def write(temporary: Path) -> None:
         temporary.write_text(patched, encoding="utf-8")

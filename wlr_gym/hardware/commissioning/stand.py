@@ -229,10 +229,7 @@ class Stand:
 
     def _check_way(self, leg: str) -> None:
         """See that a leg is no farther from its setpoint than any test asks: a hand may have moved it."""
-        counts = np.zeros(len(JOINTS))
-        k = JOINTS.index(leg)
-        counts[k] = self.servos.get(leg, "present_position")
-        way = self._goal(leg) - float(self.servos.joint_map.position(counts)[k])
+        way = self._goal(leg) - self._register(leg, "present_position")
         if not abs(way) <= LARGEST_LEAN + _READING:
             raise TroubleError(f"{leg}: {way:+.2f} rad from its setpoint, expected {LARGEST_LEAN:g} at most: turn it less")
 
@@ -253,9 +250,13 @@ class Stand:
 
     def _goal(self, joint: str) -> float:
         """Return the setpoint a servo holds, rad or rad/s."""
+        return self._register(joint, "goal_position" if joint in LEGS else "goal_velocity")
+
+    def _register(self, joint: str, item: str) -> float:
+        """Return a register of a servo: an angle of a leg, rad, or a rate of a wheel, rad/s."""
         counts = np.zeros(len(JOINTS))
         k = JOINTS.index(joint)
-        counts[k] = self.servos.get(joint, "goal_position" if joint in LEGS else "goal_velocity")
+        counts[k] = self.servos.get(joint, item)
         convert = self.servos.joint_map.position if joint in LEGS else self.servos.joint_map.velocity
         return float(convert(counts)[k])
 

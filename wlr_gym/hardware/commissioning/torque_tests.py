@@ -68,8 +68,16 @@ WATCHDOG = StandTest(
 
 
 def _measure_torque_on(stand: Stand, person: Person) -> list[Reading]:
-    found = _wheels_torque_on(stand)
-    return found + _legs_torque_on(stand, person, found)
+    found = _wheels_torque_on(stand) + _legs_torque_on(stand)
+    person.turn(LEGS[0], -_LEAN)
+    start = stand.step().position[0]
+    try:
+        stand.switch_on(LEGS[:1])
+    except TroubleError as error:  # turned too far: only this value is missing
+        raise PartlyError(str(error), found) from None
+    end = stand.run(_LEAN_TIME)[-1].position[0]
+    stand.switch_off(LEGS[:1])
+    return [*found, Reading("leg_follows_kept", LEGS[0], float((end - start) / _LEAN))]
 
 
 def _wheels_torque_on(stand: Stand) -> list[Reading]:
@@ -92,7 +100,7 @@ def _speed(stand: Stand) -> np.ndarray:
     return np.mean([readings.velocity[WHEEL_SLICE] for readings in stand.run(0.2)], axis=0)
 
 
-def _legs_torque_on(stand: Stand, person: Person, before: list[Reading]) -> list[Reading]:
+def _legs_torque_on(stand: Stand) -> list[Reading]:
     found = []
     stand.prepare(LEGS)
     for k, leg in enumerate(LEGS):
@@ -102,15 +110,7 @@ def _legs_torque_on(stand: Stand, person: Person, before: list[Reading]) -> list
         end = stand.run(_LEAN_TIME)[-1].position[k]
         stand.switch_off([leg])
         found.append(Reading("leg_follows_given", leg, float((end - start) / _LEAN)))
-    person.turn(LEGS[0], -_LEAN)
-    start = stand.step().position[0]
-    try:
-        stand.switch_on(LEGS[:1])
-    except TroubleError as error:  # turned too far: only this value is missing
-        raise PartlyError(str(error), before + found) from None
-    end = stand.run(_LEAN_TIME)[-1].position[0]
-    stand.switch_off(LEGS[:1])
-    return [*found, Reading("leg_follows_kept", LEGS[0], float((end - start) / _LEAN))]
+    return found
 
 
 TORQUE_ON = StandTest(
