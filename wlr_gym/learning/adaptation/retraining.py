@@ -14,7 +14,7 @@ from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
-from wlr_gym.learning.adaptation.supervised import more_often, stopped_episodes
+from wlr_gym.learning.adaptation.supervised import may_stop_more, stopped_episodes
 from wlr_gym.learning.adaptation.uncertainty import STATED, TRAINED_SHARE, Family, Uncertainty
 from wlr_gym.learning.evaluation.acceptance import (
     LARGEST_LOSS,
@@ -36,7 +36,7 @@ FALLS_TO = 0.2
 #: Logarithm of the exploration noise of legs and wheels at the start, where the policy's file has none of its own: that at
 #: which trainings of the recipe end.
 LOG_STD = (-4.2, -2.1)
-#: Reward term of a second training, where the supervision would stop the policy of the first more often. Not of all trainings:
+#: Reward term of a second training, where the supervision may stop the policy of the first more often. Not of all trainings:
 #: it makes policies for weak motors 36 % worse.
 STUCK_WHEELS = {"stuck_wheels": {"weight": -6.0}}
 #: Simulated episodes that the supervision watches, and their length, s.
@@ -140,10 +140,10 @@ def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
 
 
 def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
-    """Train on; once more, wheels that stick being a cost, where the supervision would stop the new policy more often."""
+    """Train on; once more, wheels that stick being a cost, where the supervision may stop the new policy more often."""
     record, trained = train_on(progress, found), str(progress.out / TRAINING / "policy")
     old, new = (watched(progress, found, own, policy) for policy in (progress.asked.policy, trained))
-    if not more_often(new, old):
+    if not may_stop_more(new, old):
         return record
     shares = f"{new.mean():.0%} of episodes, and the old policy in {old.mean():.0%}"
     if not _takes_rewards(progress.asked.policy):
@@ -151,7 +151,7 @@ def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> Adap
         return record.model_copy(update={"said": (*record.said, said)})
     config = progress.folder("model") / f"{AGAIN}.yaml"
     train_in(progress, progress.out / AGAIN, config, found.training, STUCK_WHEELS)
-    said = f"The supervision would stop it in {shares}: trained once more, wheels that stick being a cost."
+    said = f"The supervision would stop it in {shares}; that may be more often: trained again, wheels that stick being a cost."
     command = _command(progress, config, progress.out / AGAIN)
     return record.model_copy(update={"said": (*record.said, said), "command": command})
 
@@ -208,7 +208,7 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
     worse = [loss for loss in losses if not loss.bound <= LARGEST_LOSS]
     better = next(loss for loss in losses if loss.floors == STATED).bound < 0.0
     stopped, stopped_before = (watched(progress, found, own, policy) for policy in (new, asked.policy))
-    stops_more = more_often(stopped, stopped_before)
+    stops_more = may_stop_more(stopped, stopped_before)
     is_new = better and not worse and not stops_more
     if is_new:
         verdict = "The new policy is kept: better on the robot as the result states it, and nowhere worse."
@@ -216,7 +216,7 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
         verdict = f"The old policy is kept: the new one may be worse in '{worse[0].floors}' (by up to {worse[0].bound:.1f} %)."
     elif stops_more:
         shares = f"{stopped.mean():.0%} of episodes, not {stopped_before.mean():.0%}"
-        verdict = f"The old policy is kept: the supervision would stop the new one more often (in {shares})."
+        verdict = f"The old policy is kept: the supervision may stop the new one more often (in {shares})."
     else:
         verdict = "The old policy is kept: the new one is not better beyond the interval."
     numbers = {
