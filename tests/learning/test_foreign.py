@@ -9,6 +9,8 @@ from gymnasium.wrappers import ClipAction, NormalizeObservation, RescaleAction
 import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
+from wlr_gym.envs.classes import PathVectorEnv, PostureEnv
+from wlr_gym.envs.single import WlrEnv
 from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import contract_of, make_policy, policy_environment
@@ -89,6 +91,17 @@ def test_a_plain_network(env, tmp_path):
     np.testing.assert_allclose(act(tmp_path / "p.onnx", env, seen), expected, atol=1e-5)
     contract = contract_of(tmp_path / "p.onnx")
     assert (contract["agent"], contract["training"]["environment"]) == ("imported", ID)
+
+
+def test_an_environment_that_was_made_without_an_id(tmp_path):
+    own = WlrEnv(definition=read_task("velocity").model_dump(mode="json", exclude_none=True))
+    for made in (PostureEnv(), PathVectorEnv(2)):
+        network = torch.nn.Linear(made.observation_space.shape[-1], 8)
+        wlr_gym.import_policy(network, made, tmp_path / f"{type(made).__name__}.onnx")
+    assert contract_of(tmp_path / "PostureEnv.onnx")["training"]["environment"] == "WLR-Posture-v0"
+    assert contract_of(tmp_path / "PathVectorEnv.onnx")["training"]["environment"] == "WLR-Path-v0"
+    with pytest.raises(InputError, match="has no id: register its task with register_task"):
+        wlr_gym.import_policy(torch.nn.Linear(own.observation_space.shape[-1], 8), own, tmp_path / "own.onnx")
 
 
 def test_the_normaliser_around_the_environment_is_part_of_the_policy(env, tmp_path):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.registry import task_source_of
+from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.learning.evaluation.rollout import seen_observations
 from wlr_gym.learning.ppo.policy import ModulePolicy, acting_net
 from wlr_gym.policy.export import Parity, write_policy_file
@@ -87,7 +87,7 @@ def import_policy(
         written = bare.core.task.config.model_dump(mode="json", exclude_none=True)
         task = {FED_AS: {**written, "robot": "nominal", "scaling": {}}}
     config = {"environment": {"task": dict(task or {})}}  # its robot is in the contract
-    content = policy_content(AGENT, config, contract, {"environment": bare.spec.id})
+    content = policy_content(AGENT, config, contract, {"environment": _id_of(bare)})
     with _acting(whole):
         _check(whole, width, actions)
         try:
@@ -132,9 +132,19 @@ class _Whole(torch.nn.Module):
         return self.network(self.normalizer(observation))
 
 
+def _id_of(bare: Any) -> str:
+    """Return the id of an environment, also of one whose class was called without ``gymnasium.make``."""
+    if bare.spec is not None:
+        return bare.spec.id
+    for env_id, task in ENVIRONMENTS.items():
+        if task == bare.task_name:
+            return env_id
+    raise InputError(f"env = {bare!r} has no id: register its task with register_task and make it with gymnasium.make")
+
+
 def _driven(bare: Any, network: torch.nn.Module) -> NDArray[np.float32]:
     """Return observations (M, D) of robots that the network drives."""
-    source = bare.spec.kwargs.get("definition") or task_source_of(bare.spec.id)
+    source = (bare.spec and bare.spec.kwargs.get("definition")) or task_source_of(_id_of(bare))
     core = Core(source, bare.core.settings, ROBOTS)
     try:
         return seen_observations(core, ModulePolicy(network), SECONDS)

@@ -36,6 +36,8 @@ class EpisodeRecorder:
     recorder.save("runs/run_01.parquet")
     ```
 
+    A batch that resets a robot within its last step (``SameStep``, Stable-Baselines3) has that step no more: the run ends before it.
+
     Args:
         core: the batch.
         robot: which of its robots.
