@@ -651,6 +651,16 @@ def test_unseeded_environments_differ_and_tell_their_seed(fake):
     assert np.array_equal(again.reset(seed=one.np_random_seed)[0], observation)
 
 
+@pytest.mark.parametrize("face", [make, lambda: make_vec(2)])
+def test_a_generator_of_the_users_own_decides_what_is_drawn(fake, face):
+    def first(seed):
+        env = face()
+        env.np_random = np.random.default_rng(seed)
+        return env.reset()[0].tolist()
+
+    assert first(1) == first(1) != first(2)
+
+
 # ---- effects ----
 
 PUSH = {

@@ -12,7 +12,7 @@ from gymnasium.utils import EzPickle
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.envs.actions import read_actions
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.episodes import read_seed
+from wlr_gym.envs.episodes import own_seed, read_seed
 from wlr_gym.envs.infos import Infos, row_of
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
@@ -65,7 +65,7 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):  # pyright: ignor
         """
         super().reset(seed=None if seed is None else read_seed(seed))
         if seed is not None or not self.core.episodes.seeded[0]:
-            self.core.seed(0, self.np_random_seed % 2**128 if seed is None else seed)  # -1 where the user set np_random
+            self.core.seed(0, own_seed(self) if seed is None else seed)
         self.core.begin_episodes(self._everyone, options)
         self.pictures.after_step()
         return self.core.observation_of(0), row_of(self._infos.reset(), 0)

@@ -327,6 +327,8 @@ def test_wrong_shapes_are_refused():
         observer.reset(np.ones(2, bool), np.zeros((3, SENSOR_LAYOUT.width)))
     with pytest.raises(InputError, match="sensors"):
         observer.update(np.ones(3, bool), np.zeros((3, 4)))
+    with pytest.raises(InputError, match="gravity = 0"):
+        SlipObserver(ROBOT.model_copy(update={"gravity": 0.0}), PERIOD, 3, True)
 
 
 # ---- against simulated truth -----------------------------------------------------------------------------------------

@@ -188,6 +188,7 @@ class Randomization:
         places = dict.fromkeys(config.events, "randomization") | dict(places or {})
         entries = [entry for name, event in config.events.items() for entry in entries_of(name, event, robot, places[name])]
         _refuse_double_set(entries, places)
+        _refuse_no_area(entries, places)
         self._operations = {kind: [e for e in entries if e.operation == kind] for kind in ("set", "scale", "add", BELOW_LIMIT)}
         entries = [entry for kind in self._operations.values() for entry in kind]
         self._sampler = Sampler(entries) if entries else None
@@ -332,6 +333,18 @@ def _refuse_double_set(entries: Sequence[Entry], places: Mapping[str, str]) -> N
             where = " over ".join(dict.fromkeys([places[entry.event], places[other]]))
             raise InputError(
                 f"{where}: events '{other}' and '{entry.event}' both set {ELEMENTS[entry.column]}; let one of them scale or add"
+            )
+
+
+def _refuse_no_area(entries: Sequence[Entry], places: Mapping[str, str]) -> None:
+    """Refuse the friction of a patch that no event gives a place: there would be no patch."""
+    _, changed = _columns(entries)
+    for entry in entries:
+        element = ELEMENTS[entry.column]
+        if element.startswith("patch.mu[") and element.replace("mu", "x_max") not in changed:
+            raise InputError(
+                f"{places[entry.event]}: event '{entry.event}': no event says where {element} lies: expected 'area', such as "
+                "{x_min: [0.3, 1.0], length: [0.3, 0.6]}, or {} for the whole floor"
             )
 
 

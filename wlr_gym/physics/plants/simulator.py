@@ -26,7 +26,7 @@ from wlr_gym.physics.plants.base import (
 from wlr_gym.physics.plants.flow import check_flow
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.physics.plants.setpoints import SetpointHistory, Setpoints
-from wlr_gym.robot import LEG_SLICE, Robot, robot_hash
+from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -60,6 +60,7 @@ class Simulator(ABC):
         self._time: Array = np.zeros(count)
         self._setpoints: Setpoints = SetpointHistory(count, self.options.control_period)
         self._sensors = SensorModel(robot, self.options, count)
+        self._robot_content = robot.model_dump(mode="json", exclude={"name", "joints", "dynamixel_ids"})
 
     def _start(self) -> None:
         self.reset(seeds=np.zeros(self._count, np.uint64), parameters=self.parameters)
@@ -138,7 +139,7 @@ class Simulator(ABC):
         options = self.options
         return {
             "backend": self.capabilities.name,
-            "robot": robot_hash(self.robot),
+            "robot": self._robot_content,
             "precision": options.precision,
             "control_period": options.control_period,
             "physics_step": options.physics_step,

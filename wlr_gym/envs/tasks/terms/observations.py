@@ -7,9 +7,10 @@ robot refuses a policy that needs one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from wlr_gym.envs.tasks.scaling import QUANTITIES
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
 from wlr_gym.robot import LEGS, WHEELS, Robot
@@ -30,7 +31,8 @@ class ObservationTerm:
         source: ``sensors``, ``command``, ``action``, ``estimate``, ``computed`` or ``truth``.
         elements: full element names in the source; empty = all of the task's commands or actions.
         unit, frame, doc: for the generated tables.
-        limit: readings are clipped to +-limit about the offset (in ``unit``), so that the observation space is bounded.
+        limit: readings are clipped to +-limit about the offset (in ``unit``), so that the observation space is bounded; it is
+            larger for robots that reach more (:func:`limit_for`).
         offset: subtracted from the reading, from the robot's numbers.
         sensor_noise: what the sensor itself adds, from the robot's numbers: 1 sigma, or one count of an encoder.
         device: what it is read from: readings of one device share one latency; empty = no latency.
@@ -154,3 +156,41 @@ POLICY_TERMS = _SENSED | {term.name: term for term in (*_ESTIMATED, *_TRUE)}
 
 #: What a critic may observe besides.
 PRIVILEGED_TERMS = {term.name: term for term in _TRUE}
+
+
+def _leg_angle(robot: Robot) -> float:
+    """How far a leg goes from home, rad."""
+    return max(abs(limit - robot.home.leg_angle) for limit in robot.leg_limits)
+
+
+def _largest(*quantities: str) -> RobotNumber:
+    return lambda robot: max(QUANTITIES[name].of(robot) for name in quantities)
+
+
+#: Quantities that large or fast robots have more of -> the terms that read them.
+_READ_BY = {
+    _leg_angle: ("leg_position", "leg_reference"),
+    _largest("leg_speed"): ("leg_velocity",),
+    _largest("wheel_speed"): ("wheel_velocity",),
+    _largest("leg_speed", "wheel_speed"): ("joint_velocity",),
+    _largest("leg_torque"): ("leg_effort",),
+    _largest("wheel_torque"): ("wheel_effort",),
+    _largest("leg_torque", "wheel_torque"): ("motor_torque",),
+    _largest("top_speed"): (
+        *("speed_command", "climb_command", "linear_velocity_in_body", "slip_velocity"),
+        *("estimated_linear_velocity_in_body", "estimated_slip_velocity"),
+    ),
+    _largest("weight"): ("contact_force", "estimated_normal_force", "estimated_traction_force"),
+}
+_REACHED = {term: reached for reached, terms in _READ_BY.items() for term in terms}
+
+
+def limit_for(term: ObservationTerm, robot: Robot, drawn: Sequence[float] = ()) -> float:
+    """Return the limit of a term's readings, in its unit: its own, or, where that is more, what readings may come to.
+
+    Args:
+        term: of an observation.
+        robot: readings reach a quarter more than its file says.
+        drawn: ends of the range that a command is drawn from.
+    """
+    return max(term.limit, 1.25 * _REACHED.get(term.name, _zero)(robot), *map(abs, drawn))
