@@ -114,6 +114,8 @@ class Simulator(ABC):
     ) -> Sensors:
         """Start robots anew; see :meth:`wlr_gym.physics.plants.base.Plant.reset`."""
         rows = self._rows(mask)
+        if state is not None and len(state) != self._count:
+            raise InputError(f"state holds {len(state)} robots, the plant {self._count}")
         if seeds is not None:
             seeds = _checked(seeds, self._count)
         if parameters is not None:
@@ -204,8 +206,9 @@ class Simulator(ABC):
     def _rows(self, mask: NDArray[np.bool_] | None) -> Rows:
         if mask is None:
             return self._all
-        if np.shape(mask) != (self._count,):
-            raise InputError(f"mask has shape {np.shape(mask)}, expected ({self._count},)")
+        given = np.asarray(mask)
+        if given.shape != (self._count,) or given.dtype != np.bool_:
+            raise InputError(f"mask has shape {given.shape} and type {given.dtype}, expected ({self._count},) booleans")
         return np.flatnonzero(mask)
 
     def _take_parameters(self, parameters: Parameters, rows: Rows) -> None:
