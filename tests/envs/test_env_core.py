@@ -272,6 +272,8 @@ def test_computed_observations_speak_of_the_commands_that_hold_from_now_on(fake)
 
 def test_command_can_be_fixed_for_an_episode_and_live(fake):
     env = make()
+    with pytest.raises(gym.error.ResetNeeded, match=r"before set_command\(\)"):
+        env.set_command(yaw_rate=0.3)
     env.reset(seed=0, options={"command": {"linear_velocity_x": 0.07, "yaw_rate": 0.0}})
     for _ in range(600):
         env.step(np.zeros(8, np.float32))

@@ -215,6 +215,7 @@ class Core:
 
     def set_command(self, values: Mapping[str, float]) -> None:
         """Command all robots from the next step on, until the episode ends (teleoperation, evaluation)."""
+        self.episodes.require_begun("set_command()")
         self.commands.hold(np.arange(self.count), self.commands.read(values))
 
     def set_progress(self, steps: float) -> None:
