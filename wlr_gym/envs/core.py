@@ -215,8 +215,9 @@ class Core:
 
     def set_command(self, values: Mapping[str, float]) -> None:
         """Command all robots from the next step on, until the episode ends (teleoperation, evaluation)."""
+        held = self.commands.read(values)
         self.episodes.require_begun("set_command()")
-        self.commands.hold(np.arange(self.count), self.commands.read(values))
+        self.commands.hold(np.arange(self.count), held)
 
     def set_progress(self, steps: float) -> None:
         """Say how many environment steps, of all robots together, a training has done: what is drawn from now on is spread as
