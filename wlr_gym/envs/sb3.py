@@ -123,7 +123,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
             for row, more in enumerate(self._rows(self._infos.episode(), done)):
                 if done[row]:
                     limit = bool(core.truncated[row] and not core.terminated[row])
-                    infos[row] |= {"terminal_observation": core.observation_of(row), "TimeLimit.truncated": limit, **more}
+                    infos[row] |= {"terminal_observation": core.observations(row), "TimeLimit.truncated": limit, **more}
             core.begin_episodes(done)
             self._keep_reset_infos(done)
         self.pictures.after_step()

@@ -133,7 +133,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         core, changes = self.core, self._changes()
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(over).tolist():
-            final[row] = core.observation_of(row)
+            final[row] = core.observations(row)
         infos = {} if over.all() else _masked(self._infos.step(), ~over)
         infos["final_obs"], infos["_final_obs"] = final, over.copy()
         infos["final_info"] = _masked(self._infos.step() | self._infos.episode(), over)

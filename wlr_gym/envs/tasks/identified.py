@@ -21,7 +21,7 @@ from wlr_gym.envs.tasks.entries import EventConfig
 from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, TABLE
-from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.parameters import HIGH, Parameters
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,6 @@ _TWO_SIDED_95 = 2 * 1.959964
 _VERDICTS = ("nothing_missing", "effect_found", "unknown_effect")
 #: The table holds one of each (and few patches): an identified one takes the place of a drawn one.
 _REPLACED = ("payload.", "patch.", "servo.stribeck_", "servo.ripple_")
-_HIGH = np.array([spec.high for spec in TABLE for _ in spec.elements])
 
 
 def identified_events(path: str | Path, robot: Robot) -> dict[str, EventConfig]:
@@ -156,7 +155,7 @@ def _effect_events(entry: Any, robot: Parameters, place: str) -> list[EventConfi
 def _action(name: str, where: Any, values: Mapping[str, float], robot: Parameters) -> tuple[list[str], list[str], Array]:
     """What an effect changes, by which operation, and its numbers: seen by applying it to two different robots."""
     before = robot.values[0]
-    other = np.minimum(np.where(before == 0.0, 1e-3, 1.1 * before), _HIGH)
+    other = np.minimum(np.where(before == 0.0, 1e-3, 1.1 * before), HIGH)
     replaced = np.array([element.startswith(_REPLACED) for element in ELEMENTS])
     other[replaced] = before[replaced]
     after, after_other = (_applied(name, where, values, start) for start in (before, other))

@@ -23,8 +23,8 @@ from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Entry, EventConfig, Sa
 from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.robot import LEG_SLICE, LEGS, Robot
-from wlr_gym.robot.parameter_table import ELEMENTS, TABLE, XYZ
-from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS, XYZ
+from wlr_gym.robot.parameters import HIGH, LOW, Parameters
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -206,7 +206,6 @@ class Randomization:
         self._interval_limits = _limits(config, self.intervals)
         self._drift_streams = stream_numbers(*(f"drift/{name}" for name in self.drifts))
         self._drift_limits = _limits(config, self.drifts)
-        self._low, self._high = _table_bounds()
         start = config.initial_state
         widths = {"leg_angle": (start.leg_angle, LEGS), "yaw": (start.yaw, ("z",))}
         widths |= {"linear_velocity": (start.linear_velocity, XYZ), "angular_velocity": (start.angular_velocity, XYZ)}
@@ -285,7 +284,7 @@ class Randomization:
             else:
                 operate = np.multiply if kind == "scale" else np.add
                 operate.at(values.T, columns, block.T)
-        np.clip(values, self._low, self._high, out=values)
+        np.clip(values, LOW, HIGH, out=values)
         _make_inertias_physical(Parameters(values))
 
     def next_strike(self, episode_seeds: Seeds, occurrences: Counts, control_period: float) -> Counts:
@@ -346,11 +345,6 @@ def _refuse_no_area(entries: Sequence[Entry], places: Mapping[str, str]) -> None
                 f"{places[entry.event]}: event '{entry.event}': no event says where {element} lies: expected 'area', such as "
                 "{x_min: [0.3, 1.0], length: [0.3, 0.6]}, or {} for the whole floor"
             )
-
-
-def _table_bounds() -> tuple[Array, Array]:
-    sizes = [spec.size for spec in TABLE]
-    return np.repeat([spec.low for spec in TABLE], sizes), np.repeat([spec.high for spec in TABLE], sizes)
 
 
 def _make_inertias_physical(parameters: Parameters) -> None:

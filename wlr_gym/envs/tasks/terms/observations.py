@@ -157,32 +157,18 @@ POLICY_TERMS = _SENSED | {term.name: term for term in (*_ESTIMATED, *_TRUE)}
 #: What a critic may observe besides.
 PRIVILEGED_TERMS = {term.name: term for term in _TRUE}
 
-
-def _leg_angle(robot: Robot) -> float:
-    """How far a leg goes from home, rad."""
-    return max(abs(limit - robot.home.leg_angle) for limit in robot.leg_limits)
-
-
-def _largest(*quantities: str) -> RobotNumber:
-    return lambda robot: max(QUANTITIES[name].of(robot) for name in quantities)
-
-
-#: Quantities that large or fast robots have more of -> the terms that read them.
-_READ_BY = {
-    _leg_angle: ("leg_position", "leg_reference"),
-    _largest("leg_speed"): ("leg_velocity",),
-    _largest("wheel_speed"): ("wheel_velocity",),
-    _largest("leg_speed", "wheel_speed"): ("joint_velocity",),
-    _largest("leg_torque"): ("leg_effort",),
-    _largest("wheel_torque"): ("wheel_effort",),
-    _largest("leg_torque", "wheel_torque"): ("motor_torque",),
-    _largest("top_speed"): (
-        *("speed_command", "climb_command", "linear_velocity_in_body", "slip_velocity"),
-        *("estimated_linear_velocity_in_body", "estimated_slip_velocity"),
-    ),
-    _largest("weight"): ("contact_force", "estimated_normal_force", "estimated_traction_force"),
+#: Terms that large, fast or strong robots read more of -> quantities of a robot, of which the largest says how much.
+_REACHED = {
+    "leg_velocity": ("leg_speed",),
+    "wheel_velocity": ("wheel_speed",),
+    "joint_velocity": ("leg_speed", "wheel_speed"),
+    "leg_effort": ("leg_torque",),
+    "wheel_effort": ("wheel_torque",),
+    "motor_torque": ("leg_torque", "wheel_torque"),
+    **dict.fromkeys(("speed_command", "climb_command", "linear_velocity_in_body", "slip_velocity"), ("top_speed",)),
+    **dict.fromkeys(("estimated_linear_velocity_in_body", "estimated_slip_velocity"), ("top_speed",)),
+    **dict.fromkeys(("contact_force", "estimated_normal_force", "estimated_traction_force"), ("weight",)),
 }
-_REACHED = {term: reached for reached, terms in _READ_BY.items() for term in terms}
 
 
 def limit_for(term: ObservationTerm, robot: Robot, drawn: Sequence[float] = ()) -> float:
@@ -193,4 +179,7 @@ def limit_for(term: ObservationTerm, robot: Robot, drawn: Sequence[float] = ()) 
         robot: readings reach a quarter more than its file says.
         drawn: ends of the range that a command is drawn from.
     """
-    return max(term.limit, 1.25 * _REACHED.get(term.name, _zero)(robot), *map(abs, drawn))
+    reached = [QUANTITIES[name].of(robot) for name in _REACHED.get(term.name, ())]
+    if term.name in ("leg_position", "leg_reference"):
+        reached = [abs(limit - robot.home.leg_angle) for limit in robot.leg_limits]
+    return max([term.limit, *(1.25 * value for value in reached), *map(abs, drawn)])
