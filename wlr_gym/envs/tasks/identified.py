@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.envs.tasks.entries import EventConfig
+from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, TABLE
@@ -96,16 +97,12 @@ def _estimate(entry: Any, key: str, place: str) -> tuple[float, float, float]:
     interval: Any = entry.get("ci95")
     ends = [given, given] if interval is None else interval
     numbers = [given, *ends] if isinstance(ends, list) and len(ends) == 2 else []
-    if not numbers or not all(map(_is_number, numbers)):
+    if not numbers or None in map(finite_number, numbers):
         raise InputError(f"{place}: {key} = {given!r}, ci95 = {interval!r}: expected a finite number and [low, high]")
     value, low, high = map(float, numbers)
     if not low <= value <= high:
         raise InputError(f"{place}: {key} = {value:g} is not within its ci95 [{low:g}, {high:g}]")
     return value, low, high
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _event(elements: tuple[str, ...], operation: Any, mean: float, sigma: float) -> EventConfig:

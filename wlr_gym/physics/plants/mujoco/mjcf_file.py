@@ -124,11 +124,7 @@ def read_mjcf(path: str | Path) -> LinkTree:
     links = {_name(model, "body", body): _link(model, body) for body in members}
     joints = tuple(_joint(model, body, members[0], source) for body in members[1:])
     numbers = _scene_numbers(model, members[0], source)
-    return LinkTree(_model_name(path), source, links, joints, numbers)
-
-
-def _model_name(path: str | Path) -> str:
-    return mujoco.MjSpec.from_file(str(path)).modelname
+    return LinkTree(mujoco.MjSpec.from_file(source).modelname, source, links, joints, numbers)
 
 
 def _name(model: Any, kind: str, index: int) -> str:
