@@ -78,8 +78,9 @@ class Simulator(ABC):
         """Put robots ``rows`` where ``state`` (N) says."""
 
     @abstractmethod
-    def mechanical_state(self) -> PlantState:
-        """Return a copy of the mechanical and servo state."""
+    def _servo_state(self) -> tuple[Array, ...]:
+        """Return copies of the servos' references (N, 8), rad (legs: as read) and rad/s, of lead and rate of the rotors (N, 8),
+        of the supply's drop (N,) and of the joints' wind-up (N, 8)."""
 
     @abstractmethod
     def _engine_stores(self) -> dict[str, RowStore]:
@@ -133,6 +134,23 @@ class Simulator(ABC):
         rows = self._rows(mask)
         self._take_parameters(parameters, rows)
         self._setpoints.set_delays(rows, self.parameters)
+
+    def mechanical_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state."""
+        truth, has_play = self._truth, self.parameters["servo.backlash"] > 0.0
+        position, velocity, lead, rate, drop, wind_up = self._servo_state()
+        position[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
+        body = ("position", "quaternion", "linear_velocity_in_body", "angular_velocity_in_body")
+        return PlantState(
+            **{name: truth[name].copy() for name in (*body, "joint_position", "joint_velocity")},
+            reference_position=position,
+            reference_velocity=velocity,
+            rotor_lead=np.where(has_play, lead, 0.0),
+            rotor_rate=np.where(has_play, rate, truth.joint_velocity),
+            supply_drop=drop,
+            time=self._time.copy(),
+            wind_up=wind_up,
+        )
 
     # ---- snapshots ----
 

@@ -128,31 +128,10 @@ class MujocoPlant(Simulator):
         batch = self._batch
         self._state[rows], batch.qpos[rows], batch.qvel[rows], batch.warmstart[rows] = values, position, speed, 0.0
 
-    def mechanical_state(self) -> PlantState:
-        """Return a copy of the mechanical and servo state."""
-
-        def columns(name: str) -> Array:
-            return np.stack([self._state[:, _LANE[f"{name}{j}"]] for j in range(8)], axis=1)
-
-        truth = self._truth
-        reference = columns("reference_position")
-        reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
-        has_play = self.parameters["servo.backlash"] > 0.0
-        return PlantState(
-            position=truth.position.copy(),
-            quaternion=truth.quaternion.copy(),
-            linear_velocity_in_body=truth.linear_velocity_in_body.copy(),
-            angular_velocity_in_body=truth.angular_velocity_in_body.copy(),
-            joint_position=truth.joint_position.copy(),
-            joint_velocity=truth.joint_velocity.copy(),
-            reference_position=reference,
-            reference_velocity=columns("reference_velocity"),
-            rotor_lead=np.where(has_play, self._state[:, _ROTOR_LEAD], 0.0),
-            rotor_rate=np.where(has_play, self._state[:, _ROTOR_RATE], truth.joint_velocity),
-            supply_drop=self._state[:, _LANE["supply_drop"]].copy(),
-            time=self._time.copy(),
-            wind_up=self._memory[1:].T.copy(),
-        )
+    def _servo_state(self) -> tuple[Array, ...]:
+        names = ("reference_position", "reference_velocity", "rotor_lead", "rotor_rate")
+        joints = (self._state[:, [_LANE[f"{name}{j}"] for j in range(8)]] for name in names)
+        return *joints, self._state[:, _LANE["supply_drop"]].copy(), self._memory[1:].T.copy()
 
     def _fits(self) -> dict[str, Any]:
         return super()._fits() | {"formulas": self._forces.module if self._forces else ""}
