@@ -44,6 +44,7 @@ class Simulator(ABC):
     """
 
     capabilities: Capabilities
+    _formulas: Any = None
 
     def __init__(self, robot: Robot, count: int, options: PlantOptions | None) -> None:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
@@ -86,8 +87,7 @@ class Simulator(ABC):
     def _engine_stores(self) -> dict[str, RowStore]:
         """Return what the simulation itself remembers of its robots from one tick to the next."""
 
-    @abstractmethod
-    def _note_restored(self) -> None:
+    def _note_restored(self) -> None:  # noqa: B027 (a simulator may have nothing to do)
         """Follow up a state that was written into the stores."""
 
     @abstractmethod
@@ -164,6 +164,7 @@ class Simulator(ABC):
             "control_period": options.control_period,
             "physics_step": options.physics_step,
             "sensor_noise": options.sensor_noise,
+            "formulas": self._formulas.module if self._formulas else "",
         }
 
     def _stores(self) -> dict[str, RowStore]:

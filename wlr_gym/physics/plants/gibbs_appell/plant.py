@@ -241,7 +241,7 @@ class GibbsAppellPlant(Simulator):
         return position, velocity, lead, rate, drop[:, 0], wind_up
 
     def _fits(self) -> dict[str, Any]:
-        return super()._fits() | {"formulas": self._formulas.module if self._formulas else "", "sweeps": self.sweeps}
+        return super()._fits() | {"sweeps": self.sweeps}
 
     def _engine_stores(self) -> dict[str, RowStore]:
         lanes = {"lanes": self._lanes, "memory": self._memory, "force_values": self._formula_values}
