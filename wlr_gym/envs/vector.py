@@ -79,7 +79,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
 
         Args:
             seed: one number s (robot i gets s + i), or one number or None per robot. None continues the present series;
-                without a seed before, as if it were ``np_random_seed``.
+                without a seed before, as if it were ``np_random_seed``, or drawn from ``np_random`` where that was set.
             options: as in the single environment, alike for all robots that begin, and ``reset_mask`` (N,) bool: only these.
 
         Raises:
