@@ -144,6 +144,17 @@ def test_out_and_back(big, suffix, tmp_path, capsys):
     assert (after.leg_limits, after.sensors, after.wheel.width) == (before.leg_limits, before.sensors, before.wheel.width)
 
 
+@pytest.mark.parametrize("command", ["import", "new"])
+def test_what_is_stated_of_all_legs_is_of_all_whatever_the_base_says_of_one(command, big, tmp_path):
+    single, out, file = tmp_path / "single.yaml", tmp_path / "out.yaml", tmp_path / "big.urdf"
+    single.write_text('{base: big.yaml, name: single, individual: {"leg.length[leg_rf]": 0.4, "servo.kp[leg_lr]": 50.0}}')
+    assert main(["robot", "export", str(big), "--out", str(file)]) == OK
+    given = [str(file)] if command == "import" else ["--yes"]
+    assert main(["robot", command, *given, "--out", str(out), "--base", str(single)]) == OK
+    expected = {"servo.kp[leg_lr]": 50.0} if command == "import" else {}  # no file of another program holds a gain
+    assert load_robot(out).individual == expected
+
+
 def test_import_as_json(big, tmp_path, capsys):
     file, back = tmp_path / "big.urdf", tmp_path / "back.yaml"
     assert main(["robot", "export", str(big), "--out", str(file), "--json"]) == OK

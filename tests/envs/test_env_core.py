@@ -272,6 +272,8 @@ def test_computed_observations_speak_of_the_commands_that_hold_from_now_on(fake)
 
 def test_command_can_be_fixed_for_an_episode_and_live(fake):
     env = make()
+    with pytest.raises(gym.error.ResetNeeded, match=r"before set_command\(\)"):
+        env.set_command(yaw_rate=0.3)
     env.reset(seed=0, options={"command": {"linear_velocity_x": 0.07, "yaw_rate": 0.0}})
     for _ in range(600):
         env.step(np.zeros(8, np.float32))
@@ -649,6 +651,16 @@ def test_unseeded_environments_differ_and_tell_their_seed(fake):
     assert not np.array_equal(observation, two.reset()[0])
     again = make()
     assert np.array_equal(again.reset(seed=one.np_random_seed)[0], observation)
+
+
+@pytest.mark.parametrize("face", [make, lambda: make_vec(2)])
+def test_a_generator_of_the_users_own_decides_what_is_drawn(fake, face):
+    def first(seed):
+        env = face()
+        env.np_random = np.random.default_rng(seed)
+        return env.reset()[0].tolist()
+
+    assert first(1) == first(1) != first(2)
 
 
 # ---- effects ----

@@ -278,6 +278,18 @@ def test_a_refused_first_reset_begins_nothing(fake, face):
         env.step(env.action_space.sample())
 
 
+def test_after_a_reset_that_the_plant_refuses_the_old_episode_does_not_go_on():
+    env = make_vec(2)
+    env.reset(seed=0)
+    stiff = {"parameters": {"ground.normal_damping": 500.0}, "reset_mask": np.array([False, True])}
+    with pytest.raises(InputError, match="too stiff for a physics step"):
+        env.reset(options=stiff)
+    with pytest.raises(gym.error.ResetNeeded, match="no episode of robot 1"):
+        env.step(env.action_space.sample())
+    env.reset(options={"reset_mask": stiff["reset_mask"]})
+    env.step(env.action_space.sample())
+
+
 def test_robots_left_out_of_the_first_reset_are_named(fake):
     env = make_vec(3)
     env.reset(seed=0, options={"reset_mask": np.array([True, False, True])})

@@ -203,6 +203,7 @@ def test_a_snapshot_of_something_else_is_refused_and_nothing_changes() -> None:
         "randomization": {"randomization": "ice"},
         "effects": {"effects": [SPRING]},
         "free_wheels": {"free_wheels": ["wheel_lf"]},
+        "robot.servo.leg.stall_current is 4.4, here None": {"robot": "emanual"},
     }.items():
         other: Any = gym.make_vec(env_id, num_envs=2, **{**keywords, "episode_length": LENGTH, **more})
         other.reset(seed=0)

@@ -127,6 +127,14 @@ def test_mujoco_loads_the_file_and_agrees(case, suffix, tmp_path):
     assert states.error(found) < AGREE
 
 
+def test_a_single_servo_keeps_its_torque(tmp_path):
+    robot = load_robot({"base": "nominal", "name": "weak", "individual": {"servo.stall_torque[leg_rf]": 5.0}})
+    expected = dict.fromkeys(LEGS, 7.3) | {"leg_rf": 5.0}
+    for suffix, read in (("urdf", lambda path: parse_urdf(path.read_text(), "x")), ("xml", read_mjcf)):
+        joints = read(written(robot, suffix, tmp_path)).joints
+        assert {joint.name: joint.effort for joint in joints if joint.name in LEGS} == expected
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_pinocchio_loads_the_file_and_agrees(case, suffix, tmp_path):
     pin: Any = pytest.importorskip("pinocchio")

@@ -272,3 +272,12 @@ def test_training_commands_are_told_without_the_machine():
 
     command = "wlr train WLR-Velocity-v0 --config ppo --seed 3 --out '/a b/run' --no-progress --max-minutes=5 --set x=1"
     assert portable(command) == "wlr train WLR-Velocity-v0 --config ppo --seed 3 --set x=1"
+
+
+def test_a_recorded_command_is_one_that_a_shell_takes(monkeypatch):
+    from wlr_gym.base.provenance import provenance
+    from wlr_gym.cli.export import portable
+
+    words = ["train", "WLR-Velocity-v0", "--set", "environment.task.commands.terms.yaw_rate=[-0.2, 0.2]"]
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/wlr", *words, "--out", "runs/o'brien"])
+    assert portable(provenance()["command"]) == f"wlr {' '.join(words[:3])} '{words[3]}'"

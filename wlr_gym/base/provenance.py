@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -32,9 +33,9 @@ def record_provenance(folder: Path, config: Mapping[str, Any], seed: int | None 
 
 
 def provenance(seed: int | None = None) -> dict[str, Any]:
-    """Return command, time, seed, git commit and versions as plain YAML types."""
+    """Return command (as a shell takes it), time, seed, git commit and versions as plain YAML types."""
     return {
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": seed,
         "git_commit": git_commit(),

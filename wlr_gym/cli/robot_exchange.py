@@ -65,14 +65,15 @@ def import_robot(options: RobotImportOptions) -> int:
     from wlr_gym.base.files import write_text
     from wlr_gym.physics.feasibility import examine_robot
     from wlr_gym.robot.interchange import recognise
-    from wlr_gym.robot.interchange.robot_file import base_beside, new_file, robot_over, robot_text
+    from wlr_gym.robot.interchange.robot_file import base_beside, new_file, of_all, robot_over, robot_text
 
     new_file(options.out, force=options.force)
     found = recognise(_read(options.file), idealise=options.idealise)
     name = options.name or found.name or options.out.stem
-    robot = robot_over(options.base, name, found.numbers, options.out)
+    numbers = of_all(found.numbers, options.base)
+    robot = robot_over(options.base, name, numbers, options.out)
     title = [f"Imported from {options.file.name} by wlr robot import. SI units, radians.", *_explained(found, options.base)]
-    write_text(options.out, robot_text(name, base_beside(options.base, options.out), found.numbers, title=title))
+    write_text(options.out, robot_text(name, base_beside(options.base, options.out), numbers, title=title))
     findings = examine_robot(robot)
     if options.json:
         print_json({"out": options.out, **asdict(found), "findings": findings})

@@ -51,7 +51,7 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     from wlr_gym.base.files import write_text
     from wlr_gym.physics.feasibility import examine_robot
     from wlr_gym.robot import load_robot
-    from wlr_gym.robot.interchange.robot_file import base_beside, new_file, robot_over, robot_text
+    from wlr_gym.robot.interchange.robot_file import base_beside, new_file, of_all, robot_over, robot_text
     from wlr_gym.robot.outline import QUESTIONS, derived_numbers, question_of
 
     new_file(options.out, force=options.force)
@@ -65,6 +65,7 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
         if not options.yes and question.key not in given:
             answers[question.key] = _asked(question, default, ask or (lambda text: ask_terminal(text, "wlr robot new")))
     numbers, comments = derived_numbers(answers, base)
+    numbers = of_all(numbers, options.base)
     try:
         robot = robot_over(options.base, name, numbers, options.out, check=False)
     except InputError as error:

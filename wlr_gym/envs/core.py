@@ -215,7 +215,9 @@ class Core:
 
     def set_command(self, values: Mapping[str, float]) -> None:
         """Command all robots from the next step on, until the episode ends (teleoperation, evaluation)."""
-        self.commands.hold(np.arange(self.count), self.commands.read(values))
+        held = self.commands.read(values)
+        self.episodes.require_begun("set_command()")
+        self.commands.hold(np.arange(self.count), held)
 
     def set_progress(self, steps: float) -> None:
         """Say how many environment steps, of all robots together, a training has done: what is drawn from now on is spread as
@@ -323,17 +325,11 @@ class Core:
 
     # ---- what the interfaces hand out: fresh objects every time ----
 
-    def observations(self) -> Any:
-        """Return a copy of all observations: (N, D) array, or dict of arrays."""
+    def observations(self, rows: int | slice = slice(None)) -> Any:
+        """Return a copy of all observations, or of one robot's: array (N, D) or (D,), or dict of such."""
         if self.dictionary:
-            return {"policy": self.observation.copy(), "privileged": self.privileged.copy()}
-        return self.observation.copy()
-
-    def observation_of(self, row: int) -> Any:
-        """Return a copy of one robot's observation."""
-        if self.dictionary:
-            return {"policy": self.observation[row].copy(), "privileged": self.privileged[row].copy()}
-        return self.observation[row].copy()
+            return {"policy": self.observation[rows].copy(), "privileged": self.privileged[rows].copy()}
+        return self.observation[rows].copy()
 
     def describe(self) -> str:
         """Return the task's tables as text."""

@@ -71,7 +71,8 @@ class Episodes:
         return episode_seeds(self.robot_seeds[rows], self.number[rows] + 1)
 
     def begin(self, rows: Rows, seeds: NDArray[np.uint64]) -> None:
-        """Begin the next episodes of some robots, which have these seeds."""
+        """Begin the next episodes of some robots, which have these seeds; :meth:`note_begun` says when they can be stepped."""
+        self.begun[rows] = self._all_begun = False
         self.number[rows] += 1
         self.seeds[rows] = seeds
         self.steps[rows] = self.sooner[rows] = 0
@@ -120,6 +121,12 @@ def read_seed(seed: Any) -> int:
     if not is_whole(seed) or seed < 0:
         raise InputError(f"seed = {seed!r}: expected a whole number of 0 or more")
     return int(seed)
+
+
+def own_seed(environment: Any) -> int:
+    """Return the seed of an environment's ``np_random``; one drawn from it where the user set it, as its own is not known."""
+    seed = environment.np_random_seed
+    return int(environment.np_random.integers(2**63)) if seed < 0 else seed
 
 
 def _word(seed: int) -> int:

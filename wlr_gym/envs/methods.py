@@ -43,6 +43,7 @@ class TaskMethods:
 
         Raises:
             InputError: unknown command, or a value without meaning or beyond what the robot can do.
+            gymnasium.error.ResetNeeded: before the first reset.
         """
         self.core.set_command(values)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterable, Sequence
 from typing import Any, Unpack
 
@@ -87,7 +88,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
 
     def reset(self) -> Any:
         """Start new episodes with the seeds and options given before."""
-        seed_robots(self.core, self._seeds, self.core.everyone, int(np.random.SeedSequence().generate_state(1, np.uint64)[0]))
+        seed_robots(self.core, self._seeds, self.core.everyone, lambda: secrets.randbits(64))
         plain = np.array([not options for options in self._options])
         if plain.any():
             self.core.begin_episodes(plain)
@@ -122,7 +123,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
             for row, more in enumerate(self._rows(self._infos.episode(), done)):
                 if done[row]:
                     limit = bool(core.truncated[row] and not core.terminated[row])
-                    infos[row] |= {"terminal_observation": core.observation_of(row), "TimeLimit.truncated": limit, **more}
+                    infos[row] |= {"terminal_observation": core.observations(row), "TimeLimit.truncated": limit, **more}
             core.begin_episodes(done)
             self._keep_reset_infos(done)
         self.pictures.after_step()

@@ -12,7 +12,7 @@ from gymnasium.utils import EzPickle
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.envs.actions import read_actions
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.episodes import read_seed
+from wlr_gym.envs.episodes import own_seed, read_seed
 from wlr_gym.envs.infos import Infos, row_of
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
@@ -65,10 +65,10 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):  # pyright: ignor
         """
         super().reset(seed=None if seed is None else read_seed(seed))
         if seed is not None or not self.core.episodes.seeded[0]:
-            self.core.seed(0, self.np_random_seed % 2**128 if seed is None else seed)  # -1 where the user set np_random
+            self.core.seed(0, own_seed(self) if seed is None else seed)
         self.core.begin_episodes(self._everyone, options)
         self.pictures.after_step()
-        return self.core.observation_of(0), row_of(self._infos.reset(), 0)
+        return self.core.observations(0), row_of(self._infos.reset(), 0)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance one control step.
@@ -88,13 +88,13 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):  # pyright: ignor
         if done:
             info |= row_of(self._infos.episode(), 0)
         self.pictures.after_step()
-        return core.observation_of(0), float(core.reward[0]), bool(core.terminated[0]), bool(core.truncated[0]), info
+        return core.observations(0), float(core.reward[0]), bool(core.terminated[0]), bool(core.truncated[0]), info
 
     def set_state(self, snapshot: Snapshot, rows: Any = None) -> Any:
         """Put the robot into the state of a snapshot of one robot and return its observation; see
         :meth:`wlr_gym.envs.methods.TaskMethods.set_state`."""
         super().set_state(snapshot, rows)
-        return self.core.observation_of(0)
+        return self.core.observations(0)
 
     def render(self) -> np.ndarray | None:
         """Return the picture (H, W, 3) of the robot with ``rgb_array``; show it with ``human``, which every step does itself.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Unpack
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.envs.core import OPTIONS, Core, Mask, read_options
-from wlr_gym.envs.episodes import read_seed
+from wlr_gym.envs.episodes import own_seed, read_seed
 from wlr_gym.envs.infos import Infos
 from wlr_gym.envs.methods import TaskMethods
 from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
@@ -79,7 +79,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
 
         Args:
             seed: one number s (robot i gets s + i), or one number or None per robot. None continues the present series;
-                without a seed before, as if it were ``np_random_seed``.
+                without a seed before, as if it were ``np_random_seed``, or drawn from ``np_random`` where that was set.
             options: as in the single environment, alike for all robots that begin, and ``reset_mask`` (N,) bool: only these.
 
         Raises:
@@ -90,7 +90,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         seeds = _read_seeds(seed, self.num_envs)
         if isinstance(seed, (int, np.integer)):
             super().reset(seed=int(seed))
-        seed_robots(self.core, seeds, mask, self.np_random_seed or 0)
+        seed_robots(self.core, seeds, mask, lambda: own_seed(self))
         self.core.begin_episodes(mask, given)
         self.pictures.after_step()
         return self.core.observations(), _masked(self._infos.reset(), mask)
@@ -133,7 +133,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         core, changes = self.core, self._changes()
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(over).tolist():
-            final[row] = core.observation_of(row)
+            final[row] = core.observations(row)
         infos = {} if over.all() else _masked(self._infos.step(), ~over)
         infos["final_obs"], infos["_final_obs"] = final, over.copy()
         infos["final_info"] = _masked(self._infos.step() | self._infos.episode(), over)
@@ -169,14 +169,16 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         self.core.close()
 
 
-def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask, first: int) -> None:
-    """Seed the robots in ``mask``: with the given number, robot i with ``first`` + i if it never had one, else not at all."""
-    for row in np.flatnonzero(mask).tolist():
+def seed_robots(core: Core, seeds: Sequence[int | None], mask: Mask, first: Callable[[], int]) -> None:
+    """Seed the robots in ``mask``: with the given number, robot i with ``first()`` + i if it never had one, else not at all."""
+    rows = np.flatnonzero(mask).tolist()
+    start = 0 if all(seeds[row] is not None or core.episodes.seeded[row] for row in rows) else first()
+    for row in rows:
         given = seeds[row]
         if given is not None:
             core.seed(row, given)
         elif not core.episodes.seeded[row]:
-            core.seed(row, (first + row) % 2**128)
+            core.seed(row, (start + row) % 2**128)
 
 
 def _read_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:

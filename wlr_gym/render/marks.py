@@ -119,11 +119,12 @@ def areas(parameters: Parameters, row: int, around: Array) -> list[Area]:
         high = np.minimum([box[1], box[3]], around[:2] + REACH)
         if (low < high).all():
             mu = float(parameters["patch.mu"][row, index]) * float(share)
-            found.append(Area(_pair(low), _pair(high), mu, LAYER * (index + 1)))
+            found.append(Area(pair(low), pair(high), mu, LAYER * (index + 1)))
     return found
 
 
-def _pair(values: Array) -> tuple[float, float]:
+def pair(values: Array) -> tuple[float, float]:
+    """Return the first two numbers."""
     return float(values[0]), float(values[1])
 
 

@@ -142,7 +142,7 @@ class Scene:
             text = (places[:, 0] < 0.48 * width) & ((places[:, 1] < 0.27 * height) | (places[:, 1] > 0.76 * height))
             good = inside & ~text & (np.linalg.norm(places - robot, axis=1) > clear)
             if good.any():
-                notes.append(overlay.Note(f"µ {area.mu:.2g}", _pair(places[np.argmax(good)])))
+                notes.append(overlay.Note(f"µ {area.mu:.2g}", marks.pair(places[np.argmax(good)])))
         return notes
 
 
@@ -208,7 +208,3 @@ def describe(
     if abs(pitch) > 0.05 or abs(roll) > 0.05:
         lines.append(f"slope {pitch:.1f}° along x, {roll:.1f}° along y")
     return lines
-
-
-def _pair(values: NDArray[np.float64]) -> tuple[float, float]:
-    return float(values[0]), float(values[1])

@@ -18,8 +18,9 @@ _SLICES: dict[str, slice] = {}
 for _spec in TABLE:
     _start = _COLUMN[_spec.elements[0]]
     _SLICES[_spec.name] = slice(_start, _start + _spec.size)
-_LOW = np.array([spec.low for spec in TABLE for _ in spec.elements])
-_HIGH = np.array([spec.high for spec in TABLE for _ in spec.elements])
+#: Bounds of every element, in the order of the table.
+LOW = np.array([spec.low for spec in TABLE for _ in spec.elements])
+HIGH = np.array([spec.high for spec in TABLE for _ in spec.elements])
 
 
 class Parameters:
@@ -67,14 +68,14 @@ class Parameters:
 
     def validate(self) -> None:
         """Raise :class:`InputError` naming the first element that is not finite or outside its bounds."""
-        bad = ~((self.values >= _LOW) & (self.values <= _HIGH))
+        bad = ~((self.values >= LOW) & (self.values <= HIGH))
         if not bad.any():
             self._validate_payload()
             return
         row, column = np.argwhere(bad)[0]
         raise InputError(
             f"parameter {ELEMENTS[column]} = {self.values[row, column]:g} (robot {row} of the batch) is outside "
-            f"{range_in_words(float(_LOW[column]), float(_HIGH[column]), spec_of(ELEMENTS[column]).unit)}"
+            f"{range_in_words(float(LOW[column]), float(HIGH[column]), spec_of(ELEMENTS[column]).unit)}"
         )
 
     def _validate_payload(self) -> None:

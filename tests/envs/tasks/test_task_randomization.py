@@ -224,6 +224,8 @@ NO_RANGE = {"low": None, "high": None}
         ({**MASS, "distribution": "tolerance", **NO_RANGE}, "'operation' does not go with 'tolerance'"),
         ({**MASS, "when": "interval"}, "goes with 'when: interval'"),
         ({**MASS, "hihg": 3.0}, "did you mean 'high'"),
+        ({**MASS, "parameters": ["wheel.radius", "wheel.radius[wheel_lr]"]}, "wheel.radius[wheel_lr] occurs twice"),
+        ({**MASS, "parameters": ["patch.mu[patch_2]"]}, "no event says where patch.mu[patch_2] lies: expected 'area'"),
     ],
 )
 def test_bad_events_are_refused(robot, event, expected):

@@ -102,6 +102,27 @@ def test_a_bad_rule_is_named(rules, message):
         load_task("velocity", LARGE, {"scaling": rules})
 
 
+@pytest.mark.parametrize(("name", "quantity"), [("velocity", "grip = 0 m/s2"), ("slope", "weight = 0 N")])
+def test_a_robot_without_weight_is_refused(name, quantity):
+    with pytest.raises(InputError, match=f"robot 'floating': {quantity}: expected more than 0"):
+        load_task(name, {"base": "nominal", "name": "floating", "gravity": 0.0})
+
+
+def test_what_a_fast_robot_reads_is_not_cut_off():
+    fast = {"base": "nominal", "name": "fast", "servo": {"wheel": {"no_load_speed": 60.0}}, "leg_limits": [-3.0, 5.0]}
+    task, nominal = load_task("velocity", fast), load_task("velocity")
+    limit = {column.term: column.limit for column in task.policy}
+    turning = max(task.config.commands.terms["yaw_rate"])
+    assert turning > 2.0
+    assert [column.limit for column in task.policy[:2]] == [2.0, turning]
+    assert limit["wheel_velocity"] == 75.0
+    assert limit["leg_position"] == pytest.approx(1.25 * (3.0 + task.robot.home.leg_angle))
+    assert limit["leg_velocity"] == 20.0
+    assert {column.limit for column in nominal.policy if column.term in ("command", "leg_position")} == {2.0}
+    given = load_task("velocity", fast, {"observations": {"wheel_velocity": {"limit": 3.0}}})
+    assert {column.limit for column in given.policy if column.term == "wheel_velocity"} == {3.0}
+
+
 def test_rules_are_products():
     check_rule("x", "top_speed*track_width / leg_reach", "task")
     assert ratio("1 / leg_reach", load_robot(LARGE), NOMINAL) == pytest.approx(1 / 3)

@@ -10,7 +10,7 @@ from observed_runs import PERIOD, estimated, observe, plain_odometry, simulate, 
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver, kalman
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, standing_state
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors, standing_state
 from wlr_gym.robot import CORNER_SIGNS, load_robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -321,12 +321,30 @@ def test_covariances_stay_positive_and_readings_that_are_no_numbers_do_no_harm()
     assert np.abs(error).max() < 0.1
 
 
+def test_a_robot_file_may_have_ideal_sensors():
+    ideal = {"encoder": {"velocity": 0.0}, "imu": {"gyro_noise": 0.0, "accel_noise": 0.0, "gyro_bias": 0.0, "accel_bias": 0.0}}
+    robot = load_robot({"base": "nominal", "name": "ideal", "sensors": ideal})
+    observer = SlipObserver(robot, PERIOD, 1, False)
+    readings = Sensors(np.zeros((1, SENSOR_LAYOUT.width)))
+    readings.joint_position[:, :4], readings.accelerometer[:, 2] = robot.home.leg_angle, robot.gravity
+    observer.reset(np.ones(1, bool), readings.values)
+    for acceleration in (0.1, 0.0):  # for 1 s, then rolling on
+        for _ in range(50):
+            readings.accelerometer[:, 0] = acceleration
+            readings.joint_velocity[:, 4:] += acceleration * PERIOD / robot.wheel.radius
+            observer.update(np.ones(1, bool), readings.values)
+    velocity = ESTIMATE_LAYOUT.view(observer.values, "linear_velocity_in_body")[0]
+    assert velocity == pytest.approx([50 * PERIOD * 0.1, 0.0], abs=0.005)
+
+
 def test_wrong_shapes_are_refused():
     observer = SlipObserver(ROBOT, PERIOD, 3, True)
     with pytest.raises(InputError, match="observer of 3 robots"):
         observer.reset(np.ones(2, bool), np.zeros((3, SENSOR_LAYOUT.width)))
     with pytest.raises(InputError, match="sensors"):
         observer.update(np.ones(3, bool), np.zeros((3, 4)))
+    with pytest.raises(InputError, match="gravity = 0"):
+        SlipObserver(ROBOT.model_copy(update={"gravity": 0.0}), PERIOD, 3, True)
 
 
 # ---- against simulated truth -----------------------------------------------------------------------------------------

@@ -1,12 +1,16 @@
 """The tracer gives what numpy gives, and compiled kernels give it bit for bit at any width."""
 
+import os
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from llvmlite import binding
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.physics.codegen import Graph, emit, hoist, load_module, ops
+from wlr_gym.physics.codegen.module import cache_directory
 
 
 def formula(x, y, p):
@@ -98,6 +102,19 @@ def test_threads_that_load_a_module_at_once_are_given_it_whole(monkeypatch, tmp_
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: load_module("test_slow", slow).value, range(4)))
     assert found == [tmp_path.name] * 4
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="users of other systems have no number")
+def test_code_is_not_taken_from_another_users_folder(monkeypatch, tmp_path):
+    (tmp_path / "no_folder").touch()
+    monkeypatch.setenv("WLR_GYM_CACHE", str(tmp_path / "no_folder"))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+    assert cache_directory().parent == tmp_path
+    owner = os.getuid()
+    (tmp_path / f"wlr_gym-{owner + 1}").mkdir()
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    with pytest.raises(InputError, match="is another user's"):
+        cache_directory()
 
 
 def test_a_compact_block_overwrites_what_it_reads_without_losing_it():

@@ -403,8 +403,12 @@ def test_accelerometer_starts_with_the_specific_force_of_standing_still(simulato
 
 def test_bad_resets_are_refused(simulator):
     plant = make(simulator, 2)
-    with pytest.raises(InputError, match="mask has shape"):
-        plant.reset(mask=np.ones(3, bool))
+    for mask in (np.ones(3, bool), np.array([0, 1])):  # numbers of robots are no mask
+        with pytest.raises(InputError, match=r"mask has shape .* expected \(2,\) booleans"):
+            plant.reset(mask=mask)
+    for count in (1, 3):
+        with pytest.raises(InputError, match=f"state holds {count} robots, the plant 2"):
+            plant.reset(state=make(simulator, count).mechanical_state())
     state = plant.mechanical_state()
     state.position[0, 0] = np.nan
     with pytest.raises(InputError, match="not finite"):

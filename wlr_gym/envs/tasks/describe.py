@@ -30,11 +30,7 @@ class DescriptionPart:
 
 def describe(task: Task) -> str:
     """Return the task's action, observation, command, reward, termination and measure tables as text (reStructuredText)."""
-    return restructured_text(task_sections(task))
-
-
-def restructured_text(sections: Sequence[DescriptionPart]) -> str:
-    """Return sections as reStructuredText: titles in bold, simple tables."""
+    sections = task_sections(task)
     return "\n".join(line for one in sections for line in (f"**{one.title}** {one.sentence}", "", *_simple_table(one)))
 
 

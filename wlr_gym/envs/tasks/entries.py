@@ -142,6 +142,9 @@ def entries_of(name: str, event: EventConfig, robot: Robot, source: str = "rando
         elements = elements_of(event)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
+    for element in elements:
+        if elements.count(element) > 1:
+            raise InputError(f"{where}: parameters = {list(event.parameters)}: {element} occurs twice, expected each once")
     entries = [_entry(name, event, robot, element, where) for element in elements]
     if event.operation == "below_friction_limit" and len(elements) > 1:
         raise InputError(

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.envs.tasks.entries import EventConfig
+from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, TABLE
-from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.parameters import HIGH, Parameters
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,6 @@ _TWO_SIDED_95 = 2 * 1.959964
 _VERDICTS = ("nothing_missing", "effect_found", "unknown_effect")
 #: The table holds one of each (and few patches): an identified one takes the place of a drawn one.
 _REPLACED = ("payload.", "patch.", "servo.stribeck_", "servo.ripple_")
-_HIGH = np.array([spec.high for spec in TABLE for _ in spec.elements])
 
 
 def identified_events(path: str | Path, robot: Robot) -> dict[str, EventConfig]:
@@ -97,16 +97,12 @@ def _estimate(entry: Any, key: str, place: str) -> tuple[float, float, float]:
     interval: Any = entry.get("ci95")
     ends = [given, given] if interval is None else interval
     numbers = [given, *ends] if isinstance(ends, list) and len(ends) == 2 else []
-    if not numbers or not all(map(_is_number, numbers)):
+    if not numbers or None in map(finite_number, numbers):
         raise InputError(f"{place}: {key} = {given!r}, ci95 = {interval!r}: expected a finite number and [low, high]")
     value, low, high = map(float, numbers)
     if not low <= value <= high:
         raise InputError(f"{place}: {key} = {value:g} is not within its ci95 [{low:g}, {high:g}]")
     return value, low, high
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _event(elements: tuple[str, ...], operation: Any, mean: float, sigma: float) -> EventConfig:
@@ -156,7 +152,7 @@ def _effect_events(entry: Any, robot: Parameters, place: str) -> list[EventConfi
 def _action(name: str, where: Any, values: Mapping[str, float], robot: Parameters) -> tuple[list[str], list[str], Array]:
     """What an effect changes, by which operation, and its numbers: seen by applying it to two different robots."""
     before = robot.values[0]
-    other = np.minimum(np.where(before == 0.0, 1e-3, 1.1 * before), _HIGH)
+    other = np.minimum(np.where(before == 0.0, 1e-3, 1.1 * before), HIGH)
     replaced = np.array([element.startswith(_REPLACED) for element in ELEMENTS])
     other[replaced] = before[replaced]
     after, after_other = (_applied(name, where, values, start) for start in (before, other))

@@ -23,8 +23,8 @@ from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Entry, EventConfig, Sa
 from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.robot import LEG_SLICE, LEGS, Robot
-from wlr_gym.robot.parameter_table import ELEMENTS, TABLE, XYZ
-from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.parameter_table import ELEMENTS, XYZ
+from wlr_gym.robot.parameters import HIGH, LOW, Parameters
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -188,6 +188,7 @@ class Randomization:
         places = dict.fromkeys(config.events, "randomization") | dict(places or {})
         entries = [entry for name, event in config.events.items() for entry in entries_of(name, event, robot, places[name])]
         _refuse_double_set(entries, places)
+        _refuse_no_area(entries, places)
         self._operations = {kind: [e for e in entries if e.operation == kind] for kind in ("set", "scale", "add", BELOW_LIMIT)}
         entries = [entry for kind in self._operations.values() for entry in kind]
         self._sampler = Sampler(entries) if entries else None
@@ -205,7 +206,6 @@ class Randomization:
         self._interval_limits = _limits(config, self.intervals)
         self._drift_streams = stream_numbers(*(f"drift/{name}" for name in self.drifts))
         self._drift_limits = _limits(config, self.drifts)
-        self._low, self._high = _table_bounds()
         start = config.initial_state
         widths = {"leg_angle": (start.leg_angle, LEGS), "yaw": (start.yaw, ("z",))}
         widths |= {"linear_velocity": (start.linear_velocity, XYZ), "angular_velocity": (start.angular_velocity, XYZ)}
@@ -284,7 +284,7 @@ class Randomization:
             else:
                 operate = np.multiply if kind == "scale" else np.add
                 operate.at(values.T, columns, block.T)
-        np.clip(values, self._low, self._high, out=values)
+        np.clip(values, LOW, HIGH, out=values)
         _make_inertias_physical(Parameters(values))
 
     def next_strike(self, episode_seeds: Seeds, occurrences: Counts, control_period: float) -> Counts:
@@ -335,9 +335,16 @@ def _refuse_double_set(entries: Sequence[Entry], places: Mapping[str, str]) -> N
             )
 
 
-def _table_bounds() -> tuple[Array, Array]:
-    sizes = [spec.size for spec in TABLE]
-    return np.repeat([spec.low for spec in TABLE], sizes), np.repeat([spec.high for spec in TABLE], sizes)
+def _refuse_no_area(entries: Sequence[Entry], places: Mapping[str, str]) -> None:
+    """Refuse the friction of a patch that no event gives a place: there would be no patch."""
+    _, changed = _columns(entries)
+    for entry in entries:
+        element = ELEMENTS[entry.column]
+        if element.startswith("patch.mu[") and element.replace("mu", "x_max") not in changed:
+            raise InputError(
+                f"{places[entry.event]}: event '{entry.event}': no event says where {element} lies: expected 'area', such as "
+                "{x_min: [0.3, 1.0], length: [0.3, 0.6]}, or {} for the whole floor"
+            )
 
 
 def _make_inertias_physical(parameters: Parameters) -> None:

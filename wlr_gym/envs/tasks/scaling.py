@@ -111,8 +111,16 @@ def ratio(rule: str, robot: Robot, reference: Robot) -> float:
     factor = 1.0
     for name, exponent in _factors("", rule, "").items():
         if name != "1":
-            factor *= (QUANTITIES[name].of(robot) / QUANTITIES[name].of(reference)) ** exponent
+            factor *= (_positive(name, robot) / _positive(name, reference)) ** exponent
     return factor
+
+
+def _positive(name: str, robot: Robot) -> float:
+    """Return a quantity of a robot; of one without gravity or grip, some tell nothing of how a task's numbers follow."""
+    value, unit = QUANTITIES[name].of(robot), QUANTITIES[name].unit
+    if not value > 0.0:
+        raise InputError(f"robot '{robot.name}': {name} = {value:g} {unit}: expected more than 0, as the task scales with it")
+    return value
 
 
 def scaled_numbers(

@@ -22,6 +22,7 @@ from wlr_gym.envs.tasks.terms import (
     TERMINATIONS,
     ObservationTerm,
 )
+from wlr_gym.envs.tasks.terms.observations import limit_for
 from wlr_gym.policy.sources import FED
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, RobotSource, load_robot
 
@@ -169,13 +170,13 @@ def build_task(config: TaskConfig, robot: Robot) -> Task:
             "sensors.flow in its file, as in configs/robot/flow.yaml"
         )
     policy = tuple(column for name in config.observations for column in _policy_columns(config, robot, name))
-    privileged = tuple(column for name in config.privileged for column in _privileged_columns(config, name))
+    privileged = tuple(column for name in config.privileged for column in _privileged_columns(config, robot, name))
     return Task(config, robot, policy, privileged, _action_columns(config, robot))
 
 
 def _policy_columns(config: TaskConfig, robot: Robot, name: str) -> list[ObservationColumn]:
     term, settings = POLICY_TERMS[name], config.observations[name]
-    limit = term.limit if settings.limit is None else settings.limit
+    commands = config.commands.terms if term.source == "command" else {}
     return [
         ObservationColumn(
             term=name,
@@ -185,7 +186,7 @@ def _policy_columns(config: TaskConfig, robot: Robot, name: str) -> list[Observa
             frame=term.frame,
             offset=term.offset(robot),
             scale=settings.scale,
-            limit=limit,
+            limit=limit_for(term, robot, commands.get(element, ())) if settings.limit is None else settings.limit,
             sensor_noise=term.sensor_noise(robot),
             noise=settings.noise,
             bias=settings.bias,
@@ -209,9 +210,9 @@ def _term_elements(term: ObservationTerm, config: TaskConfig) -> list[tuple[str,
     return [(element, term.unit, term.doc) for element in term.elements]
 
 
-def _privileged_columns(config: TaskConfig, name: str) -> list[ObservationColumn]:
+def _privileged_columns(config: TaskConfig, robot: Robot, name: str) -> list[ObservationColumn]:
     term, settings = PRIVILEGED_TERMS[name], config.privileged[name]
-    limit = term.limit if settings.limit is None else settings.limit
+    limit = limit_for(term, robot) if settings.limit is None else settings.limit
     return [
         ObservationColumn(name, element, term.source, unit, term.frame, 0.0, settings.scale, limit, 0.0, 0.0, 0.0, 0, "", doc)
         for element, unit, doc in _term_elements(term, config)

@@ -35,6 +35,8 @@ class SlipObserver:
     """
 
     def __init__(self, robot: Robot, control_period: float, count: int, camera: bool) -> None:
+        if robot.gravity == 0.0:
+            raise InputError(f"robot '{robot.name}': gravity = 0: the slip observer tells the attitude by it, expected more")
         history = math.ceil(SPECS["camera.delay"].high / control_period) + 3
         self.count = count
         self.values: Array = np.zeros((count, ESTIMATE_LAYOUT.width))

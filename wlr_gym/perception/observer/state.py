@@ -15,6 +15,8 @@ from wlr_gym.robot import CORNER_SIGNS, Robot
 
 #: 1 sigma of rounding to whole counts.
 _ROUNDING = 12.0**-0.5
+#: rad/s and m/s2; what an ideal encoder and accelerometer count as: errors are divided by.
+_LEAST = 1e-4
 
 
 def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
@@ -41,12 +43,12 @@ def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
         "spin_inertia": robot.wheel.spin_inertia + robot.servo.wheel.armature,
         "gear_friction": robot.servo.wheel.coulomb_friction,
         "stiffness": robot.ground.normal_stiffness,
-        "velocity_count": sensors.encoder.velocity,
+        "velocity_count": max(sensors.encoder.velocity, _LEAST),
         "lag": 1.0 / (2.0 * math.pi * sensors.imu.bandwidth * period),
         "gyro_noise": sensors.imu.gyro_noise,
         "gyro_bias": sensors.imu.gyro_bias,
         "accel_noise": sensors.imu.accel_noise,
-        "accel_bias": sensors.imu.accel_bias,
+        "accel_bias": max(sensors.imu.accel_bias, _LEAST),
         "camera": float(camera),
         "camera_noise": sensors.camera.position_noise,
         "camera_yaw_noise": sensors.camera.yaw_noise,

@@ -115,30 +115,24 @@ class PatchEffect:
 
 def add(target: str, parameter: str) -> Apply:
     """Add the effect's parameter to ``target``, of the named joints or wheels where it has such elements."""
-
-    def apply(parameters: Parameters, where: Sequence[str], values: Values) -> None:
-        for element in _elements(target, where, parameters):
-            parameters[element] += _value(values, parameter)
-
-    return apply
+    return _on_each(target, parameter, lambda before, value: before + value)
 
 
 def multiply(target: str, parameter: str) -> Apply:
     """Multiply ``target`` of the named joints or wheels by the effect's parameter."""
-
-    def apply(parameters: Parameters, where: Sequence[str], values: Values) -> None:
-        for element in _elements(target, where, parameters):
-            parameters[element] *= _value(values, parameter)
-
-    return apply
+    return _on_each(target, parameter, lambda before, value: before * value)
 
 
 def put(target: str, parameter: str) -> Apply:
     """Set ``target`` of the named joints or wheels to the effect's parameter."""
+    return _on_each(target, parameter, lambda before, value: value)
 
+
+def _on_each(target: str, parameter: str, change: Callable[[Array, float], Any]) -> Apply:
     def apply(parameters: Parameters, where: Sequence[str], values: Values) -> None:
-        for element in _elements(target, where, parameters):
-            parameters[element] = _value(values, parameter)
+        elements = [target] if parameters[target].ndim == 1 else [f"{target}[{place}]" for place in where]
+        for element in elements:
+            parameters[element] = change(parameters[element], _value(values, parameter))
 
     return apply
 
@@ -166,10 +160,6 @@ def _value(values: Values, parameter: str) -> float:
     if parameter not in values:
         raise unknown_name("parameter of the effect", parameter, values)
     return values[parameter]
-
-
-def _elements(target: str, where: Sequence[str], parameters: Parameters) -> list[str]:
-    return [target] if parameters[target].ndim == 1 else [f"{target}[{place}]" for place in where]
 
 
 def add_shaped(size: str, size_target: str, shape: Mapping[str, str], what: str) -> Apply:

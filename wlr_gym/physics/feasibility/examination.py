@@ -36,20 +36,15 @@ def examine_robot(robot: Robot) -> list[RobotFinding]:
     Args:
         robot: loaded with ``check=False``: what :func:`wlr_gym.robot.load_robot` refuses is found here too.
     """
-    impossible = [fault(_key(text), None, "", text) for text in physical_faults(robot)]
+    impossible = [fault(text.partition(" ")[0], None, "", text) for text in physical_faults(robot)]
     found = [*impossible, *odd_numbers(robot), *_motors(robot)]
     if not any(" is missing" in one.text for one in impossible):
         found += _mechanics(robot, capability_of(robot))
     return sorted(found, key=lambda one: one.level)
 
 
-def _key(text: str) -> str:
-    """Return the key that a message of :func:`wlr_gym.robot.physical_faults` begins with."""
-    return text.partition(" ")[0]
-
-
 def _mechanics(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
-    if not _stands(robot):
+    if stance_of(robot, robot.home.leg_angle).clearance <= 0.0:
         sine = math.sin(robot.home.leg_angle) * robot.leg.length
         text = f"wheels are {robot.leg.length:.4g} m x sin = {sine:.4g} m below the hips: the body lies on the floor"
         yield fault("home.leg_angle", robot.home.leg_angle, "rad", text)
@@ -60,10 +55,6 @@ def _mechanics(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
     yield from _holding(robot, can)
     yield from _leg_extremes(robot)
     yield from _contact(robot, can)
-
-
-def _stands(robot: Robot) -> bool:
-    return stance_of(robot, robot.home.leg_angle).clearance > 0.0
 
 
 def _tipping(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
@@ -149,7 +140,8 @@ def _leg_extremes(robot: Robot) -> Iterator[RobotFinding]:
     if nearest < 2.0 * robot.wheel.radius:
         words = "cross" if nearest < 0 else "touch"
         apart = f"front and rear axles are {nearest:.4g} m apart, wheels need {2 * robot.wheel.radius:.4g} m"
-        text = f"legs {words}: at the limits {_limits(robot)} {apart}"
+        low, high = robot.leg_limits
+        text = f"legs {words}: at the limits [{low:.3g}, {high:.3g}] rad {apart}"
         yield warning("leg.length", length, "m", text)
     for pose in stances(robot):
         where = f"with front legs at {pose.front:.3g} and rear legs at {pose.rear:.3g} rad"
@@ -167,10 +159,6 @@ def _most(robot: Robot, sign: float) -> float:
     middle = 0.0 if sign > 0 else math.pi
     inside = any(low <= middle + turn * math.tau <= high for turn in (-1, 0, 1))
     return 1.0 if inside else max(sign * math.cos(low), sign * math.cos(high))
-
-
-def _limits(robot: Robot) -> str:
-    return f"[{robot.leg_limits[0]:.3g}, {robot.leg_limits[1]:.3g}] rad"
 
 
 def _contact(robot: Robot, can: Capability) -> Iterator[RobotFinding]:

@@ -26,7 +26,7 @@ from wlr_gym.physics.plants.base import (
 from wlr_gym.physics.plants.flow import check_flow
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.physics.plants.setpoints import SetpointHistory, Setpoints
-from wlr_gym.robot import LEG_SLICE, Robot, robot_hash
+from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -44,6 +44,7 @@ class Simulator(ABC):
     """
 
     capabilities: Capabilities
+    _formulas: Any = None
 
     def __init__(self, robot: Robot, count: int, options: PlantOptions | None) -> None:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
@@ -60,6 +61,7 @@ class Simulator(ABC):
         self._time: Array = np.zeros(count)
         self._setpoints: Setpoints = SetpointHistory(count, self.options.control_period)
         self._sensors = SensorModel(robot, self.options, count)
+        self._robot_content = robot.model_dump(mode="json", exclude={"name", "joints", "dynamixel_ids"})
 
     def _start(self) -> None:
         self.reset(seeds=np.zeros(self._count, np.uint64), parameters=self.parameters)
@@ -77,15 +79,15 @@ class Simulator(ABC):
         """Put robots ``rows`` where ``state`` (N) says."""
 
     @abstractmethod
-    def mechanical_state(self) -> PlantState:
-        """Return a copy of the mechanical and servo state."""
+    def _servo_state(self) -> tuple[Array, ...]:
+        """Return copies of the servos' references (N, 8), rad (legs: as read) and rad/s, of lead and rate of the rotors (N, 8),
+        of the supply's drop (N,) and of the joints' wind-up (N, 8)."""
 
     @abstractmethod
     def _engine_stores(self) -> dict[str, RowStore]:
         """Return what the simulation itself remembers of its robots from one tick to the next."""
 
-    @abstractmethod
-    def _note_restored(self) -> None:
+    def _note_restored(self) -> None:  # noqa: B027 (a simulator may have nothing to do)
         """Follow up a state that was written into the stores."""
 
     @abstractmethod
@@ -113,6 +115,8 @@ class Simulator(ABC):
     ) -> Sensors:
         """Start robots anew; see :meth:`wlr_gym.physics.plants.base.Plant.reset`."""
         rows = self._rows(mask)
+        if state is not None and len(state) != self._count:
+            raise InputError(f"state holds {len(state)} robots, the plant {self._count}")
         if seeds is not None:
             seeds = _checked(seeds, self._count)
         if parameters is not None:
@@ -131,6 +135,23 @@ class Simulator(ABC):
         self._take_parameters(parameters, rows)
         self._setpoints.set_delays(rows, self.parameters)
 
+    def mechanical_state(self) -> PlantState:
+        """Return a copy of the mechanical and servo state."""
+        truth, has_play = self._truth, self.parameters["servo.backlash"] > 0.0
+        position, velocity, lead, rate, drop, wind_up = self._servo_state()
+        position[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
+        body = ("position", "quaternion", "linear_velocity_in_body", "angular_velocity_in_body")
+        return PlantState(
+            **{name: truth[name].copy() for name in (*body, "joint_position", "joint_velocity")},
+            reference_position=position,
+            reference_velocity=velocity,
+            rotor_lead=np.where(has_play, lead, 0.0),
+            rotor_rate=np.where(has_play, rate, truth.joint_velocity),
+            supply_drop=drop,
+            time=self._time.copy(),
+            wind_up=wind_up,
+        )
+
     # ---- snapshots ----
 
     def _fits(self) -> dict[str, Any]:
@@ -138,11 +159,12 @@ class Simulator(ABC):
         options = self.options
         return {
             "backend": self.capabilities.name,
-            "robot": robot_hash(self.robot),
+            "robot": self._robot_content,
             "precision": options.precision,
             "control_period": options.control_period,
             "physics_step": options.physics_step,
             "sensor_noise": options.sensor_noise,
+            "formulas": self._formulas.module if self._formulas else "",
         }
 
     def _stores(self) -> dict[str, RowStore]:
@@ -203,8 +225,9 @@ class Simulator(ABC):
     def _rows(self, mask: NDArray[np.bool_] | None) -> Rows:
         if mask is None:
             return self._all
-        if np.shape(mask) != (self._count,):
-            raise InputError(f"mask has shape {np.shape(mask)}, expected ({self._count},)")
+        given = np.asarray(mask)
+        if given.shape != (self._count,) or given.dtype != np.bool_:
+            raise InputError(f"mask has shape {given.shape} and type {given.dtype}, expected ({self._count},) booleans")
         return np.flatnonzero(mask)
 
     def _take_parameters(self, parameters: Parameters, rows: Rows) -> None:

@@ -13,6 +13,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.settings import overlay, parse_config
 from wlr_gym.robot.description import Robot, load_robot
+from wlr_gym.robot.parameter_table import spec_of
 
 #: Width at which a comment starts.
 _COMMENT = 42
@@ -56,6 +57,19 @@ def base_beside(base: str, out: Path) -> str:
     if not base.endswith((".yaml", ".yml")):
         return base
     return Path(os.path.relpath(base, out.parent)).as_posix()
+
+
+def of_all(numbers: Mapping[str, Any], base: str) -> dict[str, Any]:
+    """Return numbers that also remove what the base says of single legs, wheels or servos where they state it of all."""
+    removed = {}
+    for element in load_robot(base, check=False).individual:
+        spec = spec_of(element)
+        found: Any = numbers
+        for key in str(spec.sources[spec.elements.index(element) % len(spec.sources)]).split("."):
+            found = found.get(key) if isinstance(found, Mapping) else None
+        if found is not None:
+            removed[element] = None
+    return {**numbers, "individual": removed} if removed else dict(numbers)
 
 
 def robot_over(base: str, name: str, numbers: Mapping[str, Any], where: Path, *, check: bool = True) -> Robot:

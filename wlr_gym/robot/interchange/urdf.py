@@ -39,9 +39,8 @@ def urdf_text(robot: Robot) -> str:
     Links ``base_link``, ``leg_lf_link``, ``wheel_lf_link``, ...; joints are those of the robot, with its angles: 0 is a leg
     that points forward. Frames are as in REP-103: x forward, y left, z up; a leg's frame has x along the leg.
     """
-    numbers = {
-        name: value[0] for name, value in ((name, Parameters.nominal(robot)[name]) for name in Parameters.nominal(robot))
-    }
+    nominal = Parameters.nominal(robot)
+    numbers = {name: nominal[name][0] for name in nominal}
     root = ElementTree.Element("robot", name=robot.name)
     extension = ElementTree.SubElement(root, "mujoco")  # what MuJoCo leaves out otherwise; other readers pass over it
     ElementTree.SubElement(extension, "compiler", fusestatic="false", discardvisual="false")

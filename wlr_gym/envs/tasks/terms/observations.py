@@ -7,9 +7,10 @@ robot refuses a policy that needs one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from wlr_gym.envs.tasks.scaling import QUANTITIES
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
 from wlr_gym.robot import LEGS, WHEELS, Robot
@@ -30,7 +31,8 @@ class ObservationTerm:
         source: ``sensors``, ``command``, ``action``, ``estimate``, ``computed`` or ``truth``.
         elements: full element names in the source; empty = all of the task's commands or actions.
         unit, frame, doc: for the generated tables.
-        limit: readings are clipped to +-limit about the offset (in ``unit``), so that the observation space is bounded.
+        limit: readings are clipped to +-limit about the offset (in ``unit``), so that the observation space is bounded; it is
+            larger for robots that reach more (:func:`limit_for`).
         offset: subtracted from the reading, from the robot's numbers.
         sensor_noise: what the sensor itself adds, from the robot's numbers: 1 sigma, or one count of an encoder.
         device: what it is read from: readings of one device share one latency; empty = no latency.
@@ -154,3 +156,30 @@ POLICY_TERMS = _SENSED | {term.name: term for term in (*_ESTIMATED, *_TRUE)}
 
 #: What a critic may observe besides.
 PRIVILEGED_TERMS = {term.name: term for term in _TRUE}
+
+#: Terms that large, fast or strong robots read more of -> quantities of a robot, of which the largest says how much.
+_REACHED = {
+    "leg_velocity": ("leg_speed",),
+    "wheel_velocity": ("wheel_speed",),
+    "joint_velocity": ("leg_speed", "wheel_speed"),
+    "leg_effort": ("leg_torque",),
+    "wheel_effort": ("wheel_torque",),
+    "motor_torque": ("leg_torque", "wheel_torque"),
+    **dict.fromkeys(("speed_command", "climb_command", "linear_velocity_in_body", "slip_velocity"), ("top_speed",)),
+    **dict.fromkeys(("estimated_linear_velocity_in_body", "estimated_slip_velocity"), ("top_speed",)),
+    **dict.fromkeys(("contact_force", "estimated_normal_force", "estimated_traction_force"), ("weight",)),
+}
+
+
+def limit_for(term: ObservationTerm, robot: Robot, drawn: Sequence[float] = ()) -> float:
+    """Return the limit of a term's readings, in its unit: its own, or, where that is more, what readings may come to.
+
+    Args:
+        term: of an observation.
+        robot: readings reach a quarter more than its file says.
+        drawn: ends of the range that a command is drawn from.
+    """
+    reached = [QUANTITIES[name].of(robot) for name in _REACHED.get(term.name, ())]
+    if term.name in ("leg_position", "leg_reference"):
+        reached = [abs(limit - robot.home.leg_angle) for limit in robot.leg_limits]
+    return max([term.limit, *(1.25 * value for value in reached), *map(abs, drawn)])

@@ -231,36 +231,17 @@ class GibbsAppellPlant(Simulator):
         wound = np.zeros((rows.size, 8)) if state.wind_up is None else state.wind_up[rows]
         _scatter(self._memory, self._width, rows, wound, slice(1, None))
 
-    def mechanical_state(self) -> PlantState:
-        """Return a copy of the mechanical and servo state."""
-        values = _gather(self._lanes, self._width, np.arange(self._count)).astype(np.float64)
-
-        def columns(name: str) -> Array:
-            return values[:, _PLACE[name]]
-
-        reference = columns("reference_position{}")
-        reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
+    def _servo_state(self) -> tuple[Array, ...]:
+        values = _gather(self._lanes, self._width, self._all).astype(np.float64)
+        names = ("reference_position{}", "reference_velocity{}", "rotor_lead{}", "rotor_rate{}", "supply_drop")
+        position, velocity, lead, rate, drop = (values[:, _PLACE[name]] for name in names)
         if self._float is np.float32:
-            reference[:, WHEEL_SLICE] += self._truth.joint_position[:, WHEEL_SLICE] - columns("wheel_angle{}")
-        has_play = self.parameters["servo.backlash"] > 0.0
-        return PlantState(
-            position=self._truth.position.copy(),
-            quaternion=columns("q{}"),
-            linear_velocity_in_body=columns("v{}"),
-            angular_velocity_in_body=columns("w{}"),
-            joint_position=self._truth.joint_position.copy(),
-            joint_velocity=self._truth.joint_velocity.copy(),
-            reference_position=reference,
-            reference_velocity=columns("reference_velocity{}"),
-            rotor_lead=np.where(has_play, columns("rotor_lead{}"), 0.0),
-            rotor_rate=np.where(has_play, columns("rotor_rate{}"), self._truth.joint_velocity),
-            supply_drop=columns("supply_drop")[:, 0],
-            time=self._time.copy(),
-            wind_up=_gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64),
-        )
+            position[:, WHEEL_SLICE] += self._truth.joint_position[:, WHEEL_SLICE] - values[:, _PLACE["wheel_angle{}"]]
+        wind_up = _gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64)
+        return position, velocity, lead, rate, drop[:, 0], wind_up
 
     def _fits(self) -> dict[str, Any]:
-        return super()._fits() | {"formulas": self._formulas.module if self._formulas else "", "sweeps": self.sweeps}
+        return super()._fits() | {"sweeps": self.sweeps}
 
     def _engine_stores(self) -> dict[str, RowStore]:
         lanes = {"lanes": self._lanes, "memory": self._memory, "force_values": self._formula_values}

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants.mujoco.mjcf import CONTACT_IMPEDANCE, build_model
-from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, Robot
+from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.interchange import LinkJoint, LinkShape, LinkTree, Placement, RigidLink
 from wlr_gym.robot.parameters import Parameters
 
@@ -59,12 +59,10 @@ def _complete(spec: Any, robot: Robot, kept: list[Any]) -> None:
     for leg in LEGS:
         joint = spec.joint(leg)
         joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, robot.leg_limits
-    for index, joint in enumerate(JOINTS):
-        motor = robot.servo.leg if index < LEG_SLICE.stop else robot.servo.wheel
-        torque = [-motor.stall_torque, motor.stall_torque]
+    for joint, torque in zip(JOINTS, Parameters.nominal(robot)["servo.stall_torque"][0], strict=True):
         spec.add_actuator(
             name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            ctrlrange=torque,
+            ctrlrange=[-torque, torque],
         )  # fmt: skip
 
 
@@ -126,11 +124,7 @@ def read_mjcf(path: str | Path) -> LinkTree:
     links = {_name(model, "body", body): _link(model, body) for body in members}
     joints = tuple(_joint(model, body, members[0], source) for body in members[1:])
     numbers = _scene_numbers(model, members[0], source)
-    return LinkTree(_model_name(path), source, links, joints, numbers)
-
-
-def _model_name(path: str | Path) -> str:
-    return mujoco.MjSpec.from_file(str(path)).modelname
+    return LinkTree(mujoco.MjSpec.from_file(source).modelname, source, links, joints, numbers)
 
 
 def _name(model: Any, kind: str, index: int) -> str:

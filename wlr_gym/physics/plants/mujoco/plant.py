@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +60,9 @@ class MujocoPlant(Simulator):
         self._state = np.zeros((count, len(STATE)))
         self._lanes = np.zeros((count, len(packing.PARAMETER_LANES)))
         self._inputs = [np.zeros((count, 8)) for _ in range(4)]
-        self._forces = compile_forces(forces) if forces else None
+        self._formulas = compile_forces(forces) if forces else None
         self._force_inputs = np.zeros((len(INPUTS), count if forces else 1))
-        self.set_force_values(np.tile(self._forces.values if self._forces else np.zeros(0), (count, 1)))
+        self.set_force_values(np.tile(self._formulas.values if self._formulas else np.zeros(0), (count, 1)))
         self._generalised = np.zeros((len(COORDINATES), count))
         self._memory = np.zeros((len(MEMORY), count))
         self._kernel = load_kernel()
@@ -128,42 +127,15 @@ class MujocoPlant(Simulator):
         batch = self._batch
         self._state[rows], batch.qpos[rows], batch.qvel[rows], batch.warmstart[rows] = values, position, speed, 0.0
 
-    def mechanical_state(self) -> PlantState:
-        """Return a copy of the mechanical and servo state."""
-
-        def columns(name: str) -> Array:
-            return np.stack([self._state[:, _LANE[f"{name}{j}"]] for j in range(8)], axis=1)
-
-        truth = self._truth
-        reference = columns("reference_position")
-        reference[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
-        has_play = self.parameters["servo.backlash"] > 0.0
-        return PlantState(
-            position=truth.position.copy(),
-            quaternion=truth.quaternion.copy(),
-            linear_velocity_in_body=truth.linear_velocity_in_body.copy(),
-            angular_velocity_in_body=truth.angular_velocity_in_body.copy(),
-            joint_position=truth.joint_position.copy(),
-            joint_velocity=truth.joint_velocity.copy(),
-            reference_position=reference,
-            reference_velocity=columns("reference_velocity"),
-            rotor_lead=np.where(has_play, self._state[:, _ROTOR_LEAD], 0.0),
-            rotor_rate=np.where(has_play, self._state[:, _ROTOR_RATE], truth.joint_velocity),
-            supply_drop=self._state[:, _LANE["supply_drop"]].copy(),
-            time=self._time.copy(),
-            wind_up=self._memory[1:].T.copy(),
-        )
-
-    def _fits(self) -> dict[str, Any]:
-        return super()._fits() | {"formulas": self._forces.module if self._forces else ""}
+    def _servo_state(self) -> tuple[Array, ...]:
+        names = ("reference_position", "reference_velocity", "rotor_lead", "rotor_rate")
+        joints = (self._state[:, [_LANE[f"{name}{j}"] for j in range(8)]] for name in names)
+        return *joints, self._state[:, _LANE["supply_drop"]].copy(), self._memory[1:].T.copy()
 
     def _engine_stores(self) -> dict[str, RowStore]:
         inputs = {f"input{number}": values for number, values in enumerate(self._inputs)}
         by_robot = {"memory": self._memory.T, "force_values": self._force_values.T}
         return {"servos": self._state, **inputs, **by_robot, **self._batch.stores()}
-
-    def _note_restored(self) -> None:
-        pass
 
     # ---- stepping ----
 
@@ -189,9 +161,9 @@ class MujocoPlant(Simulator):
         self._memory[0] = self._time
         kernel.drift(*robots, 0.5 * step)
         for substep in range(self.substeps):
-            if self._forces:
+            if self._formulas:
                 kernel.features(*robots, self._force_inputs)
-                self._forces.evaluate(self._force_inputs, self._force_values, self._memory, self._generalised, step)
+                self._formulas.evaluate(self._force_inputs, self._force_values, self._memory, self._generalised, step)
             kernel.before(*robots, step, (substep + 0.5) * step)
             self._batch.step()
             kernel.after(*robots, step)
