@@ -36,7 +36,7 @@ class EpisodeRecorder:
     recorder.save("runs/run_01.parquet")
     ```
 
-    A batch that resets a robot within its last step (``SameStep``, Stable-Baselines3) has that step no more: the run ends before it.
+    A batch that resets a robot within its last step (``SameStep``, Stable-Baselines3) has that step no more: it is not logged.
 
     Args:
         core: the batch.
