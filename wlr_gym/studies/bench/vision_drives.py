@@ -52,7 +52,6 @@ class FilmedDrive:
     name: str
     run: Run
     robot: Robot
-    parameters: Parameters
     time: Array
     position: Array
     rotation: Array
@@ -157,7 +156,7 @@ def _drive(
     run = Run(table, RunMeta(robot=robot.name), Path(f"{name.replace(' ', '_')}.parquet"))
     time = np.asarray(TICK * np.arange(count + 1), np.float64)
     turns = Rotation.from_quat(found[:, 3:7], scalar_first=True).as_matrix()
-    return FilmedDrive(name, run, robot, parameters, time, found[:, :3], turns, found[:, 7:], slips)
+    return FilmedDrive(name, run, robot, time, found[:, :3], turns, found[:, 7:], slips)
 
 
 def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) -> PlantState:
