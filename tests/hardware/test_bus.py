@@ -106,14 +106,6 @@ def test_scan(group):
     assert group.scan() == dict.fromkeys((1, 2, 3, 4), (1130, 45))
 
 
-def test_reboot_waits_until_the_servo_is_back():
-    machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions())
-    with Server(machine) as server, connect(server) as group:
-        group.write(2, "led", 1)
-        group.reboot(2)
-        assert group.read(2, "led") == 0
-
-
 def test_fast_reads_fall_back_for_good_on_old_firmware():
     machine = Machine(load_robot("emanual"), load_hardware(), MachineOptions(firmware=44, timing=NO_TIME))
     with Server(machine, real_time=False) as server, connect(server) as group:

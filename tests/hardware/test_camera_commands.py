@@ -11,11 +11,11 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("onnxruntime")
 
 from camera_rig import small_camera
+from policy_log import act_again
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK, run_command
 from wlr_gym.data.read import read_run
-from wlr_gym.hardware.deployment import act_again
 from wlr_gym.hardware.log import read_events
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import environment_for, make_policy

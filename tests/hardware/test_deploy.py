@@ -17,6 +17,7 @@ from rich.console import Console
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from policy_log import act_again, read_policy_log
 from robot_rig import HARDWARE, PERIOD, Phase, hardware_file, machine_of
 
 from wlr_gym.base.errors import InputError
@@ -28,7 +29,7 @@ from wlr_gym.cli.robot_status import RobotView
 from wlr_gym.data.read import read_run
 from wlr_gym.data.replay import replay
 from wlr_gym.hardware.config import load_hardware, with_ports
-from wlr_gym.hardware.deployment import REHEARSALS, act_again, loop_of, read_policy_log
+from wlr_gym.hardware.deployment import REHEARSALS, loop_of
 from wlr_gym.hardware.deployment import deploy as drive
 from wlr_gym.hardware.emulator.link import emulated_robot
 from wlr_gym.hardware.log import RunLog, read_events

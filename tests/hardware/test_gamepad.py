@@ -9,12 +9,13 @@ import pytest
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from policy_log import read_policy_log
 from robot_rig import machine_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import run_command
 from wlr_gym.hardware.config import PadButtons
-from wlr_gym.hardware.deployment import deploy, loop_of, read_policy_log
+from wlr_gym.hardware.deployment import deploy, loop_of
 from wlr_gym.hardware.gamepad import DrivingPad
 from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.operator import Operator

@@ -7,10 +7,10 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.dynamixel.protocol import Error
-from wlr_gym.hardware.dynamixel.tables import TABLE_SIZE, load_table, model_names
+from wlr_gym.hardware.dynamixel.tables import TABLE_SIZE, load_table, shipped_tables
 from wlr_gym.hardware.emulator.servo import EmulatedServo
 
-MODELS = tuple(model_names())
+MODELS = tuple(sorted(shipped_tables()))
 ROWS = [(model, item.name) for model in MODELS for item in load_table(model).items.values()]
 RULES = yaml.safe_load(Path(__file__).with_name("register_behaviour.yaml").read_text(encoding="utf-8"))
 

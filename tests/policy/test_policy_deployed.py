@@ -6,7 +6,9 @@ import pytest
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
-from wlr_gym.hardware.deployment import act_again, deploy
+from policy_log import act_again
+
+from wlr_gym.hardware.deployment import deploy
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import make_policy
 

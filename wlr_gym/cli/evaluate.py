@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn, track
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder, refuse_existing
@@ -301,13 +299,15 @@ def _film(options: EvaluateOptions, subjects: Sequence[Subject], path: Path, key
     """Write the first episode of up to two subjects, side by side."""
     from wlr_gym.learning.evaluation.film import film_beside
 
-    with Progress(transient=True, disable=not options.progress) as bar:
-
-        def watch(pictures: Iterable[NDArray[np.uint8]], count: int) -> Iterable[NDArray[np.uint8]]:
-            return bar.track(pictures, count, description="drawing")
-
-        seconds = options.video_seconds
-        film_beside(path, str(options.env), subjects, options.seed, seconds, keywords, watch=watch)
+    film_beside(
+        path,
+        str(options.env),
+        subjects,
+        options.seed,
+        options.video_seconds,
+        keywords,
+        watch=lambda pictures, count: track(pictures, "drawing", count, transient=True, disable=not options.progress),
+    )
     print(f"written: {path}")
 
 

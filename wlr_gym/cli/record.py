@@ -137,7 +137,7 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
         if not (options.emulated or options.yes):
             confirm(motion, robot, console)
         seed = noise_seed(options.out, options.seed) if options.noise_seed is None else options.noise_seed
-        with closing(options.plant(options.out, meta, options.patch(), seed)) as plant:
+        with closing(options.plant_of(options.load()[0], options.out, meta, options.patch(), seed)) as plant:
             drive = drive_robot(plant, motion)
         _report(motion, drive, console)
         found.append(

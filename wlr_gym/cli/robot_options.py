@@ -137,10 +137,6 @@ class RobotOption(HardwareOption):
         link.servos.set_patience(CALM_PATIENCE)
         return link
 
-    def plant(self, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
-        """Return the robot as a plant; see :meth:`plant_of`."""
-        return self.plant_of(self.load()[0], log, meta, patch, seed)
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOption(RobotOption):

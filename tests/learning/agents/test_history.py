@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from policy_log import act_again
 from ppo_runs import ENVIRONMENT, train
 
-from wlr_gym.hardware.deployment import act_again, deploy
+from wlr_gym.hardware.deployment import deploy
 from wlr_gym.learning.evaluation import make_core, play, read_subjects
 from wlr_gym.learning.evaluation.conditions import Condition
 from wlr_gym.policy import contract_of, export_policy, make_policy, policy_environment

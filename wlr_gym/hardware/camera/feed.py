@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.perception.scene import ScenePose
+from wlr_gym.physics.model.dynamics import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -81,12 +82,4 @@ class PoseFeed:
 
 def scene_pose(pose: RobotPose) -> ScenePose:
     """Return a pose as the renderer takes it."""
-    w, x, y, z = pose.quaternion
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return ScenePose(pose.position, turn, pose.legs)
+    return ScenePose(pose.position, rotation_matrix(pose.quaternion[None])[0], pose.legs)

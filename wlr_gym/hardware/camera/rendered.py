@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.hardware.camera.config import CameraFile
 from wlr_gym.hardware.camera.feed import RobotPose, scene_pose
@@ -28,8 +27,6 @@ from wlr_gym.perception.scene import (
     view,
 )
 from wlr_gym.robot import Robot
-
-Array = NDArray[np.float64]
 
 #: Faults of a camera: what happens, a default value and its unit.
 CAMERA_FAULTS: dict[str, tuple[str, float, str]] = {

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 #: s an answer may take beyond its bytes' time on the wire: adapter's latency timer (1 ms) twice, and the scheduler.
 PATIENCE = 0.005
-#: s a rebooting servo may be silent.
-REBOOT_TIME = 1.0
 #: Data bytes of a ping's answer: model number and firmware version.
 _PING_DATA = 3
 #: Time a servo waits for each id below its own before it answers a ping of all, ms.
@@ -192,22 +190,6 @@ class BusGroup:
         raw = protocol.read(id, address, len(block.pointers))
         if self._ask(id, raw, len(block.pointers), "read indirect addresses").data != block.pointers:
             raise NoAnswerError(f"bus {self.name}, id {id}: the indirect addresses are not what was written")
-
-    def reboot(self, id: int) -> None:
-        """Reboot a servo and wait until it is back: RAM at its defaults, latched errors cleared, torque off.
-
-        Raises:
-            NoAnswerError: it did not come back.
-        """
-        self._ask(id, protocol.reboot(id), 0, "reboot")
-        end = time.monotonic() + REBOOT_TIME
-        while True:
-            try:
-                self.ping(id)
-                return
-            except NoAnswerError:
-                if time.monotonic() > end:
-                    raise
 
     def _table(self, id: int) -> ControlTable:
         if id not in self.servos:

@@ -56,16 +56,12 @@ class BusLine:
         servos: on it.
         faults: shared with the rest of the robot.
         timing: see :class:`LineTiming`.
-
-    Attributes:
-        instructions: packets understood so far.
     """
 
     def __init__(self, name: str, servos: Sequence[EmulatedServo], faults: FaultBoard, timing: LineTiming) -> None:
         self.name = name
         self.servos: list[EmulatedServo] = list(servos)
         self.timing = timing
-        self.instructions = 0
         self._faults = faults
         self._parser = Parser()
         self._busy_until = 0.0
@@ -90,7 +86,6 @@ class BusLine:
         if self._faults.happens(now, "echo", [self.name]):
             emissions.append(Emission(now + self._wire_time(len(data), baud_rate), data))
         for packet in self._parser.feed(data):
-            self.instructions += 1
             size = len(packet.parameters) + 10
             start = max(now, self._busy_until) + self._wire_time(size, baud_rate)
             heard = [servo for servo in self.servos if self._hears(servo, baud_rate, now)]

@@ -124,17 +124,11 @@ class CameraWatch:
         """Let the present pose be zero."""
         if not self._motion:
             return
-        time, x, y, yaw, *_ = self._motion[-1]
-        self._began, self._before = time, self.frames
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        self._motion = deque(
-            (t, cosine * (a - x) + sine * (b - y), cosine * (b - y) - sine * (a - x), c - yaw, *rest)
-            for t, a, b, c, *rest in self._motion
-        )
-        self._frame = self._table = None
+        self._began, self._before, self._frame = self._motion[-1][0], self.frames, None
+        self._correct(self._began, np.zeros(3))
         if self._believed:
             self._place(self._believed[-1])
-        self.status = replace(self.status, pose=np.zeros(3), time=time, is_new=False)
+        self.status = replace(self.status, pose=np.zeros(3), time=self._began, is_new=False)
 
     def next(
         self, now: float, joints: tuple[Array, Array], gyro: Array, reading: CameraReading | None, trouble: str
@@ -304,7 +298,7 @@ class CameraWatch:
         return np.array([x + cosine * pose[0] - sine * pose[1], y + sine * pose[0] + cosine * pose[1], yaw])
 
     def _correct(self, time: float, pose: Array) -> None:
-        """Let dead reckoning go on from a believed pose."""
+        """Let dead reckoning have had this pose (3,) at a time, and go on from there."""
         known = self._at(time).tolist()
         x0, y0, yaw0 = pose.tolist()
         turn = yaw0 - known[2]

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render import marks
@@ -22,7 +21,6 @@ from wlr_gym.robot.parameters import Parameters
 if TYPE_CHECKING:
     import viser
 
-Array = NDArray[np.float64]
 
 #: The node that everything stands on; it moves, so that the robot stays where eyes look at.
 FLOOR = "/floor"

@@ -28,6 +28,7 @@ from wlr_gym.base.files import make_output_folder, write_json, write_text
 from wlr_gym.base.jobs import Ended, Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
+from wlr_gym.base.text import duration
 from wlr_gym.studies.bench.blind.cases import FIRST_SCORED_SEED, FURTHER_NULLS, SETS, BlindCase, case
 from wlr_gym.studies.bench.blind.score import FAILED, score
 from wlr_gym.studies.bench.gap_classifier import answers_of, first_screen, train, training_sets
@@ -277,7 +278,7 @@ def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[s
             rest = passed / done * (len(cases) - done)
             line = _outcome(plan, named[ended.name], ended.error)
             write_answers(plan.out)
-            say(f"{done}/{len(cases)}  {line}  {_clock(passed)} passed, about {_clock(rest)} to go")
+            say(f"{done}/{len(cases)}  {line}  {duration(passed)} passed, about {duration(rest)} to go")
 
 
 @contextmanager
@@ -327,11 +328,6 @@ def _work(task: Mapping[str, Any], send: Send) -> None:
     fields = {name: value for name, value in task.items() if name not in ("index", "analyser")}
     plan = Plan(**{**fields, "out": Path(task["out"]), "runs": tuple(task["runs"])})
     run_case(plan, case(task["index"], plan.first_seed), getattr(importlib.import_module(module), function))
-
-
-def _clock(seconds: float) -> str:
-    minutes = int(seconds / 60)
-    return f"{minutes // 60}:{minutes % 60:02d} h" if minutes >= 60 else f"{minutes} min {int(seconds) % 60} s"
 
 
 def run_case(plan: Plan, one: BlindCase, analyser: Analyser) -> None:

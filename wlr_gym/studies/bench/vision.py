@@ -292,19 +292,12 @@ def measure_drive(drive: FilmedDrive) -> list[VisionResult]:
     samples, slip, found = analysis.samples, analysis.slip, analysis.alignment
     assert found is not None  # no offset was given
     error = 1e3 * np.abs(slip.slip - true_slip(drive, slip.time))
-    final = 1e3 * (slip.slip[-1] - true_slip(drive, slip.time)[-1])
     largest = 1e3 * np.abs(drive.slip[-1]).max(axis=0)
     lines: list[VisionResult] = []
     for axis, name in enumerate(("longitudinal", "lateral")):
         what = f"{drive.name}: accumulated {name} slip (up to {largest[axis]:.0f} mm)"
-        lines.append(
-            VisionResult(f"{what}, worst wheel and time", "ours", float(error[:, :, axis].max()), "mm", 1.0, count=len(samples))
-        )
-        lines.append(
-            VisionResult(
-                f"{what}, worst wheel, end", "ours", float(np.abs(final[:, axis]).max()), "mm", 1.0, count=len(samples)
-            )
-        )
+        for when, apart in (("worst wheel and time", error[:, :, axis]), ("worst wheel, end", error[-1, :, axis])):
+            lines.append(VisionResult(f"{what}, {when}", "ours", float(apart.max()), "mm", 1.0, count=len(samples)))
     late = 1e3 * abs(found.offset - TRUE_OFFSET)
     return [
         *lines,

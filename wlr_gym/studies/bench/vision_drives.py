@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.format import Profile, RunMeta
+from wlr_gym.data.format import COMMANDS, Profile, RunMeta
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
+from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, plate_facet, robot_facets
 from wlr_gym.perception.vision.tracking import VideoFrame
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
-from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
+from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -34,6 +35,8 @@ PAPER_LEG_SPEED = 0.359712
 #: s at rest before the motion.
 _REST = 1.0
 _SETTLING = 1.0  # s before the log starts: legs and tyres take the weight
+#: What is logged of the sensors: joints and IMU, which come first.
+_LOGGED = SENSED[: SENSED.index("cam_x")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +52,6 @@ class FilmedDrive:
     name: str
     run: Run
     robot: Robot
-    parameters: Parameters
     time: Array
     position: Array
     rotation: Array
@@ -135,7 +137,7 @@ def _drive(
         leg_setpoints, wheel_setpoints = setpoints(0.0)
         sensors = plant.step(np.array([[*leg_setpoints, *wheel_setpoints]]), torque_on[None])
     count = int(duration / TICK)
-    rows: list[dict[str, float]] = []
+    rows: list[list[float]] = []
     truths, slips = [], np.zeros((count + 1, 4, 2))
     for tick in range(count + 1):
         time = tick * TICK
@@ -146,14 +148,15 @@ def _drive(
         if tick > 0:
             slips[tick] = slips[tick - 1] + truth.slip_displacement[0].reshape(4, 2)
         if tick % ROW == 0:
-            rows.append(_row(time, np.where(torque_on, goal[0], np.nan), sensors.values[0], sensors.layout.slices))
+            rows.append([time, *np.where(torque_on, goal[0], np.nan), *channels(sensors, 0)[: len(_LOGGED)]])
         sensors = plant.step(goal, torque_on[None])
     plant.close()
     found = np.array(truths)
-    run = Run(pandas.DataFrame(rows), RunMeta(robot=robot.name), Path(f"{name.replace(' ', '_')}.parquet"))
+    table = pandas.DataFrame(rows, columns=["t", *COMMANDS, *_LOGGED])
+    run = Run(table, RunMeta(robot=robot.name), Path(f"{name.replace(' ', '_')}.parquet"))
     time = np.asarray(TICK * np.arange(count + 1), np.float64)
     turns = Rotation.from_quat(found[:, 3:7], scalar_first=True).as_matrix()
-    return FilmedDrive(name, run, robot, parameters, time, found[:, :3], turns, found[:, 7:], slips)
+    return FilmedDrive(name, run, robot, time, found[:, :3], turns, found[:, 7:], slips)
 
 
 def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) -> PlantState:
@@ -162,18 +165,6 @@ def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) ->
     state.reference_position[:, LEG_SLICE] = legs
     state.position[:, 0] = x
     return state
-
-
-def _row(time: float, goal: Array, sensors: Array, slices: dict[str, slice]) -> dict[str, float]:
-    row = {"t": time}
-    for kind, values in (("cmd", goal), *((k, sensors[slices[f"joint_{n}"]]) for k, n in _KINDS)):
-        row |= {f"{kind}_{joint}": float(value) for joint, value in zip(JOINTS, values, strict=True)}
-    for kind, name in (("gyro", "gyro"), ("acc", "accelerometer")):
-        row |= {f"{kind}_{axis}": float(v) for axis, v in zip("xyz", sensors[slices[name]], strict=True)}
-    return row
-
-
-_KINDS = (("pos", "position"), ("vel", "velocity"), ("eff", "effort"))
 
 
 def film(

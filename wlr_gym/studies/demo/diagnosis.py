@@ -8,7 +8,6 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import heading, table
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
     from wlr_gym.data.replay import ReplayResult
     from wlr_gym.gap.report.entries import EffectEntry, Result
     from wlr_gym.physics.effects.effect import PatchEffect
-
-Array = NDArray[np.float64]
 
 NAME_TITLE = "4. What does the simulator lack?"
 CHECK_TITLE = "5. Does it hold?"

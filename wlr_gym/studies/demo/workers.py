@@ -1,24 +1,22 @@
 """Stages in two workers, each a process of its own on one core: what one worker breaks or leaks does not harm the other.
 
-A worker reports progress and finished sections to its parent in lines of JSON. Whatever else it prints goes to a log file.
+A worker is a job (:mod:`wlr_gym.base.jobs`): it sends progress and finished sections to its parent.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import queue
 import signal
-import subprocess
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from wlr_gym.base.errors import InputError, MissingPackageError, require_package
+from wlr_gym.base.jobs import PATIENCE, Job, Send, serve, start
 from wlr_gym.studies.demo import diagnosis, hidden_fault, ice_comparison, learn, retraining
 from wlr_gym.studies.demo.settings import Demo
 from wlr_gym.studies.demo.stage import FAILED, SKIPPED, DemoStage, Section, paragraph
@@ -46,9 +44,6 @@ WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
 }
 #: Called with the worker, what it is doing, and the share of its work that is done.
 TellWorker = Callable[[str, str, float], None]
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
-#: s that a worker has to come to an end after Ctrl-C, before it is killed.
-_PATIENCE = 60.0
 
 
 @dataclass
@@ -67,8 +62,7 @@ def run_workers(demo: Demo, tell: TellWorker) -> Outcome:
     inbox: queue.Queue[tuple[str, dict[str, Any] | None]] = queue.Queue()
     found: dict[str, list[Section]] = {worker: [] for worker in WORKERS}
     interrupted = False
-    log = (demo.out / "log.txt").open("w", encoding="utf-8")
-    running = {worker: _start(worker, demo, log, inbox) for worker in WORKERS}
+    running = {worker: _start(worker, demo, inbox) for worker in WORKERS}
     try:
         while running:
             try:
@@ -79,25 +73,15 @@ def run_workers(demo: Demo, tell: TellWorker) -> Outcome:
     finally:
         for process in running.values():
             process.kill()
-        log.close()
     return Outcome([section for worker in WORKERS for section in _complete(worker, found[worker], interrupted)], interrupted)
 
 
-def _start(worker: str, demo: Demo, log: TextIO, inbox: queue.Queue[Any]) -> subprocess.Popen[str]:
-    """Start a worker in a session of its own: Ctrl-C reaches it through its parent, once."""
+def _start(worker: str, demo: Demo, inbox: queue.Queue[Any]) -> Any:
+    """Start a worker, and a thread that puts all it sends into the inbox; return its process."""
     task = {"worker": worker, "demo": {**asdict(demo), "out": str(demo.out)}}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "wlr_gym.studies.demo.workers", json.dumps(task)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=log,
-        text=True,
-        env={**os.environ, **dict.fromkeys(_THREADS, "1")},
-        start_new_session=True,
-    )
+    process = start(Job(worker, "wlr_gym.studies.demo.workers", task, str(demo.out / "log.txt")))
 
     def read() -> None:
-        assert process.stdout is not None
         for line in process.stdout:
             inbox.put((worker, json.loads(line)))
         inbox.put((worker, None))
@@ -108,7 +92,7 @@ def _start(worker: str, demo: Demo, log: TextIO, inbox: queue.Queue[Any]) -> sub
 
 def _take(
     inbox: queue.Queue[tuple[str, dict[str, Any] | None]],
-    running: dict[str, subprocess.Popen[str]],
+    running: dict[str, Any],
     found: dict[str, list[Section]],
     tell: TellWorker,
 ) -> None:
@@ -118,15 +102,15 @@ def _take(
         running.pop(worker).wait()
     elif "section" in message:
         found[worker].append(Section(**message["section"]))
-    else:
+    elif "text" in message:
         tell(worker, message["text"], message["share"])
 
 
-def _interrupt(running: Mapping[str, subprocess.Popen[str]]) -> None:
+def _interrupt(running: Mapping[str, Any]) -> None:
     """Ask the workers to end, and see to it that they do."""
     for process in running.values():
         process.send_signal(signal.SIGINT)
-        killer = threading.Timer(_PATIENCE, process.kill)
+        killer = threading.Timer(PATIENCE, process.kill)
         killer.daemon = True
         killer.start()
 
@@ -142,7 +126,7 @@ def _complete(worker: str, sections: list[Section], interrupted: bool) -> list[S
 # ---- a worker --------------------------------------------------------------------------------------------------------
 
 
-def work(worker: str, demo: Demo, send: Callable[[dict[str, Any]], None]) -> None:
+def work(worker: str, demo: Demo, send: Send) -> None:
     """Do the stages of a worker; one that cannot be done says why and the others continue."""
     done = 0.0
     for stage in WORKERS[worker]:
@@ -168,19 +152,5 @@ def _attempt(stage: DemoStage, demo: Demo, tell: Callable[[str, float], None]) -
         return Section(stage.title, "", paragraph(f"Failed: {type(error).__name__}: {error}; log.txt has more."), FAILED)
 
 
-def _main(task: Mapping[str, Any]) -> None:
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-
-    def send(message: dict[str, Any]) -> None:
-        print(json.dumps(message), file=answers, flush=True)
-
-    demo = Demo(**{**task["demo"], "out": Path(task["demo"]["out"])})
-    try:
-        work(task["worker"], demo, send)
-    except KeyboardInterrupt as interruption:
-        print(f"{task['worker']}: stopped {interruption}", file=sys.stderr)
-
-
 if __name__ == "__main__":
-    _main(json.loads(sys.argv[1]))
+    serve(lambda task, send: work(task["worker"], Demo(**{**task["demo"], "out": Path(task["demo"]["out"])}), send))

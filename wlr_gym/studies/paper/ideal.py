@@ -8,12 +8,11 @@ printed or from the right ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.studies.paper import printed, reduced
+from wlr_gym.studies.paper import reduced
 from wlr_gym.studies.paper.experiments import LEG_SPEED, WHEEL_ACCELERATION, WHEEL_SPEED, PaperTest, duration, stop_time
 from wlr_gym.studies.paper.quantities import PaperConstants, State
 
@@ -58,10 +57,6 @@ class IdealMotion:
     def state(self) -> State:
         """Return the motion in the paper's symbols: its slip is 0."""
         return reduced.state_of(self.front, self.rear, self.posture.pitch, self.u, self.u_dot)
-
-    def as_printed(self) -> dict[str, Any]:
-        """Return (19)-(28) as printed, evaluated on this motion."""
-        return printed.forces_as_used(self.constants, self.state())
 
 
 def ideal_motion(test: PaperTest, constants: PaperConstants | None = None) -> IdealMotion:

@@ -147,17 +147,13 @@ class State:
 
 @dataclass(frozen=True)
 class Forces:
-    """What acts on the robot: hip torques (sum of both motors of an axle), wheel torques, and the floor on each wheel.
+    """What acts on the robot: wheel torques, N m, and the floor on each wheel.
 
-    ``x`` along the heading and ``y`` to the left, N. ``n_f``, ``n_r``: normal force on one front and one rear wheel, N.
+    ``x`` along the heading, N. ``n_f``, ``n_r``: normal force on one front and one rear wheel, N.
     """
 
-    tau_alpha: Value = 0.0
-    tau_beta: Value = 0.0
     tau_theta: PerWheel = field(default_factory=_zeros)
     x: PerWheel = field(default_factory=_zeros)
-    y_f: Value = 0.0
-    y_r: Value = 0.0
     n_f: Value = 0.0
     n_r: Value = 0.0
 

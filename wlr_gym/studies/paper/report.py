@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.base.files import write_json, write_text
 from wlr_gym.base.plots import save
@@ -24,7 +23,6 @@ from wlr_gym.studies.paper.slip_outcomes import ERROR_TOLERANCE, LATERAL_TOLERAN
 from wlr_gym.studies.paper.slip_search import OBSERVABLES, SearchFinding
 from wlr_gym.studies.paper.verdicts import verdict_table
 
-Array = NDArray[np.float64]
 Records = Mapping[str, Mapping[str, Record]]
 #: label of a finding -> observable -> lowest and highest of its matches.
 Decisive = Mapping[str, Mapping[str, tuple[float, float]]]

@@ -227,13 +227,9 @@ class ControlTable:
         return start.address, end.address + end.size - start.address
 
 
-def model_names() -> list[str]:
-    """Return the servo models that ship, such as ``XM540-W150-R``."""
-    return sorted(_shipped())
-
-
 @cache
-def _shipped() -> dict[str, Path]:
+def shipped_tables() -> dict[str, Path]:
+    """Return the control tables that ship: servo model, such as ``XM540-W150-R`` -> file."""
     contents = {path: read_yaml(path) for path in sorted(_FOLDER.glob("*.yaml"))}
     return {content["model"]: path for path, content in contents.items() if "model" in content}
 
@@ -246,9 +242,9 @@ def load_table(model: str) -> ControlTable:
         InputError: unknown model (the message lists those that ship), no such file, or a key that is missing or wrong.
     """
     own = model.endswith(_SUFFIXES)
-    if not own and model not in _shipped():
-        raise unknown_name("servo model", model, _shipped())
-    path = Path(model) if own else _shipped()[model]
+    if not own and model not in shipped_tables():
+        raise unknown_name("servo model", model, shipped_tables())
+    path = Path(model) if own else shipped_tables()[model]
     data = _checked(path)
     series = _series(path, str(data["series"]))
     counts = parse_config(Counts, {**series.get("counts", {}), **data.get("counts", {})}, f"{path}: counts")
