@@ -348,7 +348,7 @@ def test_command_writes_the_sheets(tmp_path, capsys):
     [
         (["vision", "v.avi", "--run", "none.csv", "--out", "o", "--camera", "c.yaml"], "none.csv: no such file"),
         (["vision", ".", "--run", "none.csv", "--out", "o", "--camera", "c.yaml"], "images do not say when they were taken"),
-        (["vision", "v.avi", "--run", "r.csv", "--out", "o", "--camera", "c.yaml", "--seconds", "-1"], "--seconds -1: expected"),
+        (["vision", "v.avi", "--run", "r.csv", "--out", "o", "--camera", "c.yaml", "--seconds", "-1"], "--seconds -1: exp"),
         (["calibrate", "camera", "nothing", "--out", "camera.yaml"], "no such video"),
         (["calibrate", "camera", ".", "--out", "camera.yaml", "--square", "28"], "expected metres"),
         (["calibrate", "camera", ".", "--out", "camera.txt"], "expected a .yaml file"),
