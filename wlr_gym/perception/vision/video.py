@@ -148,21 +148,16 @@ def _read_times(path: Path) -> list[float]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             cells = [row[-1].strip() for row in csv.reader(file) if row]
-        stamps = [float(cell) for cell in (cells[1:] if cells and not _is_number(cells[0]) else cells)]
+        try:
+            stamps = [float(cell) for cell in cells]
+        except ValueError:
+            stamps = [float(cell) for cell in cells[1:]]  # the first was a heading
     except ValueError as error:
         raise InputError(f"{path}: not a table of frame times: {error}") from None
     wrong = np.flatnonzero(~np.isfinite(stamps) | (np.diff(stamps, prepend=-math.inf) <= 0))
     if len(wrong):
         raise InputError(f"{path}: frame {wrong[0]}: times must be finite and increase, not {stamps[wrong[0]]:g}")
     return stamps
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 class VideoFile:
