@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -270,12 +270,8 @@ def known_settings(plan: SweepPlan) -> list[dict[str, Any]] | None:
         random = np.random.default_rng(plan.search.seed)
         drawn = [draw(plan, random) for _ in range(plan.search.trials)]
         return list({label_of(settings): settings for settings in drawn}.values())  # each once
-    names = list(plan.space)
-    return [dict(zip(names, values, strict=True)) for values in itertools.product(*_lists(plan))]
-
-
-def _lists(plan: SweepPlan) -> Iterator[list[Any]]:
-    return (values for values in plan.space.values() if isinstance(values, list))
+    lists = [values for values in plan.space.values() if isinstance(values, list)]
+    return [dict(zip(plan.space, values, strict=True)) for values in itertools.product(*lists)]
 
 
 def draw(plan: SweepPlan, random: np.random.Generator) -> dict[str, Any]:

@@ -255,14 +255,6 @@ def _observed(
         yield sample
 
 
-def missing_frames(missing: int, decoded: int) -> str:
-    """Say that a video is not whole."""
-    return (
-        f"the video is cut off or damaged: it announces {missing + decoded} frames, of which {decoded} could be decoded; what "
-        "the others show is not in the results"
-    )
-
-
 def _from_start(values: Array, time: Array) -> Array:
     """x, y, yaw (F, 3) in the frame of the mean pose over the first moments."""
     x, y, yaw = values[time <= time[0] + _START].mean(axis=0)
@@ -274,7 +266,10 @@ def _from_start(values: Array, time: Array) -> Array:
 def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, missing: int = 0) -> Iterator[str]:
     counts = Counter(sample.status for sample in samples)
     if missing:
-        yield missing_frames(missing, len(samples))
+        yield (
+            f"the video is cut off or damaged: it announces {missing + len(samples)} frames, of which {len(samples)} could be "
+            "decoded; what the others show is not in the results"
+        )
     if counts[MOVED]:
         first = next(sample for sample in samples if sample.status == MOVED)
         yield (
