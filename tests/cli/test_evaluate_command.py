@@ -104,6 +104,7 @@ def test_a_policy_of_another_task_is_told_where_it_was_trained(capsys):
         (["do_nothing", "--video", "a.webp", "--video-seconds", "0"], "--video-seconds 0"),
         (["a=do_nothing", "--baselines", "a=pid"], "two policies are called 'a'"),
         (["do_nothing", "do_nothing"], "policy 'do_nothing' is given twice"),
+        (["pid", "--accept", "--baselines", "do_nothing", "--episodes", "0"], "episodes = 0"),
         (["do_nothing", "--accept", "--baselines", "do_nothing"], "nothing to compare it with"),
     ],
 )

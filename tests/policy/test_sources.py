@@ -47,6 +47,15 @@ def blind_folder(folder):
     return folder
 
 
+def test_a_policy_called_as_an_agent_is_not_taken_for_it(tmp_path, monkeypatch):
+    (tmp_path / "ppo").mkdir()
+    blind_folder(tmp_path / "ppo")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"'ppo' is an agent, and a policy in this folder: give \./ppo"):
+        policy_environment("ppo")
+    assert policy_environment("./ppo") == {"task": BLIND}
+
+
 def test_keywords_are_those_that_decide_what_a_policy_is_fed(tmp_path):
     assert policy_environment(blind_folder(tmp_path)) == {"task": BLIND}
     core = make_core(ID, 1, {"randomization": "none"} | policy_environment(tmp_path))

@@ -110,16 +110,11 @@ def _export_runs(options: ExportOptions, form: str) -> list[Path]:
     if options.out is not None:
         make_output_folder(options.out)
     for path, target in zip(paths, targets, strict=True):
-        _clear(target)
-        print(f"written: {export_run(read_run(path), target, form)}")
+        run = read_run(path)  # one that cannot be read leaves the target as it was
+        if target.is_dir():
+            shutil.rmtree(target)  # rosbag2 is a folder; a file is replaced in one step
+        print(f"written: {export_run(run, target, form)}")
     return targets
-
-
-def _clear(target: Path) -> None:
-    """Remove what is to be replaced; rosbag2 is a folder."""
-    if target.is_dir():
-        shutil.rmtree(target)
-    target.unlink(missing_ok=True)
 
 
 def _check_targets(paths: Sequence[Path], targets: Sequence[Path], force: bool) -> None:

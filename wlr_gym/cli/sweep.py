@@ -114,6 +114,8 @@ def _settings(words: tuple[str, ...]) -> Mapping[str, Any]:
 def _nest(settings: dict[str, Any], path: list[str], value: Any) -> None:
     for part in path[:-1]:
         settings = settings.setdefault(part, {})
+        if not isinstance(settings, dict):
+            raise InputError(f"--set {'.'.join(path)}: '{part}' is a value, not a group")
     settings[path[-1]] = value
 
 

@@ -62,6 +62,8 @@ def run(options: TrainOptions) -> int:
             options.resume, total_steps=options.total_steps, max_seconds=seconds, progress=options.progress
         )
         environment = read_yaml(options.resume / CONFIG_FILE)["environment"]
+    elif options.total_steps is not None:
+        raise InputError(f"--total-steps goes with --resume; of a new training: --set total_steps={options.total_steps}")
     else:
         environment = options.env or "WLR-Velocity-v0" if options.init is None else environment_of(options.env, options.init)
         config = _config(options, environment)

@@ -84,6 +84,10 @@ def run(options: VisionOptions) -> int:
 
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"--rate {options.rate:g}: expected more than 0")
+    if options.seconds is not None and not options.seconds > 0:
+        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
+    if Path(options.video).is_dir() and options.rate is None and options.times is None:
+        raise InputError(f"{options.video}: images do not say when they were taken: give --rate (Hz) or --times")
     live = options.video.isdigit() and not Path(options.video).exists()
     measured = None if live else read_run(options.run)
     camera, body, floor = load_camera(options.camera), load_target(options.markers), load_target(options.floor)

@@ -11,7 +11,15 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.policy.agents import Training, TrainingProgress, agent_function, apply_changes, load_agent, load_agent_config
+from wlr_gym.policy.agents import (
+    Training,
+    TrainingProgress,
+    agent_function,
+    apply_changes,
+    for_task,
+    load_agent,
+    load_agent_config,
+)
 from wlr_gym.robot import RobotSource, robot_content
 
 
@@ -60,7 +68,7 @@ def train(
     """
     if not isinstance(settings, Mapping | None):
         raise InputError(f"settings = {settings!r}: expected a mapping, such as {{'total_steps': 100_000}}")
-    chosen = merge_changes(settings_of(env_id, config, agent, init), settings or {})
+    chosen = merge_changes(settings_of(env_id, config, agent, init), for_task(settings or {}, task_name_of(env_id)))
     if seed is not None:
         chosen["seed"] = seed
     if robot is not None:
@@ -84,9 +92,9 @@ def settings_of(
     if init is None or config is not None:
         load_agent(agent)  # an unknown one is refused as that, not as settings
         return load_agent_config(config or agent, changes, task_name_of(env_id))
-    chosen = dict(agent_function(agent, "settings_to_start_from")(init))
+    chosen = {**agent_function(agent, "settings_to_start_from")(init), "tasks": {}}
     apply_changes(chosen, changes)
-    return chosen
+    return for_task(chosen, task_name_of(env_id))
 
 
 def with_robot(settings: Mapping[str, Any], robot: RobotSource | None = None) -> dict[str, Any]:

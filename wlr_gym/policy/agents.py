@@ -163,7 +163,7 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str
     """
     config = _read_config(name, task)
     apply_changes(config, changes)
-    return config
+    return config if task is None else for_task(config, task)
 
 
 def apply_changes(config: dict[str, Any], changes: Iterable[str]) -> None:
@@ -187,9 +187,19 @@ def _read_config(name: str | Path, task: str | None) -> dict[str, Any]:
             raise InputError(f"{where}: expected a mapping, got {type(data).__name__}")
         own = dict(data or {})
         if task is not None:
-            own = merge_changes(own, _of_task(where, own.pop("tasks", None), task))
+            own = for_task(own, task, where)
         config = merge_changes(config, own)
     return config
+
+
+def for_task(settings: Mapping[str, Any], task: str, where: str = "settings") -> dict[str, Any]:
+    """Return settings with what their ``tasks`` says of one task laid over the others.
+
+    Raises:
+        InputError: a task that is none.
+    """
+    own = dict(settings)
+    return merge_changes(own, _of_task(where, own.pop("tasks", None), task))
 
 
 def _of_task(path: str, tasks: Any, task: str) -> Mapping[str, Any]:

@@ -147,9 +147,11 @@ def policy_environment(source: str | Path) -> dict[str, Any]:
         nominal one.
 
     Raises:
-        InputError: neither an agent nor a policy, or a broken one.
+        InputError: neither an agent nor a policy, both, or a broken one.
     """
     if str(source) in agent_names():
+        if _policy_place(source) is not None:
+            raise InputError(f"'{source}' is an agent, and a policy in this folder: give ./{source}, or rename the policy")
         return fed_environment(load_agent_config(source).get("environment") or {})
     contract = contract_of(source)
     robot = robot_of_contract(contract)

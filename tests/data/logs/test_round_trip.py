@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.cli import main
 from wlr_gym.data import Run, read_run, write_run
 from wlr_gym.data.convert import convert
 from wlr_gym.data.format import COLUMNS, COMMANDS, REQUIRED, Profile, RunMeta
@@ -86,6 +87,15 @@ def test_a_bag_that_is_there_is_kept(tmp_path):
     with pytest.raises(InputError, match="is there already"):
         export_run(run, tmp_path / "bag", "rosbag2")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bag", "run_01.csv"]
+
+
+@pytest.mark.parametrize(("form", "name"), [("mcap", "run_01.mcap"), ("rosbag2", "run_01.bag2")])
+def test_a_run_that_cannot_be_read_costs_no_older_export(form, name, tmp_path):
+    run = write_run(tmp_path / "run_01.csv", rows_of(made_up(3.0)))
+    assert main(["export", str(run), "--to", form]) == 0
+    run.write_text("broken")
+    assert main(["export", str(run), "--to", form, "--force"]) == 2
+    assert (tmp_path / name).exists()
 
 
 def test_what_tools_show(tmp_path):

@@ -118,6 +118,16 @@ def test_settings_of_a_task_lie_over_the_general_ones_and_changes_over_both(tmp_
     assert load_agent_config(path, task="slope") == {"gamma": 0.9, "seed": 1, "environment": {"a": 1}}
 
 
+def test_a_change_for_one_task_counts_there(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("{gamma: 0.9}")
+    change = ("tasks.path.gamma=0.99",)
+    assert load_agent_config(path, change, task="path") == {"gamma": 0.99}
+    assert load_agent_config(path, change, task="slope") == {"gamma": 0.9}
+    with pytest.raises(InputError, match=r"settings: tasks: unknown task 'pth'.*'path'"):
+        load_agent_config(path, ("tasks.pth.gamma=0.99",), task="path")
+
+
 def test_settings_of_a_task_that_does_not_exist_are_refused(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("{gamma: 0.9, tasks: {pth: {gamma: 0.99}}}")

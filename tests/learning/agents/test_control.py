@@ -223,6 +223,13 @@ def test_what_cannot_be_searched_is_refused_before_anything_is_written(tmp_path,
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("given", [{"init": "velocity_blind"}, {"max_seconds": 60.0}])
+def test_what_a_search_does_not_know_is_refused(tmp_path, given):
+    with pytest.raises(InputError, match=f"leave out '{next(iter(given))}'"):
+        load_agent("pid").train(Training(ENVIRONMENT, tmp_path / "run", {}, **given))
+    assert not (tmp_path / "run").exists()
+
+
 def test_search_is_not_resumed(tmp_path):
     with pytest.raises(InputError, match="cannot be resumed"):
         load_agent("pid").train(Training(ENVIRONMENT, tmp_path, {}, resume=True))

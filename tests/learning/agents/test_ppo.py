@@ -127,6 +127,16 @@ def test_a_run_stopped_anywhere_goes_on_as_if_it_were_not(run, tmp_path):
     assert lines == ["steps", "64", "128", "192", "256", "320", "384"]  # whole numbers stay whole numbers
 
 
+def test_a_run_goes_on_without_the_policy_that_it_started_from(run, tmp_path):
+    start = tmp_path / "start"
+    shutil.copytree(run / "policy", start)
+    stopped = Training(ENVIRONMENT, tmp_path / "run", SETTINGS, progress=False, init=start, on_update=lambda p: p.stop())
+    load_agent("ppo").train(stopped)
+    shutil.rmtree(start)
+    resumed = load_agent("ppo").train(replace(stopped, resume=True, on_update=None))
+    assert read_contract(resumed)["training"]["steps"] == SETTINGS["total_steps"]
+
+
 def test_a_plant_whose_state_cannot_be_set_is_trained_on_and_resumed_with_new_episodes(tmp_path, monkeypatch):
     monkeypatch.setattr(GibbsAppellPlant, "capabilities", replace(GibbsAppellPlant.capabilities, can_set_state=False))
     train(tmp_path, total_steps=128)
@@ -248,6 +258,7 @@ def test_broken_model_file_is_refused(run, tmp_path):
         (["train", "--agent", "pop"], "unknown agent"),
         (["train", "--agent", "do_nothing"], "has no 'train'; agents that have: pid, ppo"),
         (["train", "--set", "epochs=0"], "epochs = 0"),
+        (["train", "--set", "hidden_layers=[64,-3]"], "hidden_layers.1 = -3: expected greater than 0"),
         (["train", "--set", "environment.precison=float32"], "did you mean 'precision'"),
         (["train", "--resume", "/nowhere"], "not a run folder"),
         (["train", "--resume", ".", "--seed", "1"], "leave out"),

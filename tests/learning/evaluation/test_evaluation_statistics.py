@@ -44,6 +44,14 @@ def test_reduction_and_share():
     assert share.mean == pytest.approx(75.0)
 
 
+def test_a_share_of_less_than_nothing_says_nothing():
+    """Worse than both: the quotient of two negative scores would be 150 %."""
+    resampling, ones = Bootstrap(1, 10), np.ones((1, 10))
+    idle = pairs(4 * ones)
+    assert np.isnan(resampling.share(pairs(ones), pairs(2 * ones), idle, idle, subjects=(0, 1, 2, 2)).mean)
+    assert np.isnan(resampling.reduction(pairs(ones), pairs(-ones)).mean)
+
+
 def test_ratios_weigh_by_their_denominator():
     values = np.array([[[1.0, 1.0], [1.0, 9.0]]])
     assert Bootstrap(1, 2).mean(values).mean == pytest.approx(0.2)

@@ -41,6 +41,17 @@ def test_a_grid_is_all_combinations_with_all_seeds():
     assert whole.settings["environment"]["randomization"] != "ice"
 
 
+def test_settings_for_one_task_count_there():
+    own = {"tasks": {"velocity": {"gamma": 0.5}, "path": {"gamma": 0.6}}}
+    assert resolve(plan(settings=own, seeds=1)).settings["gamma"] == 0.5
+
+
+def test_a_value_is_no_group(capsys, tmp_path):
+    words = ["sweep", ENVIRONMENT, "--set", "environment=3", "environment.randomization=ice", "--out", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert "--set environment.randomization: 'environment' is a value, not a group" in capsys.readouterr().err
+
+
 def test_what_a_folder_keeps_is_the_whole_plan():
     whole = resolve(plan(config="ppo_blind", settings={"total_steps": 1000}, space={"gamma": [0.9, 0.97]}))
     again = parse_config(SweepPlan, whole.model_dump(mode="json"), "again")

@@ -56,6 +56,31 @@ def test_clocks_are_aligned_within_2_ms(turn, seed):
     assert "yaw" in found.parts
 
 
+def with_table(drive, change):
+    return replace(drive, run=Run(change(drive.run.table.copy()), drive.run.meta, drive.run.path, drive.run.findings))
+
+
+@pytest.mark.parametrize(("missing", "used"), [(slice(50, 52), True), (slice(50, 60), False)])
+def test_clocks_are_aligned_by_a_gyroscope_that_misses_readings(turn, missing, used):
+    def change(table):
+        table.loc[table.index[missing], "gyro_z"] = np.nan
+        return table
+
+    found = aligned(with_table(turn, change), samples_of(turn))
+    assert found.offset == pytest.approx(OFFSET, abs=0.002)
+    assert ("yaw" in found.parts) == used
+
+
+def test_a_pause_of_the_log_is_told(turn):
+    samples = samples_of(turn)
+    for count, told in ((4, False), (15, True)):
+        paused = with_table(turn, lambda table, count=count: table.drop(index=table.index[100 : 100 + count]))
+        slip = measure_slip(samples, OFFSET, paused.run, turn.robot, Parameters.nominal(turn.robot))
+        said = [finding for finding in _findings(samples, slip, 0.0) if "no rows for" in finding]
+        assert bool(said) == told
+    assert "no rows for 0.32 s after 1.98 s" in said[0]
+
+
 @pytest.mark.slow
 def test_the_wheels_errors_are_correlated_as_the_covariance_says(turn):
     """Against the errors of other draws of the frames' noise; its diagonal is that of the sigmas."""

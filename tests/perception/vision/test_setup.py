@@ -162,8 +162,12 @@ def test_frames_from_a_folder_a_video_and_times(tmp_path):
         times.write_text("\n".join(str(1 + 0.1 * k) for k in range(count)))
         with pytest.raises(InputError, match=f"{count} times, but"):
             list(Frames(str(tmp_path / "v.avi"), times=times))
-    times.write_text("t\n1.0\n0.9\n")
-    with pytest.raises(InputError, match="times must be finite and increase"):
+    for text, number, value in (("t\n1.0\n0.9\n", 1, "0.9"), ("t\n1\n2\nnan\n4\n5\n", 2, "nan")):
+        times.write_text(text)
+        with pytest.raises(InputError, match=f"frame {number}: times must be finite and increase, not {value}"):
+            list(Frames(str(tmp_path / "v.avi"), times=times))
+    times.write_text("t\n1.0\n", encoding="utf-16")
+    with pytest.raises(InputError, match="not a table of frame times"):
         list(Frames(str(tmp_path / "v.avi"), times=times))
     broken = tmp_path / "broken.mp4"
     broken.write_bytes(b"not a video")
@@ -171,6 +175,14 @@ def test_frames_from_a_folder_a_video_and_times(tmp_path):
         list(Frames(str(broken)))
     with pytest.raises(InputError, match="no such video or folder of images"):
         list(Frames(str(tmp_path / "nothing.mp4")))
+
+
+def test_images_are_in_order_of_their_numbers(tmp_path):
+    import cv2
+
+    for k in range(12):
+        cv2.imwrite(str(tmp_path / f"view_1_{k}.png"), np.full((48, 64), 20 * k, np.uint8))
+    assert [int(frame.image[0, 0]) // 20 for frame in Frames(str(tmp_path))] == list(range(12))
 
 
 @pytest.mark.parametrize(("share", "missing"), [(1.0, 0), (0.5, 20)])
@@ -335,6 +347,8 @@ def test_command_writes_the_sheets(tmp_path, capsys):
     ("arguments", "message"),
     [
         (["vision", "v.avi", "--run", "none.csv", "--out", "o", "--camera", "c.yaml"], "none.csv: no such file"),
+        (["vision", ".", "--run", "none.csv", "--out", "o", "--camera", "c.yaml"], "images do not say when they were taken"),
+        (["vision", "v.avi", "--run", "r.csv", "--out", "o", "--camera", "c.yaml", "--seconds", "-1"], "--seconds -1: exp"),
         (["calibrate", "camera", "nothing", "--out", "camera.yaml"], "no such video"),
         (["calibrate", "camera", ".", "--out", "camera.yaml", "--square", "28"], "expected metres"),
         (["calibrate", "camera", ".", "--out", "camera.txt"], "expected a .yaml file"),

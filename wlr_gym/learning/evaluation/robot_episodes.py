@@ -98,17 +98,13 @@ def drive_episode(
         refuse_deadman(plant)
         if truth is None and core.observer is None:
             raise InputError(f"policy '{policy}': it has no slip observer, which is what tells how a real robot moves")
-        score = _Score(_whole_task(environment, policy), core, truth)
+        whole = make_task(task_source_of(environment), read_settings(environment_for(policy, {})))  # with all measures
+        score = _Score(whole, core, truth)
         with stop_on_signals(plant.loop.operator):
             driven = deploy(core, make_policy(policy, core.contract()), seed, watcher=score)
     finally:
         core.close()
     return score.episode(seed, driven)
-
-
-def _whole_task(environment: str, policy: str) -> Task:
-    """Return the task with the measures that a robot cannot take, too."""
-    return make_task(task_source_of(environment), read_settings(environment_for(policy, {})))
 
 
 class _Score:

@@ -42,6 +42,11 @@ def interquartile_mean(scores: Array) -> Array:
     return np.sort(scores, axis=1)[:, cut : scores.shape[1] - cut].mean(axis=1)
 
 
+def _over(above: Array, below: Array) -> Array:
+    """Return quotients (R,); NaN where the first divisor, as measured, is not above 0: the sign would say the opposite."""
+    return above / below if below[0] > 0.0 else np.full_like(above, np.nan)
+
+
 def expansion(seeds: int) -> float:
     """Return by how much resampled means of T training seeds must spread more to give Student's interval; 0 for one seed.
 
@@ -160,11 +165,11 @@ class Bootstrap:
 
     def reduction(self, ours: Array, theirs: Array, quantile: float | None = None) -> Estimate:
         """Return by how much ours is smaller than theirs, in % of theirs."""
-        return self.estimate(lambda a, b: 100.0 * (1.0 - a / b), ours, theirs, quantile=quantile)
+        return self.estimate(lambda a, b: 100.0 * (1.0 - _over(a, b)), ours, theirs, quantile=quantile)
 
     def share(self, ours: Array, theirs: Array, our_zero: Array, their_zero: Array, *, subjects: Sequence[int]) -> Estimate:
         """Return ours in % of theirs, each above its own zero; ``subjects`` as for :meth:`estimate`."""
         return self.estimate(
-            lambda a, b, zero_a, zero_b: 100.0 * (a - zero_a) / (b - zero_b),
+            lambda a, b, zero_a, zero_b: 100.0 * _over(a - zero_a, b - zero_b),
             ours, theirs, our_zero, their_zero, subjects=subjects,
         )  # fmt: skip

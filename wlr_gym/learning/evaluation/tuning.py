@@ -34,10 +34,14 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
     """Search from the settings of ``training``, and return the folder of the policy with the best ones.
 
     Raises:
-        InputError: bad settings, a task without limits to score by, or ``resume``: a search takes minutes and is not continued.
+        InputError: bad settings, a task without limits to score by, or what a search has not: ``resume``, ``init``, a limit of
+            time.
     """
     if training.resume:
         raise InputError(f"agent '{agent}' is tuned by a search of a few minutes, which cannot be resumed: start it anew")
+    for name in ("init", "max_seconds"):
+        if getattr(training, name) is not None:
+            raise InputError(f"agent '{agent}' is tuned by a search of a few minutes: leave out '{name}', which is of training")
     config = dict(training.config)
     general = task_settings(model, {"task": ""}, config, agent)
     _check_steps(general, agent)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveInt, model_validator
 
 from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.base.settings import SettingsModel
@@ -66,7 +66,7 @@ class PpoConfig(SettingsModel):
     residual: float | None = Field(None, gt=0)
     residual_share: float = Field(1.0, gt=0, le=1)
     mirror: bool = False
-    hidden_layers: tuple[int, ...] = (64, 64)
+    hidden_layers: tuple[PositiveInt, ...] = (64, 64)
     activation: Literal["tanh", "elu", "relu"] = "tanh"
     initial_log_std: float | tuple[float, float] = 0.0
     teacher: str | None = None

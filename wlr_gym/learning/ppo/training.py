@@ -54,13 +54,13 @@ def run_training(training: Training) -> Path:
         Exception: what ``on_update`` raised, after a checkpoint was saved.
     """
     config = parse_settings(training.config)
-    if training.init is not None:
+    start = checkpoint.newest(training.folder / "checkpoints") if training.resume else None
+    if training.init is not None and start is None:  # a checkpoint has all of it: the policy may be gone
         config = with_network_of(config, training.init)
     env = Sb3VecEnv(training.environment, config.num_envs, **config.environment)
     try:
         with torch_threads(config.torch_threads):
             model = make_model(env, config)
-            start = checkpoint.newest(training.folder / "checkpoints") if training.resume else None
             if start is not None:
                 checkpoint.restore(start, model, env)
             else:

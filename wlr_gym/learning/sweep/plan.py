@@ -7,7 +7,7 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,9 +18,10 @@ from pydantic import Field, model_validator
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml
+from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.learning.training import settings_of, with_robot
-from wlr_gym.policy.agents import agent_function, apply_changes, load_agent
+from wlr_gym.policy.agents import agent_function, apply_changes, for_task, load_agent
 
 #: Metric of the held-out episodes -> whether less of it is better.
 METRICS = {"tracking_error": True, "success": False, "excess_slip": True, "reward": False}
@@ -207,7 +208,8 @@ def resolve(plan: SweepPlan) -> SweepPlan:
         InputError: unknown agent, config, environment or setting, a value that no trial can have, or two trials of one name.
     """
     agent_function(plan.agent, "train")
-    settings = with_robot(merge_changes(settings_of(plan.environment, plan.config, plan.agent, plan.init), plan.settings))
+    own = for_task(plan.settings, task_name_of(plan.environment))
+    settings = with_robot(merge_changes(settings_of(plan.environment, plan.config, plan.agent, plan.init), own))
     if plan.search is not None and plan.search.early_stopping and isinstance(settings.get("total_steps"), int):
         settings.setdefault("evaluate_every", max(1, settings["total_steps"] // SCORES))
     init = plan.init if plan.init is None or not Path(plan.init).exists() else str(Path(plan.init).resolve())
@@ -268,12 +270,8 @@ def known_settings(plan: SweepPlan) -> list[dict[str, Any]] | None:
         random = np.random.default_rng(plan.search.seed)
         drawn = [draw(plan, random) for _ in range(plan.search.trials)]
         return list({label_of(settings): settings for settings in drawn}.values())  # each once
-    names = list(plan.space)
-    return [dict(zip(names, values, strict=True)) for values in itertools.product(*_lists(plan))]
-
-
-def _lists(plan: SweepPlan) -> Iterator[list[Any]]:
-    return (values for values in plan.space.values() if isinstance(values, list))
+    lists = [values for values in plan.space.values() if isinstance(values, list)]
+    return [dict(zip(plan.space, values, strict=True)) for values in itertools.product(*lists)]
 
 
 def draw(plan: SweepPlan, random: np.random.Generator) -> dict[str, Any]:

@@ -34,6 +34,8 @@ _DRIFT = 40.0
 #: s; of the distance driven, differences with a longer period are slip.
 _SLIP = 5.0
 _GRID = 0.005  # s
+#: Share of a sensor's readings that must be there; most missing ones in a row with which the gyroscope tells the clocks.
+_SHARE, _HOLES = 0.9, 4
 _LATENCY = 1e-3  # s; the delays inside IMU and camera are known no better
 _DISTANCE = "distance"
 _START_SLIP = 1e-4  # m; a wheel that starts later than the body looks like a clock that is late
@@ -263,8 +265,8 @@ def _pairs(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parame
     ]
     delay = 1 / (2 * math.pi * robot.sensors.imu.bandwidth)  # of a first-order low-pass
     for axis, column, name in (("z", 3, "yaw"), ("y", 4, "pitch")):
-        if f"gyro_{axis}" in run and np.isfinite(run[f"gyro_{axis}"]).all():
-            angle = accumulate(run[f"gyro_{axis}"], t)
+        if (rate := readings(run, f"gyro_{axis}", _HOLES)) is not None:
+            angle = accumulate(rate, t)
             seen = np.unwrap(poses[:, column])
             pairs.append(_Pair(name, seen, _between(t - delay, angle), _DRIFT))
     return [*pairs, _rolling_pair(time + around, poses, run, joints, rest, parameters)]
@@ -309,10 +311,23 @@ def _rolling_speeds(run: Run, joints: tuple[Array, Array], rest: Array, paramete
     attitude = quaternion(np.zeros(count), rest[:, 1], rest[:, 2])
     turning = np.zeros((count, 3))
     turning[:, 1] = np.gradient(rest[:, 1], run["t"])
-    if "gyro_z" in run and np.isfinite(run["gyro_z"]).all():
-        turning[:, 2] = run["gyro_z"]
+    if (rate := readings(run, "gyro_z", _HOLES)) is not None:
+        turning[:, 2] = rate
     slip = contact_slip_velocity(repeated(parameters, count), attitude, np.zeros((count, 3)), turning, *joints)
     return -slip[:, :, 0]
+
+
+def readings(run: Run, name: str, longest: float = math.inf) -> Array | None:
+    """A column (T,) of a run, missing numbers interpolated; None where it is absent, or too many are missing.
+
+    Args:
+        run: with it or without. name: of the column. longest: most that may be missing in a row.
+    """
+    if name not in run or (fine := np.isfinite(run[name])).mean() < _SHARE:
+        return None
+    if np.diff(np.flatnonzero([True, *fine, True])).max() > longest + 1:
+        return None
+    return np.interp(run["t"], run["t"][fine], run[name][fine])
 
 
 def repeated(parameters: Parameters, count: int) -> Parameters:

@@ -27,7 +27,7 @@ from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
 from wlr_gym.perception.vision.frame_noise import without_repeats
 from wlr_gym.perception.vision.motion import smoothed_poses
-from wlr_gym.perception.vision.self_calibration import SelfCalibration, calibration_findings, self_calibrated
+from wlr_gym.perception.vision.self_calibration import UNSURE, SelfCalibration, calibration_findings, self_calibrated
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, REPEATED, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
@@ -46,6 +46,8 @@ ORIGINS = ("start", "floor")
 POOR_FIT = 0.3
 #: m; the body's height by the camera may differ by this from what its legs say.
 HEIGHT_TOLERANCE = 0.005
+#: s without a row of the run after which its slip is no longer known to its sigma.
+_LONGEST_PAUSE = 0.11
 #: s of the first poses that make the start pose.
 _START = 0.3
 #: m/s; a robot faster than this is not at rest.
@@ -187,7 +189,8 @@ def camera_columns(
     marker = np.asarray(run.meta.marker_offset)
     place = poses[:, :3] + np.einsum("nij,j->ni", rotation(*poses[:, 3:].T), marker)
     columns = {name: np.full(len(t), np.nan) for name in ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")}
-    rows = np.abs(t[:, None] - time[None]).argmin(axis=0)
+    after = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
+    rows = after - (time - t[after - 1] <= t[after] - time)
     late = t[rows] - time
     inside = (time > t[0] - 0.01) & (time < t[-1] + 0.01)
     values = np.column_stack([place[:, :2], poses[:, 3], place[:, 2], poses[:, 4]]) + late[:, None] * rates[:, [0, 1, 3, 2, 4]]
@@ -252,14 +255,6 @@ def _observed(
         yield sample
 
 
-def missing_frames(missing: int, decoded: int) -> str:
-    """Say that a video is not whole."""
-    return (
-        f"the video is cut off or damaged: it announces {missing + decoded} frames, of which {decoded} could be decoded; what "
-        "the others show is not in the results"
-    )
-
-
 def _from_start(values: Array, time: Array) -> Array:
     """x, y, yaw (F, 3) in the frame of the mean pose over the first moments."""
     x, y, yaw = values[time <= time[0] + _START].mean(axis=0)
@@ -271,7 +266,10 @@ def _from_start(values: Array, time: Array) -> Array:
 def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, missing: int = 0) -> Iterator[str]:
     counts = Counter(sample.status for sample in samples)
     if missing:
-        yield missing_frames(missing, len(samples))
+        yield (
+            f"the video is cut off or damaged: it announces {missing + len(samples)} frames, of which {len(samples)} could be "
+            "decoded; what the others show is not in the results"
+        )
     if counts[MOVED]:
         first = next(sample for sample in samples if sample.status == MOVED)
         yield (
@@ -288,6 +286,10 @@ def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, 
         yield f"{int(slip.outliers.sum())} frames contradict their neighbours, and were left out"
     if not slip.covered.all():
         yield f"{int((~slip.covered).sum())} rows are further than 0.15 s from a pose: interpolated, see the column 'covered'"
+    pauses = np.diff(slip.time)
+    if pauses.max() > _LONGEST_PAUSE:
+        pause = f"for {pauses.max():.2f} s after {slip.time[np.argmax(pauses)]:.2f} s"
+        yield f"the run has no rows {pause}: legs and wheels are interpolated there; {UNSURE}"
     residual = float(np.median([sample.residual for sample in samples if math.isfinite(sample.residual)]))
     if residual > POOR_FIT:
         yield f"markers miss their places by {residual:.2f} px: calibration, print scale or target file do not fit"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.read import Run
-from wlr_gym.perception.vision.alignment import without_slow
+from wlr_gym.perception.vision.alignment import readings, without_slow
 from wlr_gym.perception.vision.motion import smoothed_poses
 from wlr_gym.perception.vision.self_calibration import UNSURE
 from wlr_gym.perception.vision.tracking import Sample
@@ -38,8 +38,6 @@ _SCALE_ERROR, _SIZE_ERROR = 0.1, 1.0
 #: s; changes of speed with a longer period are the accelerometer's bias, and legs that shake it. How many times better another
 #: axis must explain those that the film shows.
 _SLOW, _BETTER = 1.0, 2.0
-#: Share of the readings that must be there; those between are interpolated for the comparison.
-_SHARE = 0.9
 
 
 @dataclass(frozen=True)
@@ -160,13 +158,9 @@ def wrong_axes(samples: Sequence[Sample], offset: float, run: Run, robot: Robot)
 
 
 def _readings(run: Run, name: str) -> Array | None:
-    """Readings (T, 3) of gyroscope or accelerometer, single missing ones interpolated; None where too many are missing."""
-    columns = [run[f"{name}_{axis}"] for axis in "xyz" if f"{name}_{axis}" in run]
-    found = [np.isfinite(column) for column in columns]
-    if len(columns) < 3 or min(float(fine.mean()) for fine in found) < _SHARE:
-        return None
-    t = run["t"]
-    return np.stack([np.interp(t, t[fine], column[fine]) for column, fine in zip(columns, found, strict=True)], axis=1)
+    """Readings (T, 3) of gyroscope or accelerometer; None where one of its axes has too few."""
+    columns = [column for axis in "xyz" if (column := readings(run, f"{name}_{axis}")) is not None]
+    return np.stack(columns, axis=1) if len(columns) == 3 else None
 
 
 def _angle_rates(gyro: Array, pitch: Array, roll: Array) -> Array:

@@ -140,7 +140,8 @@ def measure_slip(
     batch = repeated(parameters, len(rows))
     fine = without_outliers(samples, time)
     agrees, contradictions = imu_compared(fine, offset, run, robot)
-    imu = imu_readings(run, _leg_pace(run, robot), robot) if agrees else None
+    pace = np.sqrt(np.mean(joint_signals(run, run["t"], robot)[1][:, LEG_SLICE] ** 2, axis=1))
+    imu = imu_readings(run, pace, robot) if agrees else None
     film, joined = (
         smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, legs)
         for legs in (None, leg_readings(rows, joints, robot, parameters))
@@ -224,8 +225,3 @@ def _apart(rows: Array, frames: Array) -> Array:
     """How far (s) each of the rows is from the nearest frame."""
     after = np.clip(np.searchsorted(frames, rows), 1, len(frames) - 1)
     return np.minimum(np.abs(rows - frames[after - 1]), np.abs(frames[after] - rows))
-
-
-def _leg_pace(run: Run, robot: Robot) -> Array:
-    """Rates of the legs (T,), rms, rad/s."""
-    return np.sqrt(np.mean(joint_signals(run, run["t"], robot)[1][:, LEG_SLICE] ** 2, axis=1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ _FRAMES_FOR_RATE = 10
 
 
 class Frames:
-    """The frames of a video file or of a folder of images (in order of name); an iterator.
+    """The frames of a video file or of a folder of images (in order of name, numbers as numbers); an iterator.
 
     A note on how the camera was held (a phone's) is not followed: frames are as the sensor read them, so one calibration and
     one readout hold for films taken upright, lying and upside down.
@@ -109,7 +110,7 @@ class Frames:
             self.missing = self.announced - index
 
     def _folder(self, folder: Path) -> Iterator[tuple[float, Image]]:
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
+        files = sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGES), key=_counted)
         if not files:
             raise InputError(f"{folder}: no images ({', '.join(IMAGES)})")
         self.announced = len(files)
@@ -118,6 +119,12 @@ class Frames:
             if image is None:
                 raise InputError(f"{path}: cannot be read as an image")
             yield index / 30.0, image
+
+
+def _counted(path: Path) -> tuple[list[str | int], str]:
+    """Return what puts files in order of name, with numbers as numbers: 2 before 10."""
+    parts = re.split(r"(\d+)", path.name)  # text, number, text, ...
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
 
 
 def read_image(path: Path) -> Image | None:
@@ -138,25 +145,19 @@ def grey(image: Any) -> Image:
 def _read_times(path: Path) -> list[float]:
     if not path.is_file():
         raise InputError(f"{path}: no such file of frame times")
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        cells = [row[-1].strip() for row in csv.reader(file) if row]
     try:
-        stamps = [float(cell) for cell in (cells[1:] if cells and not _is_number(cells[0]) else cells)]
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            cells = [row[-1].strip() for row in csv.reader(file) if row]
+        try:
+            stamps = [float(cell) for cell in cells]
+        except ValueError:
+            stamps = [float(cell) for cell in cells[1:]]  # the first was a heading
     except ValueError as error:
         raise InputError(f"{path}: not a table of frame times: {error}") from None
-    back = np.flatnonzero(np.diff(stamps) <= 0)
-    if len(back) or not np.isfinite(stamps).all():
-        where = int(back[0]) + 1 if len(back) else 0
-        raise InputError(f"{path}: frame {where}: times must be finite and increase")
+    wrong = np.flatnonzero(~np.isfinite(stamps) | (np.diff(stamps, prepend=-math.inf) <= 0))
+    if len(wrong):
+        raise InputError(f"{path}: frame {wrong[0]}: times must be finite and increase, not {stamps[wrong[0]]:g}")
     return stamps
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 class VideoFile:
