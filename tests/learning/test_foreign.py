@@ -96,12 +96,12 @@ def test_a_plain_network(env, tmp_path):
 def test_an_environment_that_was_made_without_an_id(tmp_path):
     own = WlrEnv(definition=read_task("velocity").model_dump(mode="json", exclude_none=True))
     for made in (PostureEnv(), PathVectorEnv(2)):
-        network = torch.nn.Linear(made.observation_space.shape[-1], 8)
+        network = torch.nn.Linear(len(made.contract()["observation"]), 8)
         wlr_gym.import_policy(network, made, tmp_path / f"{type(made).__name__}.onnx")
     assert contract_of(tmp_path / "PostureEnv.onnx")["training"]["environment"] == "WLR-Posture-v0"
     assert contract_of(tmp_path / "PathVectorEnv.onnx")["training"]["environment"] == "WLR-Path-v0"
     with pytest.raises(InputError, match="has no id: register its task with register_task"):
-        wlr_gym.import_policy(torch.nn.Linear(own.observation_space.shape[-1], 8), own, tmp_path / "own.onnx")
+        wlr_gym.import_policy(torch.nn.Linear(len(own.contract()["observation"]), 8), own, tmp_path / "own.onnx")
 
 
 def test_the_normaliser_around_the_environment_is_part_of_the_policy(env, tmp_path):
