@@ -98,6 +98,10 @@ def test_two_runs_are_too_few(tmp_path):
         (lambda table: table.assign(current=np.nan), r"column 'current', row 0: expected a finite number"),
         (lambda table: table.assign(t=table["t"].to_numpy()[::-1]), r"column 't', row 1: expected times that rise"),
         (lambda table: table.assign(position=np.nan), r"column 'position' holds no number"),
+        (
+            lambda table: table.assign(position=table["position"].where(table.index != 7, -np.inf)),
+            r"column 'position', row 7: infinite",
+        ),
         (lambda table: table[:5], r"5 rows: expected 20 or more"),
     ],
 )
@@ -113,6 +117,12 @@ def test_one_run_in_two_formats_is_not_two(runs, tmp_path):
     table.to_parquet(tmp_path / "run_01.parquet")
     with pytest.raises(InputError, match=r"run_01\.csv and run_01\.parquet are the same run"):
         read_rig_runs(tmp_path, AXIS)
+
+
+def test_the_case_of_a_files_ending_loses_no_run(runs, tmp_path):
+    for name in ("run_01.csv", "run_02.CSV"):
+        (tmp_path / name).write_bytes((runs / name.lower()).read_bytes())
+    assert [run.name for run in read_rig_runs(tmp_path, AXIS)] == ["run_01", "run_02"]
 
 
 def test_a_candidate_has_the_meaning_of_its_own_law(runs):
@@ -136,6 +146,16 @@ def without_sigma():
         ({"parameters": without_sigma()}, r"parameters: mass: sigma = 0\.0: expected a number above 0"),
         ({"parameters": AXIS.parameters * 2}, r"parameters and laws = 'mass': expected every name once"),
         ({"windows": ()}, r"windows = \(\): expected lengths above 0"),
+        ({"windows": 0.5}, r"windows = 0\.5: expected a tuple of lengths"),
+        ({"columns": AXIS.columns[0]}, r"columns = MeasuredSignal\(.*: expected a tuple of MeasuredSignal"),
+        ({"inputs": ["current"]}, r"inputs = \['current'\]: expected a mapping from names to units"),
+        ({"inputs": {"lambda": "m"}}, r"inputs = 'lambda': expected a name"),
+        ({"inputs": {"_current": "A"}}, r"inputs = '_current': expected a name"),
+        ({"disagreement": "much"}, r"disagreement = 'much': expected a number of 0 or more"),
+        (
+            {"columns": (dataclasses.replace(AXIS.columns[0], noise=None),)},
+            r"position: noise = None: expected a number above 0",
+        ),
         ({"step": 0.0}, r"step = 0\.0: expected a number above 0"),
     ],
 )
@@ -146,7 +166,12 @@ def test_rigs_that_contradict_themselves_are_refused(changes, message):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "no such file"), ("1 / 0", "does not run: ZeroDivisionError"), ("RIG = 3", r"RIG = 3: expected")],
+    [
+        (None, "no such file"),
+        ("1 / 0", "does not run: ZeroDivisionError"),
+        ("RIG = 3", r"RIG = 3: expected"),
+        ("raise SystemExit(3)", "does not run: SystemExit: 3"),
+    ],
 )
 def test_files_that_are_no_rig_are_refused(tmp_path, text, message):
     path = tmp_path / "rig.py"
@@ -158,7 +183,9 @@ def test_files_that_are_no_rig_are_refused(tmp_path, text, message):
 
 def test_equations_that_cannot_be_compiled_are_named(runs):
     broken = dataclasses.replace(AXIS, change=lambda x, u, p: (x.no_such_state, 0.0))
-    with pytest.raises(InputError, match=r"rig 'axis': change or readings cannot be compiled: .*no_such_state"):
+    with pytest.raises(
+        InputError, match=r"rig 'axis': change \(2 rates\) or readings \(1 columns\) cannot be compiled: .*no_such_state"
+    ):
         open_own_rig(runs, broken)
 
 
