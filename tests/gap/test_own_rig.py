@@ -87,6 +87,8 @@ def test_a_model_replays_its_own_runs_to_the_noise(runs):
 def test_two_runs_are_too_few(tmp_path):
     AXIS_FILE.record(tmp_path, runs=2)
     done = analyse(tmp_path, rig=str(FILE))
+    with pytest.raises(InputError, match=r"threads = 0: expected 1 or more"):
+        analyse(tmp_path, rig=FILE, threads=0)
     assert (done.verdict, done.intake[0].kind) == ("bad_data", "few_runs")
 
 
@@ -117,6 +119,13 @@ def test_one_run_in_two_formats_is_not_two(runs, tmp_path):
     table.to_parquet(tmp_path / "run_01.parquet")
     with pytest.raises(InputError, match=r"run_01\.csv and run_01\.parquet are the same run"):
         read_rig_runs(tmp_path, AXIS)
+
+
+def test_a_run_under_two_names_is_refused(runs, tmp_path):
+    for name, copied in {"run_01": "run_01", "run_02": "run_02", "run_03": "run_01"}.items():
+        (tmp_path / f"{name}.csv").write_bytes((runs / f"{copied}.csv").read_bytes())
+    with pytest.raises(InputError, match=r"run_01 and run_03 are the same run"):
+        analyse(tmp_path, rig=FILE)
 
 
 def test_the_case_of_a_files_ending_loses_no_run(runs, tmp_path):
