@@ -1,6 +1,7 @@
 """A system of one's own: the linear axis of the examples."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
 
@@ -119,6 +120,18 @@ def test_one_run_in_two_formats_is_not_two(runs, tmp_path):
     table.to_parquet(tmp_path / "run_01.parquet")
     with pytest.raises(InputError, match=r"run_01\.csv and run_01\.parquet are the same run"):
         read_rig_runs(tmp_path, AXIS)
+
+
+def test_a_law_under_a_name_of_the_library_keeps_its_own_units(tmp_path):
+    text = FILE.read_text().replace('"viscous_friction"', '"viscous"').replace("asymmetric_friction", "coulomb_friction")
+    path = tmp_path / "axis.py"
+    path.write_text(text.replace('{"difference": ', '{"torque": ').replace("p.difference", "p.torque"))
+    AXIS_FILE.record(tmp_path, runs=3)
+    done = analyse(tmp_path, tmp_path / "out", rig=path)
+    assert [(one.name, one.parameters["torque"].unit) for one in done.effects] == [("coulomb_friction", "N")]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert re.search(r"torque [\d.]+ N<", page)
+    assert re.search(r"cogging [\d.]+ N, phase [-\d.]+ rad", page)
 
 
 def test_a_run_under_two_names_is_refused(runs, tmp_path):

@@ -109,5 +109,5 @@ def _rejected(alike: Sequence[Evidence]) -> tuple[str, ...]:
 
 def _values(one: Evidence) -> str:
     known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
-    units = {name: unit_of(known[name].unit) if name in known else "" for name in one.values}
-    return ", ".join(f"{name} {number(value)}{units[name]}" for name, value in one.values.items())
+    units = {name: spec.unit for name, spec in known.items()} | dict(one.units)
+    return ", ".join(f"{name} {number(value)}{unit_of(units.get(name, ''))}" for name, value in one.values.items())
