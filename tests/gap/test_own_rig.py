@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.estimation.likelihood import level, mean_squares
+from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting
 from wlr_gym.gap.rig.own import check_rig, load_rig
 from wlr_gym.gap.rig.own_kernel import CompiledRig
 from wlr_gym.gap.rig.own_problem import OwnRigProblem, open_own_rig, own_patch
@@ -83,6 +84,38 @@ def test_a_model_replays_its_own_runs_to_the_noise(runs):
     np.testing.assert_array_equal(made[0][0], again[0])
     assert not np.array_equal(made[0][0], made[1][0])
     assert 0.8 < np.sqrt(np.nanmean(made[0][0][:, 0] ** 2)) < 1.5, "first states are taken out"
+
+
+def falling(x, u, p):
+    return x.rate, p.fall * x.angle + u.push
+
+
+def test_an_unstable_system_has_the_noise_floor_of_its_windows(tmp_path):
+    """Held upright by feedback that the model does not know: from the first row on it would fall."""
+    rig = dataclasses.replace(
+        AXIS,
+        change=falling,
+        readings=lambda x, u, p: (x.angle,),
+        states={"angle": "angle", "rate": "rate of angle"},
+        inputs={"push": "rad/s2"},
+        columns=(MeasuredSignal("angle", "rad", 5e-4, "angle"),),
+        parameters=(Quantity("fall", "1/s2", 30.0, 1.0, 10.0, 60.0),),
+    )
+    for k in range(3):
+        rng, angle, rate, rows = np.random.default_rng(k), 0.02, 0.0, []
+        for t in 0.01 * np.arange(600):
+            push = -60.0 * (angle - 0.05 * np.sin(3.0 * t + k)) - 10.0 * rate
+            rows.append((t, push, angle + 5e-4 * rng.standard_normal()))
+            for _ in range(50):
+                rate += 2e-4 * (32.0 * angle + push)
+                angle += 2e-4 * rate
+        pd.DataFrame(rows, columns=["t", "push", "angle"]).to_csv(tmp_path / f"run_{k}.csv", index=False)
+    problem, _ = open_own_rig(tmp_path, rig)
+    assert isinstance(problem, OwnRigProblem)
+    true = Setting(np.array([32.0]))
+    left = level(mean_squares([residual[0] for residual in problem.residuals([true], range(3))], problem.cap))
+    made = level(mean_squares(next(problem.remade(true, range(3), 1)), problem.cap))
+    assert 0.5 * left < made < 1.5 * left
 
 
 def test_two_runs_are_too_few(tmp_path):
