@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
+from pathlib import Path
 
 import gap_examples as examples
 import numpy as np
@@ -27,6 +28,7 @@ from wlr_gym.gap.analysis import (
     Place,
     Threshold,
 )
+from wlr_gym.gap.opened import named_robot
 from wlr_gym.gap.report import folder
 from wlr_gym.gap.report.folder import check_folder, save_analysis
 from wlr_gym.gap.report.page import report
@@ -214,6 +216,28 @@ def test_commands_can_be_typed(tmp_path):
     known = replace(examples.EFFECT_FOUND, known_effects=({"name": "payload"},))
     assert "--effects FILES-GIVEN-AS-KNOWN " in report(known, {}, folder)
     assert "known from the start: payload" in report(known, {}, folder)
+
+
+@pytest.mark.parametrize(
+    ("meta", "option", "named", "shown"),
+    [
+        ("", None, None, ""),
+        ("robot: wlr-nominal", None, "nominal", ""),
+        ("robot: wlr-flow", None, "flow", " --robot flow"),
+        ("robot: robot.yaml", None, "{}/robot.yaml", " --robot '{}/robot.yaml'"),
+        ("robot: wlr-flow", "mine.yaml", "mine.yaml", " --robot mine.yaml"),
+    ],
+)
+def test_commands_name_the_robot_that_was_analysed(tmp_path, meta, option, named, shown):
+    folder = tmp_path / "my runs"
+    folder.mkdir()
+    (folder / "meta.yaml").write_text(meta)
+    found = named_robot(folder, None, option)
+    assert found == (named and named.format(folder))
+    provenance = {} if found is None else {"robot": found}
+    page = unescape(report(replace(examples.EFFECT_FOUND, provenance=provenance), {}, Path("out")))
+    for line in ("wlr train WLR-Velocity-v0 --effects out/patch.yaml", "wlr record --excitation straight --out new_runs"):
+        assert f"{line}{shown.format(folder)}\n" in f"{page}\n".replace("</pre>", "\n")
 
 
 def test_a_patch_that_cannot_be_loaded_is_not_advertised(tmp_path):

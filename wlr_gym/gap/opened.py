@@ -37,6 +37,19 @@ def open_problem(
     return patch, *open_own_rig(data, load_rig(rig), patch.effects)
 
 
+def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | None) -> str | None:
+    """Return what ``--robot`` takes for the robot that is analysed; None = nothing names it, or it is a rig."""
+    from wlr_gym.data.read import read_meta
+    from wlr_gym.data.robot_file import names_file, shipped_robots
+
+    if rig is not None or robot is not None:
+        return None if rig is not None else str(robot)
+    named = read_meta(data).robot
+    if named is None or names_file(named):
+        return None if named is None else str(Path(data) / named)
+    return shipped_robots()[named].stem
+
+
 def known_patch(known: Source, rig: str | Path | None) -> Patch:
     """Return the effects given as known, in the vocabulary of the robot or of the rig.
 

@@ -34,7 +34,7 @@ from wlr_gym.gap.estimation.fit import Fit, fit, widened
 from wlr_gym.gap.estimation.likelihood import mean_of_runs, mean_squares
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
-from wlr_gym.gap.opened import open_problem
+from wlr_gym.gap.opened import named_robot, open_problem
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
@@ -117,6 +117,8 @@ def analyse(
         if problem is None
         else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
     )
+    if named := named_robot(data, rig, robot):
+        done = replace(done, provenance={**done.provenance, "robot": named})
     if out is not None:
         from wlr_gym.gap.report.folder import save_analysis
 
