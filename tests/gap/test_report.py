@@ -216,6 +216,7 @@ def test_commands_can_be_typed(tmp_path):
     known = replace(examples.EFFECT_FOUND, known_effects=({"name": "payload"},))
     assert "--effects FILES-GIVEN-AS-KNOWN " in report(known, {}, folder)
     assert "known from the start: payload" in report(known, {}, folder)
+    assert "/result.json' --effects FILES-GIVEN-AS-KNOWN\n" in unescape(report(known, {}, folder)).replace("</pre>", "\n")
 
 
 @pytest.mark.parametrize(

@@ -342,19 +342,19 @@ def _use(analysis: Analysis, folder: Path) -> str:
     if analysis.verdict in (BAD_DATA, NOT_EXCITED):
         return ""
     patch, result, data = (shlex.quote(str(path)) for path in (folder / PATCH_FILE, folder / RESULT_FILE, analysis.data))
-    parts = []
+    parts, known = [], "FILES-GIVEN-AS-KNOWN " if analysis.known_effects else ""
     if not patch_of(analysis).effects:
         parts.append("<p>There is no effect to add: the patch is empty.</p>")
     elif reason := _refusal(analysis):
         parts.append(f"<p>The patch says what was found. The robot's simulators cannot load it: {escape(reason)}.</p>")
     else:
-        effects = f"--effects {'FILES-GIVEN-AS-KNOWN ' if analysis.known_effects else ''}{patch}"
+        effects = f"--effects {known}{patch}"
         lines = [f"wlr effects check {patch}", f"wlr replay {data} --out replayed {effects}"]
         lines.append(f"wlr train WLR-Velocity-v0 {effects}")
         parts += [_PATCH, commands([line + _robot(analysis) for line in lines])]
     if _drawable(analysis):
         line = f"wlr train WLR-Velocity-v0 --set environment.randomization={result}"
-        parts += [_RESULT, commands([line + _robot(analysis)])]
+        parts += [_RESULT, commands([f"{line}{_robot(analysis)}{known and f' --effects {known}'.rstrip()}"])]
     return section("How to use the result", *parts)
 
 
@@ -367,7 +367,8 @@ def _robot(analysis: Analysis) -> str:
 _PATCH = """<p><code>patch.yaml</code> holds the effects, to be laid over the nominal model. Every command that simulates takes
 it: check it, replay the runs with it, train with it.</p>"""
 _RESULT = """<p>The patch does not hold the calibrated numbers. <code>result.json</code> holds these and the effects with their
-uncertainty: used as randomization (without <code>--effects</code>), every episode draws a robot that these data allow.</p>"""
+uncertainty: used as randomization (without the patch; known effects are not in it), every episode draws a robot that these data
+allow.</p>"""
 
 
 def _refusal(analysis: Analysis) -> str:
