@@ -23,7 +23,21 @@ def test_report_is_written(tmp_path, capsys):
     assert len(found["half_step"]) == 1
     names = {path.name for path in out.iterdir()}
     assert {"report.md", "config.yaml", "provenance.yaml", "none.png", "none_steps.png"} <= names
-    assert "| steps |" in (out / "report.md").read_text()
+    report = (out / "report.md").read_text()
+    assert "| steps |" in report
+    assert "| friction_along * |" in report
+    assert "| total_along |" in report
+    assert "own step of gibbs_appell, 1 ms | own step of gibbs_appell, 2 ms |" in report
+
+
+def test_figures_of_many_effects_have_names_that_a_file_system_takes(tmp_path):
+    out = tmp_path / "out"
+    slopes = []
+    for k in range(25):
+        (tmp_path / f"{k}.yaml").write_text("effects: [{name: floor_slope, parameters: {pitch: 0.001, roll: 0.0}}]")
+        slopes.append(str(tmp_path / f"{k}.yaml"))
+    assert main(["compare", "--out", str(out), *SELF, "--excitation", "steps", "--effects", *slopes]) == 0
+    assert len(list(out.glob("*.png"))) == 2
 
 
 def test_strict_fails_when_plants_disagree(tmp_path, monkeypatch):

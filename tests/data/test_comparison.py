@@ -119,6 +119,16 @@ def test_agreement_figures(monkeypatch, traces):
     assert stronger.broken == ("wheel_torque",)
 
 
+def test_a_robot_that_stands_keeps_the_bound_of_its_position(monkeypatch, traces):
+    truth = traces.truth.copy()
+    truth[:, :, TRUTH_LAYOUT.slices["position"]] = 0.3
+    stands = replace(traces, truth=truth)
+    found = case_of(monkeypatch, stands, changed(stands, "truth", "position[x]", 1e-9)).agreement
+    assert found.travel == 0.0
+    assert found.position == pytest.approx(1e-6)  # over one noise unit of the camera, 1 mm
+    assert not found.broken
+
+
 def test_headings_half_a_turn_around_are_neighbours(monkeypatch, traces):
     quaternion = TRUTH_LAYOUT.slices["quaternion"]
 
@@ -206,6 +216,7 @@ def test_plants_by_name():
     ("text", "words"),
     [
         ("gibs_appell", "did you mean 'gibbs_appell'"),
+        ("dynamixel", "unknown simulator 'dynamixel'.*valid: gibbs_appell, mujoco"),
         ("gibbs_appell:step=0.1", "unknown option 'step'"),
         ("gibbs_appell:physics_step=fast", "physics_step = 'fast'"),
         ("gibbs_appell:physics_step=0.0007", "does not divide"),

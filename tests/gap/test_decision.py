@@ -322,6 +322,15 @@ def test_it_goes_on_after_an_interruption_with_the_run_that_was_driven(data, tmp
     assert found.history.rounds[0].seconds == pytest.approx(0.98)
 
 
+@pytest.mark.parametrize("mended", ["run_01.parquet", "meta.yaml"])
+def test_data_that_were_mended_are_analysed_again(data, tmp_path, answers, mended):
+    answers["results"] = [result(*UNDECIDED), result(*CERTAIN)]
+    decide(data, tmp_path / "out", record, Budget(runs=1))
+    path = data / mended
+    path.write_bytes(path.read_bytes())
+    assert decide(data, tmp_path / "out", record, Budget(runs=1)).history.ended == "decided"
+
+
 def test_a_drive_that_leaves_nothing_ends_it(data, tmp_path, answers):
     found = decide(data, tmp_path / "out", lambda motion, folder: Recorded(None, "a leg is too warm"))
     assert (found.history.ended, found.history.rounds[-1].stopped) == ("stopped", "a leg is too warm")

@@ -119,6 +119,9 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
         (["--effects", "nothing_like_it"], "--effects: unknown effects config 'nothing_like_it'"),
         (["--effects", "knwon.yaml"], "--effects: effects config: no file 'knwon.yaml'"),
         (["--rig", "pendulum", "--effects", "icy_patch"], "unknown effect of the test rig 'friction_patch'"),
+        (["--budget-runs", "2"], "--budget-runs: it is for --until-decided"),
+        (["--record", "emulated"], "--record: it is for --until-decided"),
+        (["--hidden", "stiff_leg"], "--hidden: it is for --until-decided"),
         (["--heldout", "run_99"], "unknown run to hold out"),
     ],
 )

@@ -43,6 +43,18 @@ def test_channel_with_the_gap_comes_first_and_says_where():
     assert row[0] == pytest.approx(1.0, abs=0.15)
 
 
+def test_a_range_without_data_is_not_where_the_error_is_smallest():
+    problem = Toy(runs=RUNS, rows=400)
+    residuals = white(problem)
+    gains = [np.repeat([100.0, 200.0, 400.0, 800.0], 100)] * RUNS
+    for residual in residuals:
+        residual[:, 2] += np.where(gains[0] > 300.0, 6.0, 0.0)
+    places, _ = localise(problem, residuals, np.ones(3), estimate_noise(residuals), [{"gain": gain} for gain in gains])
+    smallest = places[0].dependence.partition("smallest ")[2]
+    assert smallest.startswith(("100 to ", "200 to "))
+    assert float(smallest.rpartition("(")[2].rstrip(")")) == pytest.approx(1.0, abs=0.1)
+
+
 def test_heat_map_is_the_root_mean_square_in_each_bin():
     problem = Toy(runs=RUNS, rows=300)
     residuals = white(problem, 3, 3.0)

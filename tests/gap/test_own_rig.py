@@ -1,6 +1,7 @@
 """A system of one's own: the linear axis of the examples."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import pytest
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.estimation.likelihood import level, mean_squares
+from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting
 from wlr_gym.gap.rig.own import check_rig, load_rig
 from wlr_gym.gap.rig.own_kernel import CompiledRig
 from wlr_gym.gap.rig.own_problem import OwnRigProblem, open_own_rig, own_patch
@@ -84,9 +86,43 @@ def test_a_model_replays_its_own_runs_to_the_noise(runs):
     assert 0.8 < np.sqrt(np.nanmean(made[0][0][:, 0] ** 2)) < 1.5, "first states are taken out"
 
 
+def falling(x, u, p):
+    return x.rate, p.fall * x.angle + u.push
+
+
+def test_an_unstable_system_has_the_noise_floor_of_its_windows(tmp_path):
+    """Held upright by feedback that the model does not know: from the first row on it would fall."""
+    rig = dataclasses.replace(
+        AXIS,
+        change=falling,
+        readings=lambda x, u, p: (x.angle,),
+        states={"angle": "angle", "rate": "rate of angle"},
+        inputs={"push": "rad/s2"},
+        columns=(MeasuredSignal("angle", "rad", 5e-4, "angle"),),
+        parameters=(Quantity("fall", "1/s2", 30.0, 1.0, 10.0, 60.0),),
+    )
+    for k in range(3):
+        rng, angle, rate, rows = np.random.default_rng(k), 0.02, 0.0, []
+        for t in 0.01 * np.arange(600):
+            push = -60.0 * (angle - 0.05 * np.sin(3.0 * t + k)) - 10.0 * rate
+            rows.append((t, push, angle + 5e-4 * rng.standard_normal()))
+            for _ in range(50):
+                rate += 2e-4 * (32.0 * angle + push)
+                angle += 2e-4 * rate
+        pd.DataFrame(rows, columns=["t", "push", "angle"]).to_csv(tmp_path / f"run_{k}.csv", index=False)
+    problem, _ = open_own_rig(tmp_path, rig)
+    assert isinstance(problem, OwnRigProblem)
+    true = Setting(np.array([32.0]))
+    left = level(mean_squares([residual[0] for residual in problem.residuals([true], range(3))], problem.cap))
+    made = level(mean_squares(next(problem.remade(true, range(3), 1)), problem.cap))
+    assert 0.5 * left < made < 1.5 * left
+
+
 def test_two_runs_are_too_few(tmp_path):
     AXIS_FILE.record(tmp_path, runs=2)
     done = analyse(tmp_path, rig=str(FILE))
+    with pytest.raises(InputError, match=r"threads = 0: expected 1 or more"):
+        analyse(tmp_path, rig=FILE, threads=0)
     assert (done.verdict, done.intake[0].kind) == ("bad_data", "few_runs")
 
 
@@ -98,6 +134,10 @@ def test_two_runs_are_too_few(tmp_path):
         (lambda table: table.assign(current=np.nan), r"column 'current', row 0: expected a finite number"),
         (lambda table: table.assign(t=table["t"].to_numpy()[::-1]), r"column 't', row 1: expected times that rise"),
         (lambda table: table.assign(position=np.nan), r"column 'position' holds no number"),
+        (
+            lambda table: table.assign(position=table["position"].where(table.index != 7, -np.inf)),
+            r"column 'position', row 7: infinite",
+        ),
         (lambda table: table[:5], r"5 rows: expected 20 or more"),
     ],
 )
@@ -113,6 +153,31 @@ def test_one_run_in_two_formats_is_not_two(runs, tmp_path):
     table.to_parquet(tmp_path / "run_01.parquet")
     with pytest.raises(InputError, match=r"run_01\.csv and run_01\.parquet are the same run"):
         read_rig_runs(tmp_path, AXIS)
+
+
+def test_a_law_under_a_name_of_the_library_keeps_its_own_units(tmp_path):
+    text = FILE.read_text().replace('"viscous_friction"', '"viscous"').replace("asymmetric_friction", "coulomb_friction")
+    path = tmp_path / "axis.py"
+    path.write_text(text.replace('{"difference": ', '{"torque": ').replace("p.difference", "p.torque"))
+    AXIS_FILE.record(tmp_path, runs=3)
+    done = analyse(tmp_path, tmp_path / "out", rig=path)
+    assert [(one.name, one.parameters["torque"].unit) for one in done.effects] == [("coulomb_friction", "N")]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert re.search(r"torque [\d.]+ N<", page)
+    assert re.search(r"cogging [\d.]+ N, phase [-\d.]+ rad", page)
+
+
+def test_a_run_under_two_names_is_refused(runs, tmp_path):
+    for name, copied in {"run_01": "run_01", "run_02": "run_02", "run_03": "run_01"}.items():
+        (tmp_path / f"{name}.csv").write_bytes((runs / f"{copied}.csv").read_bytes())
+    with pytest.raises(InputError, match=r"run_01 and run_03 are the same run"):
+        analyse(tmp_path, rig=FILE)
+
+
+def test_the_case_of_a_files_ending_loses_no_run(runs, tmp_path):
+    for name in ("run_01.csv", "run_02.CSV"):
+        (tmp_path / name).write_bytes((runs / name.lower()).read_bytes())
+    assert [run.name for run in read_rig_runs(tmp_path, AXIS)] == ["run_01", "run_02"]
 
 
 def test_a_candidate_has_the_meaning_of_its_own_law(runs):
@@ -136,6 +201,16 @@ def without_sigma():
         ({"parameters": without_sigma()}, r"parameters: mass: sigma = 0\.0: expected a number above 0"),
         ({"parameters": AXIS.parameters * 2}, r"parameters and laws = 'mass': expected every name once"),
         ({"windows": ()}, r"windows = \(\): expected lengths above 0"),
+        ({"windows": 0.5}, r"windows = 0\.5: expected a tuple of lengths"),
+        ({"columns": AXIS.columns[0]}, r"columns = MeasuredSignal\(.*: expected a tuple of MeasuredSignal"),
+        ({"inputs": ["current"]}, r"inputs = \['current'\]: expected a mapping from names to units"),
+        ({"inputs": {"lambda": "m"}}, r"inputs = 'lambda': expected a name"),
+        ({"inputs": {"_current": "A"}}, r"inputs = '_current': expected a name"),
+        ({"disagreement": "much"}, r"disagreement = 'much': expected a number of 0 or more"),
+        (
+            {"columns": (dataclasses.replace(AXIS.columns[0], noise=None),)},
+            r"position: noise = None: expected a number above 0",
+        ),
         ({"step": 0.0}, r"step = 0\.0: expected a number above 0"),
     ],
 )
@@ -146,7 +221,12 @@ def test_rigs_that_contradict_themselves_are_refused(changes, message):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "no such file"), ("1 / 0", "does not run: ZeroDivisionError"), ("RIG = 3", r"RIG = 3: expected")],
+    [
+        (None, "no such file"),
+        ("1 / 0", "does not run: ZeroDivisionError"),
+        ("RIG = 3", r"RIG = 3: expected"),
+        ("raise SystemExit(3)", "does not run: SystemExit: 3"),
+    ],
 )
 def test_files_that_are_no_rig_are_refused(tmp_path, text, message):
     path = tmp_path / "rig.py"
@@ -158,7 +238,9 @@ def test_files_that_are_no_rig_are_refused(tmp_path, text, message):
 
 def test_equations_that_cannot_be_compiled_are_named(runs):
     broken = dataclasses.replace(AXIS, change=lambda x, u, p: (x.no_such_state, 0.0))
-    with pytest.raises(InputError, match=r"rig 'axis': change or readings cannot be compiled: .*no_such_state"):
+    with pytest.raises(
+        InputError, match=r"rig 'axis': change \(2 rates\) or readings \(1 columns\) cannot be compiled: .*no_such_state"
+    ):
         open_own_rig(runs, broken)
 
 

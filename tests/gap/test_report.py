@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
+from pathlib import Path
 
 import gap_examples as examples
 import numpy as np
@@ -27,6 +28,7 @@ from wlr_gym.gap.analysis import (
     Place,
     Threshold,
 )
+from wlr_gym.gap.opened import named_robot
 from wlr_gym.gap.report import folder
 from wlr_gym.gap.report.folder import check_folder, save_analysis
 from wlr_gym.gap.report.page import report
@@ -162,7 +164,7 @@ def test_every_candidate_is_shown_with_why_it_lost(tmp_path):
             assert all(row[7] == one.reason for row in mine)
             assert [number(one.gain), number(one.screened)] in [row[3:5] for row in mine if row[1] == places(one.where)]
     backlash = next(row for row in page.rows if row[0] == "backlash")
-    assert backlash[1] == "left front leg; less at 7 other places"
+    assert backlash[1] == "left front leg"
     assert [row[6] for row in page.rows if "5312" in row] == ["selected"]
     selected = [value for tag, name, value in page.attributes if (tag, name) == ("tr", "class") and value == "selected"]
     assert len(selected) == 1
@@ -214,6 +216,29 @@ def test_commands_can_be_typed(tmp_path):
     known = replace(examples.EFFECT_FOUND, known_effects=({"name": "payload"},))
     assert "--effects FILES-GIVEN-AS-KNOWN " in report(known, {}, folder)
     assert "known from the start: payload" in report(known, {}, folder)
+    assert "/result.json' --effects FILES-GIVEN-AS-KNOWN\n" in unescape(report(known, {}, folder)).replace("</pre>", "\n")
+
+
+@pytest.mark.parametrize(
+    ("meta", "option", "named", "shown"),
+    [
+        ("", None, None, ""),
+        ("robot: wlr-nominal", None, "nominal", ""),
+        ("robot: wlr-flow", None, "flow", " --robot flow"),
+        ("robot: robot.yaml", None, "{}/robot.yaml", " --robot '{}/robot.yaml'"),
+        ("robot: wlr-flow", "mine.yaml", "mine.yaml", " --robot mine.yaml"),
+    ],
+)
+def test_commands_name_the_robot_that_was_analysed(tmp_path, meta, option, named, shown):
+    folder = tmp_path / "my runs"
+    folder.mkdir()
+    (folder / "meta.yaml").write_text(meta)
+    found = named_robot(folder, None, option)
+    assert found == (named and named.format(folder))
+    provenance = {} if found is None else {"robot": found}
+    page = unescape(report(replace(examples.EFFECT_FOUND, provenance=provenance), {}, Path("out")))
+    for line in ("wlr train WLR-Velocity-v0 --effects out/patch.yaml", "wlr record --excitation straight --out new_runs"):
+        assert f"{line}{shown.format(folder)}\n" in f"{page}\n".replace("</pre>", "\n")
 
 
 def test_a_patch_that_cannot_be_loaded_is_not_advertised(tmp_path):
@@ -297,6 +322,8 @@ def test_sentences_say_what_was_found():
     assert "it does not measurably change the error of the held-out runs: -2 % (95 % interval -7 to 2 %);" in sentence(alike)
     no_room = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=float("nan")))
     assert "; the error of the held-out runs is as small without it;" in sentence(no_room)
+    unknown = replace(no_room, gap=replace(no_room.gap, noise_floor=float("nan")))
+    assert "; added, it changes the error of the held-out runs from 5.24 to 1.21;" in sentence(unknown)
     two = (*examples.EFFECT_FOUND.effects, FoundEffect("payload", ("body",), {}, 0.9, 300.0))
     assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=())).startswith(
         "The model lacks 2 effects: rolling resistance (both front wheels) and payload (body); added, they remove 95 %"

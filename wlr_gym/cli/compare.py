@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: Share of the time that driving takes, about; drawing takes the rest.
 _DRIVES = 0.7
+#: Letters of the effects in a figure's file name, the last ones: file systems take 255 in all.
+_LONGEST_LABEL = 120
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ def _compare_all(
 def _draw(found: Comparison, out: Path, tell: Callable[[str, float], None]) -> None:
     from wlr_gym.data.comparison_report import save_map, save_motion_plot
 
-    label = re.sub(r"[^\w]+", "_", found.effects)
+    label = re.sub(r"[^\w]+", "_", found.effects)[-_LONGEST_LABEL:]
     for index, motion in enumerate(found.motions):
         tell("drawing", index / len(found.motions))
         save_motion_plot(found, index, out / f"{label}_{motion.name}.png")

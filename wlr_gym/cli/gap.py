@@ -11,7 +11,7 @@ import json
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -150,8 +150,9 @@ def _check(options: GapOptions) -> None:
             raise InputError(f"--effects {name}: the results would replace it: give another --out")
     if options.until_decided and (options.rig is not None or options.heldout):
         raise InputError("--until-decided: runs of the robot, held out anew in every round: leave --rig and --heldout out")
-    if options.hidden and not options.until_decided:
-        raise InputError("--hidden: it is for --until-decided with --record emulated or simulator")
+    given = [one.name for one in fields(DecideOptions) if getattr(options, one.name) != one.default]
+    if given and not options.until_decided:
+        raise InputError(f"--{given[0].replace('_', '-')}: it is for --until-decided")
     if options.threads is not None and options.threads < 1:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
 

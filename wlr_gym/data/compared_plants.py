@@ -15,7 +15,7 @@ from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import standing_at
 from wlr_gym.physics.effects import Patch, apply_patch
-from wlr_gym.physics.plants import check_backend, make_plant
+from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, Sensors, Truth
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -33,7 +33,7 @@ class ComparedPlant:
     """A plant and the numerical options it is run with.
 
     Attributes:
-        backend: of :data:`wlr_gym.physics.plants.BACKENDS`.
+        backend: of :data:`wlr_gym.physics.plants.SIMULATORS`.
         physics_step: s.
         precision: ``float64`` or ``float32``.
     """
@@ -58,10 +58,11 @@ def parse_plant(text: str, physics_step: float = 0.001) -> ComparedPlant:
     """Read ``BACKEND`` or ``BACKEND:option=value,...`` with the options ``physics_step`` (s) and ``precision``.
 
     Raises:
-        InputError: unknown backend or option, a step that does not divide the control period, an unknown precision.
+        InputError: unknown simulator or option, a step that does not divide the control period, an unknown precision.
     """
     backend, _, options = text.partition(":")
-    check_backend(backend)
+    if backend not in SIMULATORS:  # a real robot has no truth to compare, and none of the guards of wlr record here
+        raise unknown_name("simulator", backend, SIMULATORS, f"plant '{text}'")
     plant = ComparedPlant(backend, physics_step)
     for option in filter(None, options.split(",")):
         name, _, value = option.partition("=")

@@ -63,7 +63,7 @@ class Agreement:
 
     Attributes:
         travel: m; path of the body origin up to the horizon. apart: m; distance of the positions there.
-        position: apart/travel. yaw: rad.
+        position: apart over travel, or over one noise unit where the robot hardly moves. yaw: rad.
         leg_torque, wheel_torque: rms difference of the motors' torques over their own rms, or over the nominal dry friction of
             their gears where they stay below it: motors that hardly work have nothing to agree on.
     """
@@ -233,7 +233,7 @@ def _agreement(motion: Motion, k: int, a: Traces, b: Traces, signals: Mapping[st
     for kind in ("leg", "wheel"):
         own, other = (traces.signals[f"motor_torque_{kind}"][:rows, k] for traces in (a, b))
         torque[f"{kind}_torque"] = _ratio(_rms(other - own), max(_rms(own), getattr(robot.servo, kind).coulomb_friction))
-    return Agreement(travel, apart, _ratio(apart, travel), yaw, **torque)
+    return Agreement(travel, apart, apart / max(travel, signals["true_xy"].resolution), yaw, **torque)
 
 
 def _ratio(a: float, b: float) -> float:

@@ -48,7 +48,7 @@ def tables(comparison: Comparison) -> list[ReportTable]:
         found.append(agreement_table("The same at half of both steps", [(case.motion, case) for case in comparison.half]))
     rows = [
         (
-            name,
+            _starred(comparison, name),
             signal.unit,
             f"{signal.resolution:.2g}",
             *(_noise(case.differences[name].rms_in_noise) for case in comparison.cases),
@@ -117,10 +117,15 @@ def _convergence_table(
         return _noise(float(np.sqrt(np.mean([case.differences[name].rms_in_noise ** 2 for case in cases]))))
 
     sets = (comparison.cases, half, first, second)
-    labels = [traces.plant.backend for traces in (comparison.first, comparison.second)]
-    headings = ("signal", "apart", "at half the steps", *(f"{label}'s own step" for label in labels))
-    rows = tuple((name, *(pooled(cases, name) for cases in sets)) for name in comparison.signals)
+    labels = [traces.plant.label for traces in (comparison.first, comparison.second)]
+    headings = ("signal", "apart", "at half the steps", *(f"own step of {label}" for label in labels))
+    rows = tuple((_starred(comparison, name), *(pooled(cases, name) for cases in sets)) for name in comparison.signals)
     return ReportTable("Does it shrink with the step? All motions, rms in units of sensor noise", headings, rows)
+
+
+def _starred(comparison: Comparison, name: str) -> str:
+    """Name of a signal; with a star where rigid bodies do not determine it."""
+    return f"{name} *" if comparison.signals[name].shared else name
 
 
 def _noise(value: float) -> str:
@@ -194,7 +199,7 @@ def save_map(comparison: Comparison, path: Path) -> Path:
     axes.set_xticks(
         range(len(comparison.cases)), [case.motion for case in comparison.cases], rotation=40, ha="right", fontsize=9
     )
-    axes.set_yticks(range(len(names)), names, fontsize=9)
+    axes.set_yticks(range(len(names)), [_starred(comparison, name) for name in names], fontsize=9)
     for row, column in np.ndindex(*values.shape):
         size = float(values[row, column])
         colour = "black" if 0.1 < size < 30.0 else "white"

@@ -111,7 +111,7 @@ class Evidence:
         reason: of the outcome, one sentence.
         by_run: fall of the weighted squares per fit run; empty where it was only screened.
         probability: of this candidate among all that were refitted and none of them; 0 where it was only screened.
-        formula, units: of an unknown effect; empty otherwise.
+        formula: of an unknown effect; empty otherwise. units: of values, where the library's effect of this name has none.
     """
 
     round: int

@@ -14,6 +14,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import check_same_request, resumes, write_json
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.excitations import Motion
+from wlr_gym.data.format import META_FILE
 from wlr_gym.data.read import read_meta, read_run, run_files
 from wlr_gym.data.replay import robot_of
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
@@ -215,7 +216,7 @@ def _analysed(
     if len(runs) < LEAST_RUNS:
         return now, None, ()
     folder = asked.folder(now)
-    if last is None or last.runs != runs or not (folder / RESULT_FILE).is_file():
+    if last is None or last.runs != runs or not _is_current(folder / RESULT_FILE, asked.data):
         analyse(
             asked.data,
             folder,
@@ -230,6 +231,12 @@ def _analysed(
     now = now.model_copy(update={"verdict": result.verdict, "names": {one.name: one.probability for one in left}})
     _saved(asked, history, now)
     return now, result, left
+
+
+def _is_current(result: Path, data: Path) -> bool:
+    """Whether a result is there, and newer than runs and meta data: those may have been mended since."""
+    read = [path for path in (*run_files(data), data / META_FILE) if path.exists()]
+    return result.is_file() and result.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in read)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ OWN_RIG = ".py"
 
 
 def open_problem(
-    data: str | Path, known: Source, rig: str | None, backend: str, threads: int, robot: str | Path | None
+    data: str | Path, known: Source, rig: str | Path | None, backend: str, threads: int, robot: str | Path | None
 ) -> tuple[Patch, Problem | None, list[IntakeFinding]]:
     """Return what is known already, the problem (None where the data are too bad to go on), and what was noticed.
 
@@ -37,7 +37,20 @@ def open_problem(
     return patch, *open_own_rig(data, load_rig(rig), patch.effects)
 
 
-def known_patch(known: Source, rig: str | None) -> Patch:
+def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | None) -> str | None:
+    """Return what ``--robot`` takes for the robot that is analysed; None = nothing names it, or it is a rig."""
+    from wlr_gym.data.read import read_meta
+    from wlr_gym.data.robot_file import names_file, shipped_robots
+
+    if rig is not None or robot is not None:
+        return None if rig is not None else str(robot)
+    named = read_meta(data).robot
+    if named is None or names_file(named):
+        return None if named is None else str(Path(data) / named)
+    return shipped_robots()[named].stem
+
+
+def known_patch(known: Source, rig: str | Path | None) -> Patch:
     """Return the effects given as known, in the vocabulary of the robot or of the rig.
 
     Raises:
@@ -49,8 +62,8 @@ def known_patch(known: Source, rig: str | None) -> Patch:
         from wlr_gym.gap.rig.open import rig_patch
 
         return rig_patch(known)
-    if not rig.endswith(OWN_RIG):
-        raise unknown_name("rig", rig, RIGS)
+    if Path(rig).suffix != OWN_RIG:
+        raise unknown_name("rig", str(rig), RIGS)
     from wlr_gym.gap.rig.own import load_rig
     from wlr_gym.gap.rig.own_problem import own_patch
 

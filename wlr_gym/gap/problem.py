@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.physics.effects import PatchEffect
+from wlr_gym.physics.effects import EFFECTS, EffectParameter, PatchEffect
 
 Array = NDArray[np.float64]
 
@@ -154,6 +154,11 @@ class Candidate:
     def law(self) -> str:
         """What tells it from other effects, wherever they act: its name, and the formula of one without a name."""
         return self.name + self.formula
+
+    @property
+    def vocabulary(self) -> Mapping[str, EffectParameter]:
+        """The parameters of the library's effect of this name; none where it is not meant."""
+        return EFFECTS[self.name].parameters if self.name in EFFECTS and not self.doc else {}
 
     def kept(self, values: Sequence[float]) -> tuple[float, ...]:
         """Return the values brought into the plausible range."""

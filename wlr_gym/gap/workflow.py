@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Container, Mapping, Sequence
@@ -33,7 +34,7 @@ from wlr_gym.gap.estimation.fit import Fit, fit, widened
 from wlr_gym.gap.estimation.likelihood import mean_of_runs, mean_squares
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
-from wlr_gym.gap.opened import open_problem
+from wlr_gym.gap.opened import named_robot, open_problem
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
@@ -73,7 +74,7 @@ def analyse(
     out: str | Path | None = None,
     *,
     known: Source = None,
-    rig: str | None = None,
+    rig: str | Path | None = None,
     robot: str | Path | None = None,
     backend: str = "gibbs_appell",
     heldout: Sequence[str] = (),
@@ -95,9 +96,11 @@ def analyse(
         tell: called with progress.
 
     Raises:
-        InputError: data that cannot be read, a run, rig or backend that does not exist, a folder that the results cannot go
-            into; the last before the work begins.
+        InputError: data that cannot be read, a run twice, a run, rig or backend that does not exist, a folder that the results
+            cannot go into; the last before the work begins.
     """
+    if threads < 1:
+        raise InputError(f"threads = {threads}: expected 1 or more")
     if out is not None:
         from wlr_gym.gap.report.folder import check_folder
 
@@ -107,11 +110,15 @@ def analyse(
     for finding in _first_of_every_run(findings):
         tell(f"left out {finding.place}: {finding.said}", STAGES["reading"])
     _refuse_left_out(heldout, findings)
+    if problem is not None:
+        _refuse_copies(problem, data)
     done = (
         _bad_data(str(data), findings)
         if problem is None
         else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
     )
+    if named := named_robot(data, rig, robot):
+        done = replace(done, provenance={**done.provenance, "robot": named})
     if out is not None:
         from wlr_gym.gap.report.folder import save_analysis
 
@@ -134,6 +141,15 @@ def _refuse_left_out(heldout: Sequence[str], findings: Sequence[IntakeFinding]) 
     for finding in findings:
         if finding.fatal and finding.run in heldout:
             raise InputError(f"--heldout {finding.run}: the run cannot be used: {finding.place}: {finding.said}")
+
+
+def _refuse_copies(problem: Problem, data: str | Path) -> None:
+    """A run under two names would count twice, and could be fitted and held out."""
+    readings = [(problem.times(k), problem.measured(k)) for k in range(len(problem.runs))]
+    for one, two in itertools.combinations(range(len(readings)), 2):
+        if all(np.array_equal(*pair, equal_nan=True) for pair in zip(readings[one], readings[two], strict=True)):
+            names = f"{problem.runs[one]} and {problem.runs[two]}"
+            raise InputError(f"{data}: {names} are the same run, reading by reading; keep one of them")
 
 
 def _bad_data(data: str, findings: Sequence[IntakeFinding]) -> Analysis:

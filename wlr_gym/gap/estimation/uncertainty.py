@@ -11,7 +11,6 @@ from wlr_gym.gap.estimation.fit import PINNED, Fit
 from wlr_gym.gap.estimation.least_squares import equations_by_run
 from wlr_gym.gap.estimation.model import on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.physics.effects import EFFECTS
 
 Array = NDArray[np.float64]
 
@@ -103,8 +102,7 @@ def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[
         for name in here:
             slopes[name][k] = (beside[name] - here[name]) / step
     units = {unknown.name: unknown.unit for unknown in candidate.unknowns}
-    if candidate.name in EFFECTS:
-        units |= {name: spec.unit for name, spec in EFFECTS[candidate.name].parameters.items()}
+    units |= {name: spec.unit for name, spec in candidate.vocabulary.items()}
     found = {}
     for name, value in here.items():
         half = TWO_SIDED_95 * float(np.sqrt(max(slopes[name] @ spread @ slopes[name], 0.0)))

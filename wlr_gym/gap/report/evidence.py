@@ -70,11 +70,13 @@ def _evidence(evidence: Sequence[Evidence], turn: int, none: float) -> str:
         )
         for one in fitted
     ]  # fmt: skip
-    rejected = [_rejected(alike) for alike in _by_name([one for one in evidence if one.outcome == REJECTED])]
+    screened = [one for one in evidence if one.outcome == REJECTED]
+    screened.sort(key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
+    rejected = [(plain(one.name), places(one.where), number(max(one.screened, 0.0)), one.reason) for one in screened]
     classes = ["selected" if one.outcome == SELECTED else "" for one in fitted]
     return "\n".join(
         [
-            heading(f"Round {turn}: {counted(len(evidence), 'candidate')} compared"),
+            heading(f"Round {turn}: {counted(len(fitted), 'candidate')} refitted"),
             table(
                 ("candidate", "where", "values", "gain", "predicted", "probability", "outcome", "reason"),
                 rows,
@@ -84,7 +86,7 @@ def _evidence(evidence: Sequence[Evidence], turn: int, none: float) -> str:
             f"<p>Probability that none of them is missing: {percent(none)}.</p>" if math.isfinite(none) else "",
             folded(
                 f"{counted(len(rejected), 'effect')} rejected at screening",
-                table(("effect", "where", "predicted", "reason"), rejected, {2}),
+                table(("effect", "where it would gain most", "predicted", "reason"), rejected, {2}),
             ),
         ]
     )
@@ -95,19 +97,7 @@ def _rank(one: Evidence) -> tuple[bool, float]:
     return one.outcome != SELECTED, -one.gain if math.isfinite(one.gain) else math.inf
 
 
-def _by_name(evidence: Sequence[Evidence]) -> list[list[Evidence]]:
-    """Put the places of an effect together, the largest predicted improvement first."""
-    ordered = sorted(evidence, key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
-    return [[one for one in ordered if one.name == name] for name in dict.fromkeys(one.name for one in ordered)]
-
-
-def _rejected(alike: Sequence[Evidence]) -> tuple[str, ...]:
-    best, others = alike[0], len(alike) - 1
-    more = f"; less at {counted(others, 'other place')}" if others else ""
-    return plain(best.name), f"{places(best.where)}{more}", number(max(best.screened, 0.0)), best.reason
-
-
 def _values(one: Evidence) -> str:
     known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
-    units = {name: unit_of(known[name].unit) if name in known else "" for name in one.values}
-    return ", ".join(f"{name} {number(value)}{units[name]}" for name, value in one.values.items())
+    units = {name: spec.unit for name, spec in known.items()} | dict(one.units)
+    return ", ".join(f"{name} {number(value)}{unit_of(units.get(name, ''))}" for name, value in one.values.items())

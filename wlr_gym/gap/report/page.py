@@ -59,6 +59,8 @@ _COLOURS = {
     BAD_DATA: "#b03030", NOT_EXCITED: "#8a6d00", NOTHING_MISSING: "#2e7d32", EFFECT_FOUND: "#1f4e9c", UNKNOWN: "#7b3fa0",
 }  # fmt: skip
 
+#: Name of the robot of commands without ``--robot``.
+NOMINAL = "nominal"
 #: Tolerances by which a calibrated number must have moved to be shown at once.
 _FAR = 0.5
 CAPTIONS = {
@@ -275,7 +277,7 @@ def _next(analysis: Analysis) -> str:
         known = [name for name in dict.fromkeys(one.excitation for one in analysis.recommendations) if name in EXCITATIONS]
         if known:
             parts.append("<p>Drive them on the robot, or write their command files with <code>--commands-only</code>:</p>")
-            parts.append(commands(record_commands(known)))
+            parts.append(commands([line + _robot(analysis) for line in record_commands(known)]))
     named = [(one.separating_run, listed([plain(name) for name in one.names], "from")) for one in analysis.equivalent]
     items = [f"<li>{escape(run)}: distinguishes {escape(names)}.</li>" for run, names in named if run]
     return section("What to run next", *parts, f"<ul>{''.join(items)}</ul>" if items else "")
@@ -340,24 +342,33 @@ def _use(analysis: Analysis, folder: Path) -> str:
     if analysis.verdict in (BAD_DATA, NOT_EXCITED):
         return ""
     patch, result, data = (shlex.quote(str(path)) for path in (folder / PATCH_FILE, folder / RESULT_FILE, analysis.data))
-    parts = []
+    parts, known = [], "FILES-GIVEN-AS-KNOWN " if analysis.known_effects else ""
     if not patch_of(analysis).effects:
         parts.append("<p>There is no effect to add: the patch is empty.</p>")
     elif reason := _refusal(analysis):
         parts.append(f"<p>The patch says what was found. The robot's simulators cannot load it: {escape(reason)}.</p>")
     else:
-        effects = f"--effects {'FILES-GIVEN-AS-KNOWN ' if analysis.known_effects else ''}{patch}"
+        effects = f"--effects {known}{patch}"
         lines = [f"wlr effects check {patch}", f"wlr replay {data} --out replayed {effects}"]
-        parts += [_PATCH, commands([*lines, f"wlr train WLR-Velocity-v0 {effects}"])]
+        lines.append(f"wlr train WLR-Velocity-v0 {effects}")
+        parts += [_PATCH, commands([line + _robot(analysis) for line in lines])]
     if _drawable(analysis):
-        parts += [_RESULT, commands([f"wlr train WLR-Velocity-v0 --set environment.randomization={result}"])]
+        line = f"wlr train WLR-Velocity-v0 --set environment.randomization={result}"
+        parts += [_RESULT, commands([f"{line}{_robot(analysis)}{known and f' --effects {known}'.rstrip()}"])]
     return section("How to use the result", *parts)
+
+
+def _robot(analysis: Analysis) -> str:
+    """The option that names the robot, where it is not the nominal one."""
+    robot = analysis.provenance.get("robot", NOMINAL)
+    return "" if robot == NOMINAL else f" --robot {shlex.quote(str(robot))}"
 
 
 _PATCH = """<p><code>patch.yaml</code> holds the effects, to be laid over the nominal model. Every command that simulates takes
 it: check it, replay the runs with it, train with it.</p>"""
 _RESULT = """<p>The patch does not hold the calibrated numbers. <code>result.json</code> holds these and the effects with their
-uncertainty: used as randomization (without <code>--effects</code>), every episode draws a robot that these data allow.</p>"""
+uncertainty: used as randomization (without the patch; known effects are not in it), every episode draws a robot that these data
+allow.</p>"""
 
 
 def _refusal(analysis: Analysis) -> str:

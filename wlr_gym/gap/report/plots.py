@@ -162,8 +162,7 @@ def _evidence(evidence: Sequence[Evidence]) -> Figure:
     panels = figure.subplots(len(rounds), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, turn, members in zip(panels, rounds, shown, strict=True):
         _draw_round(axes, members)
-        total = sum(one.round == turn for one in evidence)
-        part = f": the strongest of {total} candidates" if total > len(members) else ""
+        part = ": the strongest candidates" if sum(one.round == turn for one in evidence) > len(members) else ""
         axes.set_title(f"Round {turn}{part}", fontsize=10, loc="left")
         axes.set_xlabel("gain: improvement of the fit (fall of -2 log posterior)", fontsize=9)
     labels = (

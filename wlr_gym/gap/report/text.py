@@ -336,6 +336,11 @@ def _improvement(analysis: Analysis) -> str:
     if analysis.gap is None or not analysis.added:
         return ""
     share, one = analysis.gap.reduction, len(analysis.added) == 1
+    if not math.isfinite(analysis.gap.noise_floor):
+        errors = (
+            f"{capped(analysis.gap.heldout_calibrated, analysis.gap)} to {capped(analysis.gap.heldout_after, analysis.gap)}"
+        )
+        return f"; added, {'it changes' if one else 'they change'} the error of the held-out runs from {errors}"
     if not math.isfinite(share):
         return "; the error of the held-out runs is as small without it"
     if share < 0.0 <= analysis.gap.reduction_ci95[1]:

@@ -6,6 +6,7 @@ The file defines ``RIG``, a :class:`Rig`; docs/own_rig.md goes through one, and 
 from __future__ import annotations
 
 import importlib.util
+import keyword
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,17 @@ class RigLaw:
 
     doc: str
     parameters: Mapping[str, EffectParameter]
+
+
+#: Field of a rig -> what it is, what it holds, and both in words.
+_KINDS: Mapping[str, tuple[type, Any, str]] = {
+    "states": (Mapping, str, "a mapping from names to texts"),
+    "inputs": (Mapping, str, "a mapping from names to units"),
+    "laws": (Mapping, RigLaw, "a mapping from names to RigLaw"),
+    "columns": (Sequence, MeasuredSignal, "a tuple of MeasuredSignal"),
+    "parameters": (Sequence, Quantity, "a tuple of Quantity"),
+    "windows": (Sequence, float | int, "a tuple of lengths in s"),
+}
 
 
 @dataclass(frozen=True)
@@ -95,7 +107,7 @@ def load_rig(path: str | Path) -> Rig:
     sys.modules[spec.name] = module  # dataclasses and pickles of the file look themselves up
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"{path}: does not run: {type(error).__name__}: {error}") from error
     rig = getattr(module, "RIG", None)
     if not isinstance(rig, Rig):
@@ -110,6 +122,7 @@ def check_rig(rig: Rig, place: str) -> None:
     Raises:
         InputError: naming ``place``, field, value and what was expected.
     """
+    _check_kinds(rig, place)
     columns = [column.name for column in rig.columns]
     laws = [name for law in rig.laws.values() for name in law.parameters]
     numbers = [*(one.name for one in rig.parameters), *laws]
@@ -122,35 +135,55 @@ def check_rig(rig: Rig, place: str) -> None:
         if source and source.removeprefix(RATE_OF) not in columns:
             raise unknown_name("column", source.removeprefix(RATE_OF), columns, f"{place}: states: {state}")
     for column in rig.columns:
-        _check(column.noise > 0.0, f"{place}: columns: {column.name}: noise", column.noise, "a number above 0")
+        _check_positive(column.noise, f"{place}: columns: {column.name}: noise")
     for one in rig.parameters:
-        _check(one.sigma > 0.0, f"{place}: parameters: {one.name}: sigma", one.sigma, "a number above 0")
-        inside = one.low <= one.nominal <= one.high
-        _check(inside, f"{place}: parameters: {one.name}: nominal", one.nominal, f"a number in {one.low:g} to {one.high:g}")
+        _check_positive(one.sigma, f"{place}: parameters: {one.name}: sigma")
+        inside = (
+            all(isinstance(end, float | int) for end in (one.low, one.nominal, one.high)) and one.low <= one.nominal <= one.high
+        )
+        _check(inside, f"{place}: parameters: {one.name}: nominal", one.nominal, f"a number in {one.low} to {one.high}")
     for law_name, law in rig.laws.items():
         sizes = [one for one in law.parameters.values() if one.is_size]
         _check(bool(sizes), f"{place}: laws: {law_name}: parameters", list(law.parameters), "one that says how large it is")
         for name, one in law.parameters.items():
             _check_law_number(one, f"{place}: laws: {law_name}: {name}")
-    _check(rig.disagreement >= 0.0, f"{place}: disagreement", rig.disagreement, "a number of 0 or more")
-    _check(rig.step > 0.0, f"{place}: step", rig.step, "a number above 0")
-    _check(bool(rig.windows) and min(rig.windows) > 0.0, f"{place}: windows", rig.windows, "lengths above 0")
+    known = _is_number(rig.disagreement) and rig.disagreement >= 0.0
+    _check(known, f"{place}: disagreement", rig.disagreement, "a number of 0 or more")
+    _check_positive(rig.step, f"{place}: step")
+    right = bool(rig.windows) and all(length > 0.0 for length in rig.windows)
+    _check(right, f"{place}: windows", rig.windows, "lengths above 0")
+
+
+def _check_kinds(rig: Rig, place: str) -> None:
+    for field, (whole, part, expected) in _KINDS.items():
+        value = getattr(rig, field)
+        parts = value.values() if isinstance(value, Mapping) else value
+        _check(isinstance(value, whole) and all(isinstance(one, part) for one in parts), f"{place}: {field}", value, expected)
 
 
 def _check_names(names: Sequence[str], place: str) -> None:
     _check(bool(names), place, names, "one name or more")
     for name in names:
-        _check(name.isidentifier(), place, name, "a name of letters, digits and _")
+        right = name.isidentifier() and not name.startswith("_") and not keyword.iskeyword(name)
+        _check(right, place, name, "a name of letters, digits and _, without _ in front, that Python does not use itself")
         _check(names.count(name) == 1, place, name, "every name once")
 
 
 def _check_law_number(one: EffectParameter, place: str) -> None:
     (low, high), neutral = one.prior, one.neutral
-    _check(isinstance(neutral, float | int) and math.isfinite(neutral), f"{place}: neutral", neutral, "a number")
+    _check(_is_number(neutral), f"{place}: neutral", neutral, "a number")
     _check(low < high, f"{place}: prior", one.prior, "a low and a high end")
     _check(low <= one.severity <= high, f"{place}: severity", one.severity, f"a number in the prior, {low:g} to {high:g}")
     if one.is_size:
         _check(one.severity != neutral, f"{place}: severity", one.severity, f"another number than neutral, {neutral!r}")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float | int) and math.isfinite(value)
+
+
+def _check_positive(value: object, place: str) -> None:
+    _check(isinstance(value, float | int) and 0.0 < value < math.inf, place, value, "a number above 0")
 
 
 def _check(right: bool, place: str, value: object, expected: str) -> None:

@@ -76,7 +76,8 @@ class CompiledRig:
             self._simulate(self.numbers(**values), t, inputs, starts, begun, self.rig.step, out)
         except NumbaError as error:
             reason = " ".join(re.sub(COLOURS, "", str(error)).split())
-            raise InputError(f"rig '{self.rig.name}': change or readings cannot be compiled: {reason}") from error
+            sizes = f"change ({len(self.rig.states)} rates) or readings ({len(self.rig.columns)} columns)"
+            raise InputError(f"rig '{self.rig.name}': {sizes} cannot be compiled: {reason}") from error
         return out if with_states else out[:, : len(self.rig.columns)]
 
 

@@ -33,6 +33,8 @@ STATE_STEP = 1e-3
 LEAST_STATE_STEP = 1e-9
 #: Steps of finite differences per plausible range.
 STEPS_PER_RANGE = 50.0
+#: Spans of the readings by which a simulation from the first row on may leave their mean.
+FARTHEST = 10.0
 
 
 def open_own_rig(
@@ -144,20 +146,45 @@ class OwnRigProblem:
         return values
 
     def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
-        """Replay runs that a model itself would have made; see :meth:`wlr_gym.gap.problem.Problem.remade`."""
+        """Replay runs that a model itself would have made; see :meth:`wlr_gym.gap.problem.Problem.remade`.
+
+        An unstable system, without the feedback that held it, runs away from what was measured: then every window is made from
+        where it began, and replayed from what noise makes of that.
+        """
         values = self._values(setting)
         clean = [self._simulated(values, run, math.inf) for run in runs]
-        if not all(np.isfinite(one).all() for one in clean):
-            return
+        stays = all(self._stays(run, one) for run, one in zip(runs, clean, strict=True))
         noise = np.array([column.noise for column in self.rig.columns])
         draws = [generator(run, "gap", "floor") for run in runs]
         for _ in range(count):
-            made = [
-                replace(self._runs[run], measured=one + noise * rng.standard_normal(one.shape))
-                for run, one, rng in zip(runs, clean, draws, strict=True)
-            ]
+            drawn = [noise * rng.standard_normal(one.shape) for one, rng in zip(clean, draws, strict=True)]
+            if not stays:
+                yield [self._remade_windows(values, run, own) for run, own in zip(runs, drawn, strict=True)]
+                continue
+            read = zip(runs, clean, drawn, strict=True)
+            made = [replace(self._runs[run], measured=one + own) for run, one, own in read]
             twin = OwnRigProblem(made, self._compiled, self.known)
             yield [residual[0] for residual in twin.residuals([setting], range(len(made)))]
+
+    def _stays(self, run: int, simulated: Array) -> bool:
+        """Whether a simulation from the first row on (rows, columns) stays near what was measured."""
+        measured = self._runs[run].measured
+        spans = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
+        noise = np.array([column.noise for column in self.rig.columns])
+        away = np.abs(simulated - np.nanmean(measured, axis=0))
+        return bool(np.isfinite(simulated).all() and (away <= FARTHEST * (spans + noise)).all())
+
+    def _remade_windows(self, values: dict[str, float], run: int, drawn: Array) -> Array:
+        """Residuals (rows, signals) of windows that the model itself made, each from its first state; ``drawn``: noise."""
+        noisy = replace(self._runs[run], measured=drawn)
+        shift = np.stack([_state(noisy, self.rig, name) for name in self.rig.states], axis=1)
+        made, replayed = (
+            np.concatenate([self._simulated(values, run, length, shift=own) for length in self.rig.windows], axis=1)
+            for own in (None, shift)
+        )
+        found = (made + np.tile(drawn, len(self.rig.windows)) - replayed) / self._noise
+        found[np.isnan(self.measured(run))] = np.nan
+        return self._without_first_states(run, found[None])[0]
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
@@ -166,12 +193,15 @@ class OwnRigProblem:
     def _residuals(self, run: int, simulated: Array) -> Array:
         """Of one run; a setting whose simulation broke down is as far from the data as can be."""
         measured = self.measured(run)
-        found = (measured - simulated) / self._noise
+        return with_lost(self._without_first_states(run, (measured - simulated) / self._noise), measured, simulated)
+
+    def _without_first_states(self, run: int, found: Array) -> Array:
+        """Take out of residuals (settings, rows, signals), in place, what changes of the windows' first states explain."""
         for rows, columns, basis in self._first_states[run]:
             part = found[:, rows, columns]
             flat = np.nan_to_num(part).reshape(len(part), -1)
             found[:, rows, columns] = part - (flat @ basis @ basis.T).reshape(part.shape)
-        return with_lost(found, measured, simulated)
+        return found
 
     def candidates(
         self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]

@@ -40,7 +40,7 @@ def read_rig_runs(folder: str | Path, rig: Rig) -> list[RigRun]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder: expected one of runs of '{rig.name}'")
-    paths = sorted(path for path in folder.iterdir() if path.suffix in _READERS)
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _READERS)
     if not paths:
         raise InputError(f"{folder}: holds no *.csv or *.parquet: expected runs of '{rig.name}', one file each")
     for before, after in pairwise(paths):
@@ -51,7 +51,7 @@ def read_rig_runs(folder: str | Path, rig: Rig) -> list[RigRun]:
 
 def _run(path: Path, rig: Rig) -> RigRun:
     try:
-        table = _READERS[path.suffix](path)
+        table = _READERS[path.suffix.lower()](path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as a table: {error}") from error
     columns = [column.name for column in rig.columns]
@@ -73,6 +73,10 @@ def _run(path: Path, rig: Rig) -> RigRun:
             f"{path}: column '{CLOCK}', row {row}: expected times that rise, got {t[row, 0]:g} after {t[row - 1, 0]:g}"
         )
     for name, values in zip(columns, measured.T, strict=True):
+        if np.isinf(values).any():
+            raise InputError(
+                f"{path}: column '{name}', row {int(np.argmax(np.isinf(values)))}: infinite; expected a finite number"
+            )
         if not np.isfinite(values).any():
             raise InputError(f"{path}: column '{name}' holds no number")
     return RigRun(path.stem, t[:, 0], inputs, measured)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from wlr_gym.gap.analysis import Detectable
 from wlr_gym.gap.problem import Candidate
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_amplitude
-from wlr_gym.physics.effects import EFFECTS, EffectParameter
 
 
 def detectable(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> dict[str, Detectable]:
@@ -39,20 +38,15 @@ def detectable(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> dict[s
     return {name: entry for name, (_, entry) in sorted(found.items())}
 
 
-def _vocabulary(candidate: Candidate) -> Mapping[str, EffectParameter]:
-    """An effect's parameters, where the library knows it."""
-    return EFFECTS[candidate.name].parameters if candidate.name in EFFECTS else {}
-
-
 def _sizes(candidate: Candidate) -> list[int]:
     """Which unknowns are sizes in the vocabulary; all where none is in it, as of a wave's sine and cosine."""
-    own, unknowns = _vocabulary(candidate), candidate.unknowns
+    own, unknowns = candidate.vocabulary, candidate.unknowns
     return [k for k, u in enumerate(unknowns) if u.name in own and own[u.name].is_size] or list(range(len(unknowns)))
 
 
 def _largest(candidate: Candidate, values: Sequence[float]) -> Detectable:
     """The size that is farthest from neutral, in units of its range."""
-    parameters, own = candidate.parameters(values), _vocabulary(candidate)
+    parameters, own = candidate.parameters(values), candidate.vocabulary
     unknowns = {unknown.name: unknown for unknown in candidate.unknowns}
 
     def distance(name: str) -> float:

@@ -62,7 +62,7 @@ def _fitted_evidence(
         {problem.runs[k]: float(gain) for k, gain in zip(fitted, one.by_run, strict=True)},
         probability,
         one.candidate.formula,
-        one.candidate.units,
+        one.candidate.units or ({u.name: u.unit for u in one.candidate.unknowns} if one.candidate.doc else {}),
     )
 
 

@@ -73,10 +73,10 @@ def _dependence(residual: Array, features: Mapping[str, Array]) -> tuple[str, st
         if not edges.size:
             continue
         bins = np.searchsorted(edges, values[seen], side="right")
-        means = np.array([square[bins == b].mean() if (bins == b).any() else 0.0 for b in range(len(edges) + 1)])
+        means = np.array([square[bins == b].mean() if (bins == b).any() else np.nan for b in range(len(edges) + 1)])
         share = float(np.var(means[bins]) / max(np.var(square), 1e-12))
         if share > best_share:
-            top, low = int(np.argmax(means)), int(np.argmin(means))
+            top, low = int(np.nanargmax(means)), int(np.nanargmin(means))
             best, best_share = name, share
             labels = _labels(edges)
             text = (
