@@ -37,8 +37,8 @@ def helps(case: Mapping[str, Line]) -> bool | None:
 
 def regained(case: Mapping[str, Line]) -> Estimate:
     """Return (old - ours) / (old - truth), %, paired over the episodes."""
-    pairs = [_pairs(case[name]) for name in ("ours", "truth", "none", "none")]
-    return Bootstrap(1, len(_errors(case["none"]))).share(*pairs, subjects=(0, 1, 2, 2))
+    pairs = [_pairs(case[name]) for name in ("none", "none", "ours", "truth")]
+    return Bootstrap(1, len(_errors(case["none"]))).share(*pairs, subjects=(0, 0, 1, 2))
 
 
 def better(case: Mapping[str, Line], ours: str, theirs: str) -> Estimate:
