@@ -47,6 +47,7 @@ def test_contract_survives_writing_and_reading(folder, contract):
         (lambda c: c["robot"].update(hash="0"), r"robot\.hash"),
         (lambda c: c.update(control_period=0.04), r"control_period is 0\.02 in the policy, 0\.04 in the environment"),
         (lambda c: c["observation"][3].update(scale=9.0), r"observation\[3\]\.scale"),
+        (lambda c: c["observation"][3].update(limit=9.0), r"observation\[3\]\.limit"),
         (lambda c: c["observation"][5].update(unit="deg"), r"observation\[5\]\.unit"),
         (lambda c: c["observation"].insert(0, c["observation"].pop(1)), r"observation\[0\]\.name"),
         (lambda c: c["observation"].pop(), r"length of observation is (\d+) in the policy, \d+ in the environment"),
@@ -68,6 +69,12 @@ def test_first_difference_is_named(contract, change, message):
 )
 def test_other_conditions_are_not_refused(contract, change):
     check_contract(contract, changed(contract, change), "policy")
+
+
+def test_commands_beyond_those_of_the_training_are_a_condition(contract):
+    core = make_core("WLR-Velocity-v0", 1, {"task": {"commands": {"terms": {"yaw_rate": [-2.5, 2.5]}}}})
+    assert [column["limit"] for column in core.contract()["observation"][:2]] == [2.0, 2.5]
+    check_contract(contract, core.contract(), "policy")
 
 
 def contract_with(motor):

@@ -145,6 +145,13 @@ def with_defaults(environment: Contract) -> dict[str, Any]:
     return whole
 
 
+def _is_condition(place: str, mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> bool:
+    """Return whether a place is no matter of meaning; the limit of a command grows with the range it is drawn from."""
+    general = _INDEX.sub("", place)
+    of_command = mine.get("source") == theirs.get("source") == "command"
+    return general in CONDITIONS or (of_command and general == "observation.limit")
+
+
 def _entry(mapping: Mapping[str, Any], key: str, place: str) -> Any:
     """Return what a contract says at a place such as ``observation[3].scale``, or the default."""
     return mapping.get(key, DEFAULTS.get(_INDEX.sub("", place)))
@@ -155,7 +162,7 @@ def differences(name: str, mine: Any, theirs: Any) -> Iterator[tuple[str, Any, A
     if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
         for key in dict.fromkeys([*mine, *theirs]):
             place = f"{name}.{key}" if name else key
-            if _INDEX.sub("", place) not in CONDITIONS:
+            if not _is_condition(place, mine, theirs):
                 yield from differences(place, _entry(mine, key, place), _entry(theirs, key, place))
     elif isinstance(mine, list | tuple) and isinstance(theirs, list | tuple):
         for index, (left, right) in enumerate(zip(mine, theirs, strict=False)):

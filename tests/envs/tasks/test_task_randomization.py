@@ -233,6 +233,16 @@ def test_bad_events_are_refused(robot, event, expected):
         load_randomization({"events": {"mass": {k: v for k, v in event.items() if v is not None}}}, robot)
 
 
+def test_what_scales_all_patches_takes_those_that_lie_somewhere(robot):
+    event = {"parameters": ["patch.mu"], "distribution": "uniform", "operation": "scale", "low": 0.5, "high": 0.5}
+    given = {base: load_randomization({"base": base, "events": {"worn": event}}, robot) for base in ("split", "patches")}
+    for base, randomization in given.items():
+        before = load_randomization(base, robot).parameters(SEEDS, SEEDS)["patch.mu"]
+        assert np.allclose(randomization.parameters(SEEDS, SEEDS)["patch.mu"], 0.5 * before)
+    with pytest.raises(InputError, match=r"no event says where patch.mu\[patch_1\] lies"):
+        load_randomization({"events": {"worn": event}}, robot)
+
+
 FLOOR = {"parameters": ["ground.mu_x"], "operation": "set"}
 FRICTION = {**FLOOR, "distribution": "uniform", "low": 10.0, "high": 20.0}
 

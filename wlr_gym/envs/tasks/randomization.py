@@ -336,14 +336,16 @@ def _refuse_double_set(entries: Sequence[Entry], places: Mapping[str, str]) -> N
 
 
 def _refuse_no_area(entries: Sequence[Entry], places: Mapping[str, str]) -> None:
-    """Refuse the friction of a patch that no event gives a place: there would be no patch."""
+    """Refuse the friction of patches that no event gives a place: there would be none. Scaling takes those there are."""
     _, changed = _columns(entries)
-    for entry in entries:
-        element = ELEMENTS[entry.column]
-        if element.startswith("patch.mu[") and element.replace("mu", "x_max") not in changed:
+    frictions = {entry: ELEMENTS[entry.column] for entry in entries if ELEMENTS[entry.column].startswith("patch.mu[")}
+    lying = [entry for entry, element in frictions.items() if element.replace("mu", "x_max") in changed]
+    some = {entry.event for entry in lying}
+    for entry, element in frictions.items():
+        if entry not in lying and (entry.operation == "set" or entry.event not in some):
             raise InputError(
-                f"{places[entry.event]}: event '{entry.event}': no event says where {element} lies: expected 'area', such as "
-                "{x_min: [0.3, 1.0], length: [0.3, 0.6]}, or {} for the whole floor"
+                f"{places[entry.event]}: event '{entry.event}': no event says where {element} lies: expected 'area', "
+                "such as {x_min: [0.3, 1.0], length: [0.3, 0.6]}, or {} for the whole floor"
             )
 
 
