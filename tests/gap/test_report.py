@@ -322,7 +322,7 @@ def test_sentences_say_what_was_found():
     assert "it does not measurably change the error of the held-out runs: -2 % (95 % interval -7 to 2 %);" in sentence(alike)
     no_room = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=float("nan")))
     assert "; the error of the held-out runs is as small without it;" in sentence(no_room)
-    unknown = replace(no_room, gap=replace(no_room.gap, noise_floor=float("nan")))
+    unknown = replace(no_room, gap=replace(examples.GAP, reduction=float("nan"), noise_floor=float("nan")))
     assert "; added, it changes the error of the held-out runs from 5.24 to 1.21;" in sentence(unknown)
     two = (*examples.EFFECT_FOUND.effects, FoundEffect("payload", ("body",), {}, 0.9, 300.0))
     assert sentence(replace(examples.EFFECT_FOUND, effects=two, equivalent=())).startswith(
