@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,8 @@ def act_again(core: Core, policy: Policy, run: Path) -> tuple[NDArray[np.float32
     log = read_policy_log(run)
     commands = np.stack([log[f"command_{name}"] for name in core.task.commands], axis=1)
     given = np.stack([log[f"action_{joint}"] for joint in JOINTS], axis=1).astype(np.float32)
-    plant, core.plant = core.plant, LoggedPlant(core, read_run(run))  # type: ignore[assignment]
+    again: Any = LoggedPlant(core, read_run(run))
+    plant, core.plant = core.plant, again
     answered = np.zeros_like(given)
     try:
         core.seed(0, 0)

@@ -42,12 +42,14 @@ def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | No
     from wlr_gym.data.read import read_meta
     from wlr_gym.data.robot_file import names_file, shipped_robots
 
-    if rig is not None or robot is not None:
-        return None if rig is not None else str(robot)
+    if rig is not None:
+        return None
+    if robot is not None:
+        return str(robot)
     named = read_meta(data).robot
-    if named is None or names_file(named):
-        return None if named is None else str(Path(data) / named)
-    return shipped_robots()[named].stem
+    if named is None:
+        return None
+    return str(Path(data) / named) if names_file(named) else shipped_robots()[named].stem
 
 
 def known_patch(known: Source, rig: str | Path | None) -> Patch:

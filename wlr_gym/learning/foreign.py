@@ -87,14 +87,15 @@ def import_policy(
         written = bare.core.task.config.model_dump(mode="json", exclude_none=True)
         task = {FED_AS: {**written, "robot": "nominal", "scaling": {}}}
     config = {"environment": {"task": dict(task or {})}}  # its robot is in the contract
-    content = policy_content(AGENT, config, contract, {"environment": _id_of(bare)})
+    env_id = _id_of(bare)
+    content = policy_content(AGENT, config, contract, {"environment": env_id})
     with _acting(whole):
         _check(whole, width, actions)
         try:
             graph = to_onnx(whole, width)
         except torch.onnx.OnnxExporterError as error:
             raise InputError(f"the network cannot be written as an ONNX graph: {_reason(error)}") from error
-        return write_policy_file(Path(out), graph, content, ModulePolicy(whole), _driven(bare, whole))
+        return write_policy_file(Path(out), graph, content, ModulePolicy(whole), _driven(bare, env_id, whole))
 
 
 @contextmanager
@@ -142,9 +143,9 @@ def _id_of(bare: Any) -> str:
     raise InputError(f"env = {bare!r} has no id: register its task with register_task and make it with gymnasium.make")
 
 
-def _driven(bare: Any, network: torch.nn.Module) -> NDArray[np.float32]:
+def _driven(bare: Any, env_id: str, network: torch.nn.Module) -> NDArray[np.float32]:
     """Return observations (M, D) of robots that the network drives."""
-    source = (bare.spec and bare.spec.kwargs.get("definition")) or task_source_of(_id_of(bare))
+    source = (bare.spec and bare.spec.kwargs.get("definition")) or task_source_of(env_id)
     core = Core(source, bare.core.settings, ROBOTS)
     try:
         return seen_observations(core, ModulePolicy(network), SECONDS)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib.util
 import keyword
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.gap.problem import MeasuredSignal, Quantity
+from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.effects.effect import EffectParameter
 
 __all__ = ["EffectParameter", "MeasuredSignal", "Quantity", "Rig", "RigLaw"]
@@ -138,17 +138,16 @@ def check_rig(rig: Rig, place: str) -> None:
         _check_positive(column.noise, f"{place}: columns: {column.name}: noise")
     for one in rig.parameters:
         _check_positive(one.sigma, f"{place}: parameters: {one.name}: sigma")
-        inside = (
-            all(isinstance(end, float | int) for end in (one.low, one.nominal, one.high)) and one.low <= one.nominal <= one.high
-        )
+        ends = one.low, one.nominal, one.high
+        inside = all(isinstance(end, float | int) for end in ends) and one.low <= one.nominal <= one.high
         _check(inside, f"{place}: parameters: {one.name}: nominal", one.nominal, f"a number in {one.low} to {one.high}")
     for law_name, law in rig.laws.items():
         sizes = [one for one in law.parameters.values() if one.is_size]
         _check(bool(sizes), f"{place}: laws: {law_name}: parameters", list(law.parameters), "one that says how large it is")
         for name, one in law.parameters.items():
             _check_law_number(one, f"{place}: laws: {law_name}: {name}")
-    known = _is_number(rig.disagreement) and rig.disagreement >= 0.0
-    _check(known, f"{place}: disagreement", rig.disagreement, "a number of 0 or more")
+    known = finite_number(rig.disagreement)
+    _check(known is not None and known >= 0.0, f"{place}: disagreement", rig.disagreement, "a number of 0 or more")
     _check_positive(rig.step, f"{place}: step")
     right = bool(rig.windows) and all(length > 0.0 for length in rig.windows)
     _check(right, f"{place}: windows", rig.windows, "lengths above 0")
@@ -171,19 +170,16 @@ def _check_names(names: Sequence[str], place: str) -> None:
 
 def _check_law_number(one: EffectParameter, place: str) -> None:
     (low, high), neutral = one.prior, one.neutral
-    _check(_is_number(neutral), f"{place}: neutral", neutral, "a number")
+    _check(finite_number(neutral) is not None, f"{place}: neutral", neutral, "a number")
     _check(low < high, f"{place}: prior", one.prior, "a low and a high end")
     _check(low <= one.severity <= high, f"{place}: severity", one.severity, f"a number in the prior, {low:g} to {high:g}")
     if one.is_size:
         _check(one.severity != neutral, f"{place}: severity", one.severity, f"another number than neutral, {neutral!r}")
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, float | int) and math.isfinite(value)
-
-
 def _check_positive(value: object, place: str) -> None:
-    _check(isinstance(value, float | int) and 0.0 < value < math.inf, place, value, "a number above 0")
+    number = finite_number(value)
+    _check(number is not None and number > 0.0, place, value, "a number above 0")
 
 
 def _check(right: bool, place: str, value: object, expected: str) -> None:

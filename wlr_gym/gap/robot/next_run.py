@@ -26,6 +26,7 @@ from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import Profile
 from wlr_gym.data.read import Run, read_run
 from wlr_gym.data.record import motion_of, record_simulation
+from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.entries import AdequacyEntry, Result
 from wlr_gym.gap.report.explanations import NOTHING, Explanation
@@ -40,8 +41,6 @@ Array = NDArray[np.float64]
 LEAST_WEIGHT = 1e-6
 #: Expected difference of minus two log evidence that takes even odds to 95 %: a motion that promises less would not tell.
 TELLS = 2.0 * math.log(19.0)
-#: Half of a 95 % interval, in standard deviations.
-_HALF_95 = 1.96
 #: Change of an explanation's own number for finite differences, a share of the way to where the effect vanishes: large, for
 #: friction that sticks and slips answers small ones by chance. Before any run the number is unknown by the whole way.
 STEP = 0.2
@@ -217,7 +216,7 @@ def _calibrated(problem: RobotProblem, result: Result) -> tuple[Array, Array]:
         entry = result.calibration.get(quantity.name)
         values.append(quantity.nominal if entry is None else entry.fitted)
         half = None if entry is None or entry.ci95 is None else 0.5 * (entry.ci95[1] - entry.ci95[0])
-        deviations.append(quantity.sigma if half is None else min(half / _HALF_95, quantity.sigma))
+        deviations.append(quantity.sigma if half is None else min(half / TWO_SIDED_95, quantity.sigma))
     return np.array(values), np.array(deviations)
 
 

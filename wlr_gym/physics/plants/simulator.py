@@ -87,9 +87,6 @@ class Simulator(ABC):
     def _engine_stores(self) -> dict[str, RowStore]:
         """Return what the simulation itself remembers of its robots from one tick to the next."""
 
-    def _note_restored(self) -> None:  # noqa: B027 (a simulator may have nothing to do)
-        """Follow up a state that was written into the stores."""
-
     @abstractmethod
     def _look(self, rows: Rows) -> None:
         """Fill truth and raw sensor signals of robots ``rows``."""
@@ -197,7 +194,6 @@ class Simulator(ABC):
             self._use_parameters(new, Parameters(self.parameters.values[new]))
         write_snapshot(snapshot, stores, index)
         self._setpoints.set_delays(index, self.parameters)
-        self._note_restored()
         return self._readings
 
     def use_setpoints(self, setpoints: Setpoints) -> None:

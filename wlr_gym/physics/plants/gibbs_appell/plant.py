@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
-from wlr_gym.base.snapshot import RowStore
+from wlr_gym.base.snapshot import RowStore, Snapshot
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
@@ -247,8 +247,11 @@ class GibbsAppellPlant(Simulator):
         lanes = {"lanes": self._lanes, "memory": self._memory, "force_values": self._formula_values}
         return {name: _LaneRows(values, self._width) for name, values in lanes.items()}
 
-    def _note_restored(self) -> None:
+    def set_state(self, snapshot: Snapshot, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Sensors:
+        """Put robots into the state of a snapshot; the last tile's further lanes follow its robots."""
+        readings = super().set_state(snapshot, rows)
         self._pad(self._lanes)
+        return readings
 
     def expect_all_effects(self) -> None:
         """Compile for every family of effects; see :class:`wlr_gym.physics.plants.simulator.Simulator`."""
