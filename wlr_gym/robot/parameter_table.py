@@ -139,6 +139,7 @@ TABLE: tuple[ParameterSpec, ...] = (
     motor("servo.armature", "kg m2", low=1e-6, high=1, tolerance="servo.armature", doc="rotor inertia at the output shaft"),
     motor("servo.coulomb_friction", "N m", low=0, high=50, tolerance="servo.coulomb_friction", doc="dry gear friction"),
     motor("servo.viscous_friction", "N m s/rad", low=0, high=10, tolerance="servo.viscous_friction", doc="beyond back-EMF"),
+    fixed("servo.creep_rate", "rad/s", JOINTS, low=0, high=1, doc="dry gear friction grows linearly to here; 0 = sticks"),
     # Below 1: a weak magnet, not seen in the reported effort.
     fixed("servo.torque_scale", "-", JOINTS, at=1.0, low=0, high=2, doc="torque of the motor over what its current says"),
     # Fades with exp(-(rate/stribeck_speed)^2).

@@ -22,7 +22,7 @@ from wlr_gym.data.run_states import (
 )
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
 from wlr_gym.physics.plants.base import PlantState
-from wlr_gym.robot import LEGS, WHEEL_SLICE, WHEELS, Robot
+from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 CLOCK = 0.004
 #: s; the robot stands this long before the first row.
 LEAD = 0.3
+#: Rows before and after an anchor that are near it.
+NEAR = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +42,17 @@ class Anchors:
     Attributes:
         tick: of the plant's clock.
         legs: (W, 4) leg readings, rad.
-        effort: (W, 4) wheel efforts, N m; NaN where not measured or the motor is off.
+        swing: (W, 4) range of a leg's readings or setpoints nearby, rad.
+        effort: (W, 8) mean of the efforts nearby, N m; NaN where not measured or the motor is off.
+        unrest: (W, 8) their range, N m.
         pose, pose_rate: (W, 3) what the camera shows (x, y, heading), and its rate; NaN where not measured.
     """
 
     tick: NDArray[np.intp]
     legs: Array
+    swing: Array
     effort: Array
+    unrest: Array
     pose: Array
     pose_rate: Array
 
@@ -64,6 +70,7 @@ class RunClock:
         self.begin = self.t[0] - (LEAD if starts_at_rest(run) else 0.0)
         self.ticks: int = int(np.ceil((self.t[-1] - self.begin) / CLOCK)) + 1
         self.anchors: Anchors = self._anchors([window.start for window in self.windows[1:]])
+        self.start: Anchors = self._anchors([0])
         self._started: tuple[Robot, PlantState] | None = None
 
     def measured_start(self, robot: Robot, nominal: Parameters) -> PlantState:
@@ -75,14 +82,17 @@ class RunClock:
     def _anchors(self, rows: list[int]) -> Anchors:
         run, times = self.run, self.t[rows]
         legs = [local_fit(self.t, run[f"pos_{joint}"], times, JOINT_WINDOW)[0] for joint in LEGS]
-        effort = np.full((4, len(rows)), np.nan)
-        for k, wheel in enumerate(WHEELS):
-            if np.isfinite(run[f"eff_{wheel}"]).sum() > 2 if f"eff_{wheel}" in run else False:
-                effort[k] = local_fit(self.t, run[f"eff_{wheel}"], times, JOINT_WINDOW)[0]
-        effort[~self.torque_on[rows, WHEEL_SLICE].T] = np.nan
+        near = [slice(max(row - NEAR, 0), row + NEAR + 1) for row in rows]
+        angles = np.array([[run[f"pos_{joint}"], run[f"cmd_{joint}"]] for joint in LEGS])
+        swing = np.array([np.fmax.reduce(np.ptp(angles[:, :, rows], axis=2), axis=1) for rows in near]).reshape(len(rows), 4)
+        unknown = np.full(len(self.t), np.nan)
+        efforts = np.array([run[f"eff_{joint}"] if f"eff_{joint}" in run else unknown for joint in JOINTS])
+        efforts[~self.torque_on.T] = np.nan
+        effort = np.array([efforts[:, rows].mean(axis=1) for rows in near]).reshape(len(rows), 8)
+        unrest = np.array([np.ptp(efforts[:, rows], axis=1) for rows in near]).reshape(len(rows), 8)
         pose = np.full((2, 3, len(rows)), np.nan)
         if has_camera(run):
             fits = [local_fit(self.t, seen, times, CAMERA_WINDOW) for seen in camera_pose(run)]
             pose = np.where(frame_near(run, times), np.stack(fits, axis=1), np.nan)
         tick = np.floor((times - self.begin) / CLOCK + 1e-9).astype(int)
-        return Anchors(tick, np.transpose(legs), effort.T, pose[0].T, pose[1].T)
+        return Anchors(tick, np.transpose(legs), swing, effort, unrest, pose[0].T, pose[1].T)

@@ -25,8 +25,9 @@ GUESSED = {"ground.normal_stiffness": 0.3, "ground.normal_damping": 0.5}
 REACH = 2.5
 #: The same of the biases of the IMU. They are drawn each time it is switched on: they get more room.
 REACH_OF_BIAS = 4.0
-#: m/s; one sigma of the creep that any tyre has, all wheels alike: an effect is what goes beyond.
-CREEP = 0.001
+#: m/s and rad/s; one sigma of the creep that any tyre has, all wheels alike, and any gear, all joints alike: an effect is what
+#: goes beyond.
+CREEP = {"ground.creep_speed": 0.001, "servo.creep_rate": 0.004}
 #: A leg's own inertia is a hundredth of its rotor's: no run shows it.
 UNSEEN = ("leg.inertia",)
 
@@ -73,8 +74,7 @@ def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
         if name == "ground.normal_damping":
             quantity = replace(quantity, high=max(min(quantity.high, resolved), value))
         found.append(Knob(quantity, tuple(spec.elements)))
-    creep = SPECS["ground.creep_speed"]
-    found.append(Knob(_quantity(creep.name, creep.name, 0.0, CREEP), tuple(creep.elements)))
+    found += [Knob(_quantity(name, name, 0.0, sigma), tuple(SPECS[name].elements)) for name, sigma in CREEP.items()]
     imu = robot.sensors.imu
     for name, sigma in (("imu.gyro_bias", imu.gyro_bias), ("imu.accel_bias", imu.accel_bias)):
         spec = SPECS[name]

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.threads import in_threads
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
+from wlr_gym.data.noise import channel_noise
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.gap.robot.clock import CLOCK, RunClock
+from wlr_gym.gap.robot.clock import CLOCK, Anchors, RunClock
 from wlr_gym.gap.robot.loop import follower
 from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
 from wlr_gym.gap.robot.schedule import WrittenSetpoints
@@ -31,7 +32,7 @@ from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
 from wlr_gym.physics.servo import motor_constants, position_gains
-from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -42,6 +43,10 @@ PHYSICS_STEP = 0.001
 PRECISION = {"gibbs_appell": "float32"}
 #: Passes over the friction rows per substep of the engine: twice as many move readings by 0.02 sensor noises (rms).
 SWEEPS = 2
+#: Counts of its encoder within which a leg stands.
+STANDS = 1.5
+#: Sigmas within which a wheel's efforts are at rest: what the spring of its controller holds is read off no jolt.
+UNREST = 6.0
 #: Robots simulated at once: what they read stays in the processor's cache.
 MOST_ROBOTS = 512
 #: Robots of a tile of the engine in single precision.
@@ -192,11 +197,13 @@ def _anchor(
     plant: Simulator, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters, readings: Sensors
 ) -> Sensors:
     """Put one run's robots where they were measured at the start of a window."""
-    anchors, state = clock.anchors, _standing_where_lost(plant, lanes)
-    legs = anchors.legs[window] - lanes["joint.zero_offset"][mine]
-    state.joint_position[mine, LEG_SLICE] = legs
-    missing = np.nan_to_num(anchors.effort[window] - readings.joint_effort[mine, WHEEL_SLICE])
-    state.reference_position[mine, WHEEL_SLICE] += missing * _tension_per_effort(plant.robot, lanes, mine)
+    robot, anchors, state = plant.robot, clock.anchors, _standing_where_lost(plant, lanes)
+    own = Parameters(lanes.values[mine])
+    legs, references = state.joint_position[mine, LEG_SLICE], state.reference_position[mine]
+    state.joint_position[mine, LEG_SLICE] = _standing_legs(robot, own, anchors, window, legs, references)
+    quiet = anchors.unrest[window, WHEEL_SLICE] <= UNREST * channel_noise(robot)[f"eff_{WHEELS[0]}"]
+    missing = np.where(quiet, anchors.effort[window, WHEEL_SLICE] - readings.joint_effort[mine, WHEEL_SLICE], 0.0)
+    state.reference_position[mine, WHEEL_SLICE] += missing * _tension_per_effort(robot, own)[:, WHEEL_SLICE]
     if np.isfinite(anchors.pose[window]).all():
         _place(state, clock, window, mine, lanes)
     kept = {name: readings[name][mine].copy() for name in ("joint_effort", "gyro", "accelerometer", "supply_voltage")}
@@ -219,14 +226,26 @@ def _standing_where_lost(plant: Simulator, lanes: Parameters) -> PlantState:
     return state
 
 
-def _tension_per_effort(robot: Robot, lanes: Parameters, mine: NDArray[np.bool_]) -> Array:
-    """Change of a wheel's reference (rad) that changes its reported effort by 1 N m."""
-    nominal = robot.servo.supply_voltage
-    constant, _ = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal)
-    kp = position_gains(lanes)[mine, WHEEL_SLICE]
-    stall_torque, no_load_speed = (lanes[f"servo.{name}"][mine, WHEEL_SLICE] for name in ("stall_torque", "no_load_speed"))
-    _, resistance = motor_constants(stall_torque, no_load_speed, nominal)
-    return resistance / constant / np.maximum(kp, 1e-9)
+def _standing_legs(robot: Robot, parameters: Parameters, anchors: Anchors, row: int, legs: Array, references: Array) -> Array:
+    """Angles (N, 4) at an anchor: of legs that stand what their encoders and efforts say, of others ``legs``.
+
+    A leg that has come to rest stands where dry friction just holds it. A count of its encoder is several sigma of its effort:
+    put in the middle of the count, it would carry another load, or slide on. One that moves follows its servo.
+    """
+    reading = anchors.legs[row] - parameters["joint.zero_offset"]
+    pull = anchors.effort[row, LEG_SLICE] * _tension_per_effort(robot, parameters)[:, LEG_SLICE]
+    half = 0.5 * robot.sensors.encoder.position
+    held = np.clip(references[:, LEG_SLICE] - pull, reading - half, reading + half)
+    stands = anchors.swing[row] <= STANDS * robot.sensors.encoder.position
+    return np.where(stands, np.where(np.isfinite(held), held, reading), legs)
+
+
+def _tension_per_effort(robot: Robot, parameters: Parameters) -> Array:
+    """Change of the joints' references (N, 8), rad, that changes their reported effort by 1 N m at rest."""
+    nominal, motors = robot.servo.supply_voltage, (robot.servo.leg, robot.servo.wheel)
+    constant = np.repeat([motor_constants(motor.stall_torque, motor.no_load_speed, nominal)[0] for motor in motors], 4)
+    _, resistance = motor_constants(parameters["servo.stall_torque"], parameters["servo.no_load_speed"], nominal)
+    return resistance / constant / np.maximum(position_gains(parameters), 1e-9)
 
 
 def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters) -> None:
@@ -253,6 +272,8 @@ def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
     legs = base["joint.zero_offset"] - parameters["joint.zero_offset"]
     state.joint_position[:, LEG_SLICE] += legs
     state.reference_position[:, LEG_SLICE] += legs
+    legs, references = state.joint_position[:, LEG_SLICE], state.reference_position
+    state.joint_position[:, LEG_SLICE] = _standing_legs(robot, parameters, clock.start, 0, legs, references)
     background = standing_state(robot, parameters)
     height = background.position[:, 2] - background.position[:1, 2]
     bent, level = state.joint_position[:, LEG_SLICE], background.joint_position[:, LEG_SLICE]

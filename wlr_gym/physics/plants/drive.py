@@ -12,7 +12,7 @@ Order of calls within a substep of length ``step``, from the rates at its start:
 4. :func:`finish` gives the rotor's new rate, the motor's torque and its energies.
 
 Families of effects that change what is traced: ``drive`` (weak motor, Stribeck and load-dependent friction, torque ripple,
-supply sag) and ``backlash``. A joint whose own parameters are neutral gets the same bits with and without them.
+supply sag), ``backlash`` and ``creep`` (of gears; the floor has a family of this name too). A joint whose own parameters are neutral gets the same bits with and without them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 JOINTS = range(8)
 JOINT_LANES = (
-    "kp", "kd", "volt_gain", "back_emf_damping", "viscous", "weight", "gear_bound",
+    "kp", "kd", "volt_gain", "back_emf_damping", "viscous", "weight", "gear_bound", "creep_rate", "inverse_creep_rate",
     "inverse_constant", "idle_current", "effort_scale", "velocity_limit", "acceleration_limit",
     "torque_scale", "stribeck_torque", "inverse_stribeck_speed", "load_friction",
     "ripple_amplitude", "ripple_order", "ripple_phase",
@@ -72,6 +72,7 @@ def pack(parameters: Parameters, robot: Robot, step: float, moved_inertia: Array
     back_emf_damping = constant * constant / resistance
     viscous, armature = parameters["servo.viscous_friction"], parameters["servo.armature"]
     torque_scale, play = parameters["servo.torque_scale"], parameters["servo.backlash"]
+    creep = parameters["servo.creep_rate"]
     limits = servo.profile_limits(parameters["servo.profile_velocity"], parameters["servo.profile_acceleration"])
     weight = np.ones_like(armature)
     if moved_inertia is not None:
@@ -85,6 +86,8 @@ def pack(parameters: Parameters, robot: Robot, step: float, moved_inertia: Array
         "viscous": viscous,
         "weight": weight,
         "gear_bound": step * parameters["servo.coulomb_friction"],
+        "creep_rate": creep,
+        "inverse_creep_rate": 1.0 / np.where(creep > 0.0, creep, 1.0),
         "inverse_constant": 1.0 / (constant * (law.torque_constant / line)),
         "idle_current": np.broadcast_to(law.idle, constant.shape),
         "effort_scale": line / constant,
@@ -127,6 +130,7 @@ def families(parameters: Parameters) -> set[str]:
     present = {
         "drive": (parameters["servo.torque_scale"] != 1.0).any() or any(parameters[f"servo.{name}"].any() for name in added),
         "backlash": parameters["servo.backlash"].any(),
+        "creep": parameters["servo.creep_rate"].any(),
     }
     return {name for name, is_present in present.items() if is_present}
 
@@ -249,7 +253,8 @@ def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead:
     """Return what motor, gear friction and gear play do to joint ``j`` within this substep.
 
     torque = on torque_scale ((K/R) voltage - (K^2/R) W) + ripple - viscous W, damping with weight on the new rate;
-    dry friction = coulomb + stribeck_torque exp(-(W/stribeck_speed)^2) + load_friction |torque|.
+    dry friction = coulomb + stribeck_torque exp(-(W/stribeck_speed)^2) + load_friction |torque|; while a gear turns more slowly
+    than its creep_rate, it is a damping instead: that times W/creep_rate.
 
     Args:
         lanes: as for :func:`command`.
@@ -274,6 +279,10 @@ def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead:
         ripple = lanes[f"ripple_amplitude{j}"] * ops.sin(phase)
         torque = torque + ripple
         bound = bound + step * _extra_friction(lanes, j, strength, voltage, rate, ripple)
+    if "creep" in features:
+        slower = lanes[f"creep_rate{j}"] - ops.absolute(rate)
+        damping = damping + ops.where_positive(slower, (bound * (1.0 / step)) * lanes[f"inverse_creep_rate{j}"], 0.0)
+        bound = ops.where_positive(slower, 0.0, bound)
     if "backlash" not in features:
         return Push(step * torque, step * damping, bound, ripple=ripple)
     teeth = _teeth(lanes, j, joint, step * torque, step * damping, bound, step, ahead)
