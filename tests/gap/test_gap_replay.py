@@ -251,6 +251,20 @@ def test_windows_start_where_the_robot_was_measured():
         assert abs(replays[window.start + 1, leg] - seen[window.start + 1, leg]) < 0.004
 
 
+@pytest.mark.parametrize("window", [2.0, 0.3])
+def test_a_window_begins_with_the_loads_that_were_measured(window):
+    """Standing legs truly stand within a count (1.5 mrad) of their encoders; wheels are driven by jolts, which tell no load."""
+    exact, noisy = record(abrupt, spaced(6.0)), record(abrupt, spaced(6.0), noise=5)
+    clock = RunClock(noisy, window=window)
+    values = replay_batch(ROBOT, [clock], nominal())[0].values
+    legs = [CHANNELS.index(f"pos_{leg}") for leg in JOINTS[:4]]
+    assert np.abs(values[0][:, legs] - measured(exact)[:, legs]).max() < 5e-4
+    found = anchored_residuals(noisy["t"], measured(noisy), values, NOISE, clock.windows)[0]
+    rms = np.sqrt(np.nanmean(found**2, axis=0))
+    assert rms[[CHANNELS.index(f"eff_{leg}") for leg in JOINTS[:4]]].max() < 1.3
+    assert rms[[CHANNELS.index(f"pos_{wheel}") for wheel in JOINTS[4:]]].max() < 1.2
+
+
 def test_a_window_does_not_show_the_drift_before_it():
     """Neither its first row nor frames that were exposed before it began."""
     radius = {"name": "wheel_radius_error", "where": ["wheel_lf", "wheel_lr"], "parameters": {"scale": 1.05}}

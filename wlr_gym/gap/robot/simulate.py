@@ -203,7 +203,7 @@ def _anchor(
     state.joint_position[mine, LEG_SLICE] = _standing_legs(robot, own, anchors, window, legs, references)
     quiet = anchors.unrest[window, WHEEL_SLICE] <= UNREST * channel_noise(robot)[f"eff_{WHEELS[0]}"]
     missing = np.where(quiet, anchors.effort[window, WHEEL_SLICE] - readings.joint_effort[mine, WHEEL_SLICE], 0.0)
-    state.reference_position[mine, WHEEL_SLICE] += missing * _tension_per_effort(robot, own)[:, WHEEL_SLICE]
+    state.reference_position[mine, WHEEL_SLICE] += np.nan_to_num(missing) * _tension_per_effort(robot, own)[:, WHEEL_SLICE]
     if np.isfinite(anchors.pose[window]).all():
         _place(state, clock, window, mine, lanes)
     kept = {name: readings[name][mine].copy() for name in ("joint_effort", "gyro", "accelerometer", "supply_voltage")}

@@ -27,6 +27,13 @@ YIELDING_FLOOR = (0.5e-3, 2e-3)
 YIELDING_GEAR = (1e-3, 1e-2)
 #: Range of the stiffness of such tyres, as a share of the robot file's.
 SOFTNESS = (0.3, 1.0)
+#: Range of the share of their deflection by which such tyres roll on a smaller radius.
+FLATTENING = (0.2, 0.5)
+#: m; range of the rms height of the floor that such robots drive on: :data:`WAVES` waves of random heading and phase, whose
+#: lengths (m) lie in WAVE_LENGTH.
+UNEVENNESS = (0.03e-3, 0.1e-3)
+WAVES = 8
+WAVE_LENGTH = (0.1, 0.8)
 
 
 @dataclass(frozen=True)
@@ -65,6 +72,8 @@ class Copy:
     camera_yaw: float
     camera_age: float
     command_delay: float
+    flattening: float
+    floor_waves: Array  # (WAVES, 4) height, wave numbers along x and y, phase
     gyro_bias: Array  # (3,)
     accel_bias: Array  # (3,)
 
@@ -120,6 +129,8 @@ def nominal(robot: dict[str, Any]) -> Copy:
         camera_yaw=0.0,
         camera_age=0.0,
         command_delay=0.0,
+        flattening=0.0,
+        floor_waves=np.zeros((WAVES, 4)),
         gyro_bias=np.zeros(3),
         accel_bias=np.zeros(3),
     )
@@ -178,7 +189,17 @@ def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
         floor_creep=drawn(*YIELDING_FLOOR),
         gear_creep=drawn(*YIELDING_GEAR),
         normal_stiffness=copy.normal_stiffness * drawn(*SOFTNESS),
+        flattening=drawn(*FLATTENING),
+        floor_waves=_waves(drawn(*UNEVENNESS), rng),
     )
+
+
+def _waves(height: float, rng: np.random.Generator) -> Array:
+    """Draw a floor whose rms height is ``height``."""
+    number = 2.0 * np.pi / np.exp(rng.uniform(*np.log(WAVE_LENGTH), WAVES))
+    heading, phase = rng.uniform(0.0, 2.0 * np.pi, (2, WAVES))
+    each = np.full(WAVES, height * np.sqrt(2.0 / WAVES))
+    return np.stack([each, number * np.cos(heading), number * np.sin(heading), phase], axis=1)
 
 
 def with_body_of(copy: Copy, other: Copy) -> Copy:

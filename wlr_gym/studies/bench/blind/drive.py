@@ -114,11 +114,12 @@ def _solve(matrix, vector):
 
 
 @_jit
-def _contact(w, place, turn, hip_x, hip_y, length, radius, cos, sin, rows, columns, dofs):
+def _contact(w, place, turn, hip_x, hip_y, length, radius, flattening, cos, sin, rows, columns, dofs):
     """Find the lowest point of a wheel's disc.
 
-    Writes the rows that give its velocity along the heading, the axle and upwards, over the columns (8) of the generalised
-    velocities that move it, and returns how deep it is under the floor, its x and its y.
+    Writes the rows that give its velocity upwards, and along the heading and the axle that of a point which is higher by the
+    share ``flattening`` of its depth: a loaded tyre rolls on less than its radius. They are over the columns (8) of the
+    generalised velocities that move it. Returns how deep the lowest point is under a flat floor, its x and its y.
     """
     side_x, side_y, side_z = turn[0, 1], turn[1, 1], turn[2, 1]
     flat = np.sqrt(side_x * side_x + side_y * side_y)
@@ -129,10 +130,16 @@ def _contact(w, place, turn, hip_x, hip_y, length, radius, cos, sin, rows, colum
     arm_y = radius * (turn[0, 1] * down_x + turn[1, 1] * down_y + turn[2, 1] * down_z)
     arm_z = radius * (turn[0, 2] * down_x + turn[1, 2] * down_y + turn[2, 2] * down_z)
     x, y, z = hub_x + arm_x, hip_y + arm_y, hub_z + arm_z
+    height = place[2] + turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+    at_x = place[0] + turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
+    at_y = place[1] + turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
+    share = flattening * max(-height, 0.0) / radius
     head_x, head_y = side_y / flat, -side_x / flat
     directions = ((head_x, head_y, 0.0), (-head_y, head_x, 0.0), (0.0, 0.0, 1.0))
     for d in range(3):
         e = directions[d]
+        arm = 1.0 if d == 2 else 1.0 - share
+        x, y, z = hub_x + arm * arm_x, hip_y + arm * arm_y, hub_z + arm * arm_z
         bx = turn[0, 0] * e[0] + turn[1, 0] * e[1] + turn[2, 0] * e[2]
         by = turn[0, 1] * e[0] + turn[1, 1] * e[1] + turn[2, 1] * e[2]
         bz = turn[0, 2] * e[0] + turn[1, 2] * e[1] + turn[2, 2] * e[2]
@@ -140,13 +147,10 @@ def _contact(w, place, turn, hip_x, hip_y, length, radius, cos, sin, rows, colum
         row[0], row[1], row[2] = e[0], e[1], e[2]
         row[3], row[4], row[5] = y * bz - z * by, z * bx - x * bz, x * by - y * bx
         row[6] = (z * bx) - (x - hip_x) * bz
-        row[7] = arm_z * bx - arm_x * bz
+        row[7] = arm * (arm_z * bx - arm_x * bz)
     for k in range(6):
         columns[w, k] = k
     columns[w, 6], columns[w, 7] = dofs[w], dofs[4 + w]
-    height = place[2] + turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
-    at_x = place[0] + turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
-    at_y = place[1] + turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
     return -height, at_x, at_y
 
 
@@ -169,7 +173,7 @@ def _add_damper(matrix, row, columns, coefficient):
 @_jit
 def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records):
     position, rate, motor_rate, motor_position = addresses
-    joints, corners, general = tables
+    joints, corners, general, waves = tables
     kp, kd, constant, resistance, coulomb, viscous = joints[0], joints[1], joints[2], joints[3], joints[4], joints[5]
     stick_extra, stick_speed, load_ratio, motor_scale = joints[6], joints[7], joints[8], joints[9]
     amplitude, order, phase, delay, zero, play = joints[10], joints[11], joints[12], joints[13], joints[14], joints[15]
@@ -183,7 +187,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
     drag, veer, pull, pull_frequency, pull_phase = general[11], general[12], general[13], general[14], general[15]
     patch, mu_ratio, mu_k, weak_speed = general[16:21], general[21], general[22], general[23]
     gravity, stiffness = general[24:27], general[27]
-    floor_creep, gear_creep = general[28], general[29]
+    floor_creep, gear_creep, flattening = general[28], general[29], general[30]
     filter_share = 1.0 - np.exp(-2.0 * np.pi * BANDWIDTH * STEP)
 
     size = qvel.shape[0]
@@ -297,8 +301,10 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
             angle, spin_angle = qpos[position[w]], qpos[position[4 + w]]
             depth[w], at_x, at_y = _contact(
                 w, qpos, turn, hip_x[w], hip_y[w], length, radius[w] * (1.0 + out_of_round[w] * np.sin(spin_angle)),
-                np.cos(angle), np.sin(angle), rows, columns, rate,
+                flattening, np.cos(angle), np.sin(angle), rows, columns, rate,
             )  # fmt: skip
+            for k in range(waves.shape[0]):
+                depth[w] += waves[k, 0] * np.sin(waves[k, 1] * at_x + waves[k, 2] * at_y + waves[k, 3])
             pressed[w] = depth[w] > 0.0
             mu_x[w] = wheel_mu[w]
             inside = patch[1] < at_x and at_x < patch[2] and patch[3] < at_y and at_y < patch[4]

@@ -63,7 +63,7 @@ def simulate(
     data.qpos[2] = (copy.leg_length * np.sin(start) + copy.radius * hidden.radius_scale).max()
     records = np.zeros((round(duration / SAMPLE) + 1, WIDTH))
     addresses = (world.position, world.rate, world.motor_rate, world.motor_position)
-    tables = (_joint_table(copy, hidden), _corner_table(copy, hidden), _general_table(copy, hidden, profile))
+    tables = (_joint_table(copy, hidden), _corner_table(copy, hidden), _general_table(copy, hidden, profile), copy.floor_waves)
     drive(model._address, data._address, data.qpos, data.qvel, addresses, tables, times, setpoints, records)
     if not np.isfinite(records).all():
         raise FloatingPointError("the simulated robot blew up")
@@ -134,5 +134,6 @@ def _general_table(copy: Copy, hidden: Hidden, profile: BlindProfile) -> Array:
             copy.normal_stiffness,
             copy.floor_creep,
             copy.gear_creep,
+            copy.flattening,
         ]
     )
