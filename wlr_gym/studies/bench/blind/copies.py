@@ -27,7 +27,7 @@ YIELDING_FLOOR = (0.5e-3, 2e-3)
 YIELDING_GEAR = (1e-3, 1e-2)
 #: Range of the stiffness of such tyres, as a share of the robot file's.
 SOFTNESS = (0.3, 1.0)
-#: Range of the share of their deflection by which such tyres roll on a smaller radius.
+#: Range of the share of its deflection, beyond that under the robot at rest, by which such a tyre rolls on a smaller radius.
 FLATTENING = (0.2, 0.5)
 #: m; range of the rms height of the floor that such robots drive on: :data:`WAVES` waves of random heading and phase, whose
 #: lengths (m) lie in WAVE_LENGTH.
@@ -76,6 +76,11 @@ class Copy:
     floor_waves: Array  # (WAVES, 4) height, wave numbers along x and y, phase
     gyro_bias: Array  # (3,)
     accel_bias: Array  # (3,)
+
+    @property
+    def weight(self) -> float:
+        """N."""
+        return (self.mass + float(self.leg_mass.sum()) + 4 * self.wheel_mass) * self.gravity
 
     def moved(self, **changes: Any) -> Copy:
         """Return a copy with other numbers."""

@@ -114,12 +114,12 @@ def _solve(matrix, vector):
 
 
 @_jit
-def _contact(w, place, turn, hip_x, hip_y, length, radius, flattening, cos, sin, rows, columns, dofs):
+def _contact(w, place, turn, hip_x, hip_y, length, radius, flat_tyre, cos, sin, rows, columns, dofs):
     """Find the lowest point of a wheel's disc.
 
-    Writes the rows that give its velocity upwards, and along the heading and the axle that of a point which is higher by the
-    share ``flattening`` of its depth: a loaded tyre rolls on less than its radius. They are over the columns (8) of the
-    generalised velocities that move it. Returns how deep the lowest point is under a flat floor, its x and its y.
+    Writes the rows that give its velocity upwards, and along the heading and the axle that of a point above it: ``flat_tyre``
+    is a share and a depth, and a tyre rolls on its radius less that share of what it is deeper. They are over the columns (8)
+    of the generalised velocities that move it. Returns how deep the lowest point is under a flat floor, its x and its y.
     """
     side_x, side_y, side_z = turn[0, 1], turn[1, 1], turn[2, 1]
     flat = np.sqrt(side_x * side_x + side_y * side_y)
@@ -133,7 +133,7 @@ def _contact(w, place, turn, hip_x, hip_y, length, radius, flattening, cos, sin,
     height = place[2] + turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
     at_x = place[0] + turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
     at_y = place[1] + turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
-    share = flattening * max(-height, 0.0) / radius
+    share = flat_tyre[0] * (max(-height, 0.0) - flat_tyre[1]) / radius
     head_x, head_y = side_y / flat, -side_x / flat
     directions = ((head_x, head_y, 0.0), (-head_y, head_x, 0.0), (0.0, 0.0, 1.0))
     for d in range(3):
@@ -187,7 +187,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
     drag, veer, pull, pull_frequency, pull_phase = general[11], general[12], general[13], general[14], general[15]
     patch, mu_ratio, mu_k, weak_speed = general[16:21], general[21], general[22], general[23]
     gravity, stiffness = general[24:27], general[27]
-    floor_creep, gear_creep, flattening = general[28], general[29], general[30]
+    floor_creep, gear_creep, flat_tyre = general[28], general[29], general[30:32]
     filter_share = 1.0 - np.exp(-2.0 * np.pi * BANDWIDTH * STEP)
 
     size = qvel.shape[0]
@@ -301,7 +301,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
             angle, spin_angle = qpos[position[w]], qpos[position[4 + w]]
             depth[w], at_x, at_y = _contact(
                 w, qpos, turn, hip_x[w], hip_y[w], length, radius[w] * (1.0 + out_of_round[w] * np.sin(spin_angle)),
-                flattening, np.cos(angle), np.sin(angle), rows, columns, rate,
+                flat_tyre, np.cos(angle), np.sin(angle), rows, columns, rate,
             )  # fmt: skip
             for k in range(waves.shape[0]):
                 depth[w] += waves[k, 0] * np.sin(waves[k, 1] * at_x + waves[k, 2] * at_y + waves[k, 3])

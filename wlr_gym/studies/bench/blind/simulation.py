@@ -135,5 +135,6 @@ def _general_table(copy: Copy, hidden: Hidden, profile: BlindProfile) -> Array:
             copy.floor_creep,
             copy.gear_creep,
             copy.flattening,
+            copy.weight / 4 / copy.normal_stiffness,
         ]
     )
