@@ -107,6 +107,29 @@ def test_creep_speed_under_a_steady_pull():
     assert speed(records)[500:].mean() == pytest.approx(expected, rel=0.02)
 
 
+def test_a_flattened_tyre_rolls_on_less_than_its_radius():
+    """On the radius at rest, less the share of what a load presses it deeper."""
+    share, load = 0.5, effect("payload", ["body"], mass=1.5, x=0.0, y=0.0, z=0.0)
+    copy = nominal(ROBOT).moved(flattening=share)
+    for loads, deeper in (((), 0.0), ((load,), 1.5 * GRAVITY / 4 / 7400)):
+        records = simulate(np.full(4, 4.0), 2.0, loads, copy)
+        rolled = np.ptp(records[1000:, 0]) / np.ptp(records[1000:, 11:15], axis=0).mean()
+        assert rolled == pytest.approx(0.034 - share * deeper, abs=2e-6)
+
+
+def test_an_uneven_floor_carries_where_it_is():
+    """One long wave at its steepest: the robot stands a height up, and as oblique as the floor."""
+    height, number = 1e-3, 0.5
+    waves = np.zeros((8, 4))
+    waves[0] = height, number, 0.0, 0.0
+    waves[1] = 2 * height, 0.0, 0.0, np.pi / 2
+    records = simulate(np.zeros(4), 0.5, copy=nominal(ROBOT).moved(floor_waves=waves))
+    flat = simulate(np.zeros(4), 0.5)
+    assert records[-1, 2] - flat[-1, 2] == pytest.approx(2 * height, rel=1e-3)
+    pitch = -2 * records[-1, 5]  # nose up where the floor rises along x
+    assert pitch == pytest.approx(height * number, rel=1e-2)
+
+
 def test_motor_torque_in_steady_driving_is_what_resists():
     constant = 12.0 / 6.388
     plain = simulate(np.full(4, 4.0), 3.0)

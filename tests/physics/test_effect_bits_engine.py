@@ -17,8 +17,9 @@ FAMILIES = {
     "ground": ("ground.kinetic_ratio", 0.7),
     "creep": ("ground.creep_speed", 0.05),
     "creep of gears": ("servo.creep_rate", 0.05),
+    "flattening": ("ground.flattening", 0.4),
 }
-FEATURES = {family: {"creep", "backlash"} if family.startswith("creep") else {family} for family in FAMILIES}
+FEATURES = {family: {"compliance", "backlash"} if family.startswith(("creep", "flat")) else {family} for family in FAMILIES}
 TICKS = 20
 
 

@@ -30,6 +30,10 @@ def creep(parameters):
     parameters["ground.creep_speed"] = 0.05
 
 
+def compliance(parameters):
+    parameters["servo.creep_rate"], parameters["ground.flattening"] = 0.3, 0.5
+
+
 def tether(parameters):
     parameters["tether.stiffness"], parameters["tether.anchor"] = TETHER, (0.2, 0.3)
 
@@ -38,7 +42,7 @@ def backlash(parameters):
     parameters["servo.backlash"] = 0.02
 
 
-FAMILIES = {f.__name__: f for f in (drive_effects, ground_effects, creep, tether, backlash)}
+FAMILIES = {f.__name__: f for f in (drive_effects, ground_effects, creep, compliance, tether, backlash)}
 
 
 def stored(plant):

@@ -163,6 +163,8 @@ TABLE: tuple[ParameterSpec, ...] = (
     fixed("ground.kinetic_ratio", "-", WHEELS, at=1.0, low=0, high=1, doc="friction at fast slip over friction at rest"),
     fixed("ground.weakening_speed", "m/s", WHEELS, at=0.1, low=1e-3, high=10, doc="slip speed over which friction falls"),
     fixed("ground.creep_speed", "m/s", WHEELS, low=0, high=1, doc="friction grows as tanh(slip/creep_speed); 0 = dry, sticks"),
+    # Of the deflection beyond that under the robot at rest, a quarter of its weight.
+    fixed("ground.flattening", "-", WHEELS, low=0, high=1, doc="share of a tyre's deflection that its rolling radius loses"),
     # A patch has a friction of its own along the heading (along the axle: times ground.mu_y/mu_x). Later patches win.
     fixed("patch.mu", "-", PATCHES, low=0, high=5, doc="friction along the heading inside an area of the floor"),
     fixed("patch.x_min", "m", PATCHES, low=-1e3, high=1e3, doc="area of the patch, floor frame"),

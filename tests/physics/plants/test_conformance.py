@@ -39,6 +39,7 @@ EFFECTS = {
     "ground.rolling_resistance": 0.02,
     "ground.creep_speed": 0.02,
     "servo.creep_rate": 0.02,
+    "ground.flattening": 0.4,
     "ground.kinetic_ratio": 0.6,
     "servo.backlash": 0.02,
     "servo.supply_resistance": 0.3,

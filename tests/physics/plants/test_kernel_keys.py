@@ -12,7 +12,7 @@ from wlr_gym.physics.plants.gibbs_appell import kernel as engine
 from wlr_gym.physics.plants.mujoco import kernel as mujoco
 
 PACKAGE = Path(wlr_gym.__file__).parent
-FAMILIES = frozenset({"drive", "backlash", "ground", "creep", "rolling_resistance", "forces"})
+FAMILIES = frozenset({"drive", "backlash", "ground", "compliance", "rolling_resistance", "forces"})
 
 
 def called_files(function):

@@ -25,9 +25,9 @@ GUESSED = {"ground.normal_stiffness": 0.3, "ground.normal_damping": 0.5}
 REACH = 2.5
 #: The same of the biases of the IMU. They are drawn each time it is switched on: they get more room.
 REACH_OF_BIAS = 4.0
-#: m/s and rad/s; one sigma of the creep that any tyre has, all wheels alike, and any gear, all joints alike: an effect is what
-#: goes beyond.
-CREEP = {"ground.creep_speed": 0.001, "servo.creep_rate": 0.004}
+#: What tyres and gears yield, all alike, of which no robot's file tells: one sigma from none, m/s, rad/s and a share. An effect is
+#: what goes beyond.
+YIELDS = {"ground.creep_speed": 0.001, "servo.creep_rate": 0.004, "ground.flattening": 0.3}
 #: A leg's own inertia is a hundredth of its rotor's: no run shows it.
 UNSEEN = ("leg.inertia",)
 
@@ -74,7 +74,7 @@ def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
         if name == "ground.normal_damping":
             quantity = replace(quantity, high=max(min(quantity.high, resolved), value))
         found.append(Knob(quantity, tuple(spec.elements)))
-    found += [Knob(_quantity(name, name, 0.0, sigma), tuple(SPECS[name].elements)) for name, sigma in CREEP.items()]
+    found += [Knob(_quantity(name, name, 0.0, sigma), tuple(SPECS[name].elements)) for name, sigma in YIELDS.items()]
     imu = robot.sensors.imu
     for name, sigma in (("imu.gyro_bias", imu.gyro_bias), ("imu.accel_bias", imu.accel_bias)):
         spec = SPECS[name]

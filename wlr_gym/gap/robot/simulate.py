@@ -54,7 +54,7 @@ TILE = WIDTH["float32"]
 #: Robots that a further thread is worth.
 LEAST_ROBOTS = 12
 #: Kernels that replay all robots, the faster first: each further one would be compiled, for longer than it saves.
-KERNELS = ("without effects", "tyres that creep", "all effects")
+KERNELS = ("without effects", "tyres and gears that yield", "all effects")
 
 
 def replay_batch(
@@ -131,7 +131,7 @@ def _joined(parts: Sequence[Replays]) -> Replays:
 def kernel_of(parameters: Parameters) -> str:
     """Return the leanest of :data:`KERNELS` that knows all effects of a batch."""
     found = drive.families(parameters) | ground.families(parameters)
-    return KERNELS[0] if not found else KERNELS[1] if found == {"creep"} else KERNELS[-1]
+    return KERNELS[0] if not found else KERNELS[1] if found == {"compliance"} else KERNELS[-1]
 
 
 def _replay_chunk(

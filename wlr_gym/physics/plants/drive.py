@@ -12,7 +12,7 @@ Order of calls within a substep of length ``step``, from the rates at its start:
 4. :func:`finish` gives the rotor's new rate, the motor's torque and its energies.
 
 Families of effects that change what is traced: ``drive`` (weak motor, Stribeck and load-dependent friction, torque ripple,
-supply sag), ``backlash`` and ``creep`` (of gears; the floor has a family of this name too). A joint whose own parameters are neutral gets the same bits with and without them.
+supply sag), ``backlash`` and ``compliance`` (gears that creep; of the floor too). A joint whose own parameters are neutral gets the same bits with and without them.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def families(parameters: Parameters) -> set[str]:
     present = {
         "drive": (parameters["servo.torque_scale"] != 1.0).any() or any(parameters[f"servo.{name}"].any() for name in added),
         "backlash": parameters["servo.backlash"].any(),
-        "creep": parameters["servo.creep_rate"].any(),
+        "compliance": parameters["servo.creep_rate"].any(),
     }
     return {name for name, is_present in present.items() if is_present}
 
@@ -238,6 +238,7 @@ class Push:
         rotor_free: rad/s.
         rotor_gain: rad/s per N m s.
         ripple: N m, acts on the motor beside what its current makes.
+        creep: what of the damping is dry friction of a gear that creeps, at the motor, N m s per rad/s.
     """
 
     impulse: Value
@@ -247,6 +248,7 @@ class Push:
     rotor_free: Value = 0.0
     rotor_gain: Value = 0.0
     ripple: Value = 0.0
+    creep: Value = 0.0
 
 
 def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead: Value, features: frozenset[str]) -> Push:
@@ -279,12 +281,14 @@ def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead:
         ripple = lanes[f"ripple_amplitude{j}"] * ops.sin(phase)
         torque = torque + ripple
         bound = bound + step * _extra_friction(lanes, j, strength, voltage, rate, ripple)
-    if "creep" in features:
+    creep: Value = 0.0
+    if "compliance" in features:
         slower = lanes[f"creep_rate{j}"] - ops.absolute(rate)
-        damping = damping + ops.where_positive(slower, (bound * (1.0 / step)) * lanes[f"inverse_creep_rate{j}"], 0.0)
+        creep = ops.where_positive(slower, bound * lanes[f"inverse_creep_rate{j}"], 0.0)
+        damping = damping + creep * (1.0 / step)
         bound = ops.where_positive(slower, 0.0, bound)
     if "backlash" not in features:
-        return Push(step * torque, step * damping, bound, ripple=ripple)
+        return Push(step * torque, step * damping, bound, ripple=ripple, creep=creep)
     teeth = _teeth(lanes, j, joint, step * torque, step * damping, bound, step, ahead)
     half_play = lanes[f"half_play{j}"]
 
@@ -300,6 +304,7 @@ def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead:
         rotor_free=either(teeth.rotor_free, 0.0),
         rotor_gain=either(teeth.rotor_gain, 0.0),
         ripple=ripple,
+        creep=creep,
     )
 
 
@@ -359,6 +364,7 @@ def kept_for_finish(pushed: Push, j: int) -> Out:
         f"rotor_free{j}": pushed.rotor_free,
         f"rotor_gain{j}": pushed.rotor_gain,
         f"ripple{j}": pushed.ripple,
+        f"creep{j}": pushed.creep,
     }
 
 
@@ -385,7 +391,8 @@ def finish(
 
     Returns:
         ``motor_torque{j}`` (N m, mean over the substep, before gear friction), ``current_torque{j}`` (N m, current times torque
-        constant: what the reported effort is made of), ``work{j}`` and ``electrical_work{j}`` (J), ``rotor_rate{j}``.
+        constant: what the reported effort is made of), ``work{j}`` and ``electrical_work{j}`` (J), ``rotor_rate{j}``,
+        ``crept{j}`` (N m s, the friction of a gear that creeps).
     """
     out: Out = {}
     on, weight = lanes[f"on{j}"], lanes[f"weight{j}"]
@@ -395,6 +402,7 @@ def finish(
         old_rate = ops.where_positive(half_play, lanes[f"rotor_rate{j}"], old_rate)
         new_rate = ops.where_positive(half_play, with_play, new_rate)
         out[f"rotor_rate{j}"] = new_rate
+    out[f"crept{j}"] = -(lanes[f"creep{j}"] * new_rate) if "compliance" in features else 0.0
     mean_rate = weight * new_rate + (1.0 - weight) * old_rate
     current_torque = on * (lanes[f"volt_gain{j}"] * voltage - lanes[f"back_emf_damping{j}"] * mean_rate)
     torque = current_torque

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 WHEEL_LANES = (
     "mu_x", "mu_y", "inverse_mu_x", "inverse_mu_y", "grip", "anisotropy", "kinetic_drop", "inverse_weakening_speed",
-    "creep_speed", "inverse_creep_speed",
+    "creep_speed", "inverse_creep_speed", "flattening", "rest_depth",
 )  # fmt: skip
 _PATCH_FIELDS = ("mu", "x_min", "x_max", "y_min", "y_max")
 _PATCH_NUMBERS = range(len(PATCHES))
@@ -38,6 +38,8 @@ def pack(parameters: Parameters) -> dict[str, Array]:
     """Return the lanes GROUND_LANES, each (N,); ``anisotropy`` is ground.mu_y over mu_x (1 where mu_x is 0)."""
     grip, creep_speed = parameters["wheel.grip"], parameters["ground.creep_speed"]
     mu_x, mu_y = parameters["ground.mu_x"], parameters["ground.mu_y"]
+    mass = parameters["body.mass"] + parameters["leg.mass"].sum(axis=1) + parameters["wheel.mass"].sum(axis=1)
+    load = parameters["gravity"] * mass / 4
     wheel = {
         "mu_x": grip * mu_x,
         "mu_y": grip * mu_y,
@@ -49,6 +51,8 @@ def pack(parameters: Parameters) -> dict[str, Array]:
         "inverse_weakening_speed": 1.0 / parameters["ground.weakening_speed"],
         "creep_speed": creep_speed,
         "inverse_creep_speed": 1.0 / np.where(creep_speed > 0.0, creep_speed, 1.0),
+        "flattening": parameters["ground.flattening"],
+        "rest_depth": load[:, None] / parameters["ground.normal_stiffness"],
     }
     lanes = {f"{name}{i}": wheel[name][:, i] for name in WHEEL_LANES for i in range(4)}
     lanes |= {f"patch_{name}{k}": parameters[f"patch.{name}"][:, k] for name in _PATCH_FIELDS for k in _PATCH_NUMBERS}
@@ -62,7 +66,7 @@ def families(parameters: Parameters) -> set[str]:
     )
     present = {
         "ground": has_patch.any() or (parameters["ground.kinetic_ratio"] != 1.0).any(),
-        "creep": parameters["ground.creep_speed"].any(),
+        "compliance": parameters["ground.creep_speed"].any() or parameters["ground.flattening"].any(),
         "rolling_resistance": parameters["ground.rolling_resistance"].any(),
     }
     return {name for name, is_present in present.items() if is_present}

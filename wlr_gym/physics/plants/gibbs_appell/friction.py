@@ -81,7 +81,7 @@ def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str])
         change = new[f"gear_friction{j}"] - old
         slope = slope + (lanes[f"rotor_free{j}"] + gain * old) * change
         curvature = curvature + gain * (change * change)
-    if "creep" in features:
+    if "compliance" in features:
         multiplier = ops.where_positive(lanes[f"creep_speed{i}"], new[f"multiplier{i}"], 0.0)
         for a in "xy":
             inverse = lanes[f"acting_inverse_mu_{a}{i}"]
@@ -107,7 +107,7 @@ def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: froz
     that at which |p| = step N tanh(slip speed/creep_speed).
     """
     zx, zy = ([lanes[f"z_{a}{i}_{r}"] for r in range(6)] for a in "xy")
-    slip_x = dot(zx, base) + lanes[f"leg_entry_x{i}"] * y[0] - lanes[f"radius{i}"] * y[1]
+    slip_x = dot(zx, base) + lanes[f"leg_entry_x{i}"] * y[0] - lanes[f"rolling_radius{i}"] * y[1]
     slip_y = dot(zy, base) + lanes[f"leg_entry_y{i}"] * y[0]
     mu_x, mu_y, bound = lanes[f"acting_mu_x{i}"], lanes[f"acting_mu_y{i}"], lanes[f"bound{i}"]
     old_x, old_y = lanes[f"friction_x{i}"], lanes[f"friction_y{i}"]
@@ -125,14 +125,14 @@ def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: froz
 
     multiplier = lanes[f"multiplier{i}"]
     least: Value = 0.0
-    if "creep" in features:  # the slope of tanh at rest
+    if "compliance" in features:  # the slope of tanh at rest
         least = ops.minimum(lanes[f"creep_speed{i}"] * ops.minimum(mu_x, mu_y) / (bound + 1e-9), 1e6)
         multiplier = ops.maximum(multiplier, least)
     p_x, p_y, c11, c22, inverse = impulse(multiplier)
     square = p_x * p_x + p_y * p_y + 1e-30
     curvature = (p_x * p_x * c22 - 2.0 * (a12 * p_x * p_y) + p_y * p_y * c11) * inverse + 1e-30
     better = multiplier + square * (ops.sqrt(square) - bound) / (curvature * (bound + 1e-9))
-    if "creep" in features:
+    if "compliance" in features:
         creeping = _creep_multiplier(lanes, i, multiplier, (p_x, p_y), square, curvature)
         better = ops.where_positive(lanes[f"creep_speed{i}"], creeping, better)
     multiplier = ops.clip(better, least, 1e6)

@@ -20,6 +20,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     floor_axes,
     joints_of,
     rotation_rows,
+    rolling_contact,
     slip_velocity,
     to_body,
     vector,
@@ -83,7 +84,7 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         corner.hip, corner.leg, corner.rim = wheel_points(lanes, i, *corner.trig, n, scale)
         _push_of_floor(lanes, i, corner, n, [*v, *w], step, momentum, own, out)
         damping = _push_of_motors(lanes, i, voltages, joints, step, features, momentum, own, out)
-        _friction_under_wheel(lanes, i, corner, (rows, heading, lateral), [*v, *w], features, out)
+        _friction_under_wheel(lanes, i, corner, rows, (n, heading, lateral, scale), [*v, *w], features, out)
         _eliminate(corner, damping, own, momentum, reduced)
 
     lower, inverse_diagonal = _cholesky(reduced)
@@ -114,8 +115,10 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         }
         if "rolling_resistance" in features:
             local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, out[f"rolling_friction{i}"])
-        for e, name, wheel_entry in ((heading, "x", -lanes[f"radius{i}"]), (lateral, "y", 0.0)):
-            base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, e)
+        rise, radius = rolling_contact(lanes, i, (corner.hip, corner.leg, corner.rim), n, scale, features)
+        out[f"rolling_radius{i}"] = radius
+        for e, name, wheel_entry in ((heading, "x", -radius), (lateral, "y", 0.0)):
+            base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, e, rise)
             local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, out[f"friction_{name}{i}"])
             out[f"leg_entry_{name}{i}"] = leg_entry
         _friction_rows(lanes, i, corner, white, local, base, out)
@@ -206,7 +209,8 @@ def _friction_under_wheel(
     lanes: Lanes,
     i: int,
     corner: Corner,
-    axes: tuple[Sequence[Sequence[Value]], Vector, Vector],
+    rows: Sequence[Sequence[Value]],
+    axes: tuple[Vector, Vector, Vector, Value],
     twist: Vector,
     features: frozenset[str],
     out: Out,
@@ -215,10 +219,9 @@ def _friction_under_wheel(
     place: list[Value] = [0.0, 0.0]
     speed: Value = 0.0
     if "ground" in features:
-        rows, heading, lateral = axes
         points = (corner.hip, corner.leg, corner.rim)
         place = contact_place(lanes, rows, points)
-        slip = slip_velocity(lanes, i, points, heading, lateral, twist)
+        slip = slip_velocity(lanes, i, points, axes, twist, features)
         speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
     found = ground.friction(lanes, i, place[0], place[1], speed, features)
     out[f"acting_mu_x{i}"], out[f"acting_mu_y{i}"] = found.mu_x, found.mu_y
@@ -278,7 +281,7 @@ def _friction_rows(
             out[f"inverse_gain_{name}"] = 1.0 / gain
     cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
     own_gain = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"]
-    out[f"gain_xy{i}"] = own_gain - lanes[f"radius{i}"] * out[f"g_wheel_y{i}"]
+    out[f"gain_xy{i}"] = own_gain - out[f"rolling_radius{i}"] * out[f"g_wheel_y{i}"]
 
 
 def _accumulate(

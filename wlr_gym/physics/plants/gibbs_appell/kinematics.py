@@ -64,12 +64,30 @@ def wheel_points(
     return hip, leg, [-(reach * n[0]), 0.0, -(reach * n[2])]
 
 
-def contact_row(hip: Vector, leg: Vector, rim: Vector, e: Sequence[Value]) -> tuple[Vector, Value]:
+def rolling_contact(
+    lanes: Lanes, i: int, points: tuple[Vector, Vector, Vector], n: Vector, scale: Value, features: frozenset[str]
+) -> tuple[Vector | None, Value]:
+    """How far above a disc's lowest point friction acts (body frame; None = there), and the radius on which its wheel rolls.
+
+    A loaded tyre flattens: it rolls on its radius less a share of what it is deeper in the floor than the robot at rest.
+    """
+    if "compliance" not in features:
+        return None, lanes[f"radius{i}"]
+    hip, leg, rim = points
+    gap = lanes["pz"] + dot(n, [hip[k] + leg[k] + rim[k] for k in range(3)])
+    flat = lanes[f"flattening{i}"] * (ops.maximum(-gap, 0.0) - lanes[f"rest_depth{i}"])
+    return [(flat * scale) * n[k] for k in range(3)], lanes[f"radius{i}"] - flat
+
+
+def contact_row(hip: Vector, leg: Vector, rim: Vector, e: Sequence[Value], rise: Vector | None = None) -> tuple[Vector, Value]:
     """Jacobian of the contact point's velocity along ``e``: six base entries and the leg-rate entry.
 
-    The wheel-rate entry is -radius along the heading and zero along the lateral axis and the normal.
+    The wheel-rate entry is -radius along the heading and zero along the lateral axis and the normal. ``rise``, and that
+    radius: :func:`rolling_contact`.
     """
     point = [hip[0] + leg[0] + rim[0], hip[1], hip[2] + leg[2] + rim[2]]
+    if rise is not None:
+        point = [point[k] + rise[k] for k in range(3)]
     arm = cross(point, e)
     return [*e, arm[0], hip[2] * e[0] - hip[0] * e[2], arm[2]], leg[2] * e[0] - leg[0] * e[2]
 
@@ -82,12 +100,22 @@ def contact_place(lanes: Lanes, rows: Sequence[Sequence[Value]], points: tuple[V
 
 
 def slip_velocity(
-    lanes: Lanes, i: int, points: tuple[Vector, Vector, Vector], heading: Vector, lateral: Vector, twist: Vector
+    lanes: Lanes,
+    i: int,
+    points: tuple[Vector, Vector, Vector],
+    axes: tuple[Vector, Vector, Vector, Value],
+    twist: Vector,
+    features: frozenset[str],
 ) -> Vector:
-    """Velocity of wheel ``i``'s contact point over the floor along heading and axle, at the present rates, m/s."""
+    """Velocity of wheel ``i``'s contact point over the floor along heading and axle, at the present rates, m/s.
+
+    ``axes``: of :func:`floor_axes`.
+    """
+    n, heading, lateral, scale = axes
+    rise, radius = rolling_contact(lanes, i, points, n, scale, features)
     slip: Vector = []
-    for e, wheel_entry in ((heading, -lanes[f"radius{i}"]), (lateral, 0.0)):
-        base_row, leg_entry = contact_row(*points, e)
+    for e, wheel_entry in ((heading, -radius), (lateral, 0.0)):
+        base_row, leg_entry = contact_row(*points, e, rise)
         speed = dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"] + wheel_entry * lanes[f"wheel_rate{i}"]
         slip.append(speed)
     return slip

@@ -104,7 +104,7 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
         new_rates[i], new_rates[FIRST_WHEEL + i] = leg_rate - u[4], wheel_rate - leg_rate
         old_rates[i] = lanes[f"leg_rate{i}"] - lanes["wy"]
         old_rates[FIRST_WHEEL + i] = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
-        for a, wheel_entry in (("x", -lanes[f"radius{i}"]), ("y", 0.0)):
+        for a, wheel_entry in (("x", -lanes[f"rolling_radius{i}"]), ("y", 0.0)):
             z = [lanes[f"z_{a}{i}_{r}"] for r in range(6)]
             slip = dot(z, [lanes[f"base{r}"] for r in range(6)]) + lanes[f"leg_entry_{a}{i}"] * lanes[f"y_leg{i}"]
             slip = slip + wheel_entry * lanes[f"y_wheel{i}"]
@@ -116,6 +116,7 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
         done = drive.finish(lanes, j, lanes[f"drive{j}"], old_rates[j], new_rates[j], friction, step, features)
         mechanical = mechanical + done.pop(f"work{j}")
         electrical = electrical + done.pop(f"electrical_work{j}")
+        out[f"gear_friction{j}"] = friction + done.pop(f"crept{j}")
         out |= done
     out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
     gravity = to_body(rotation_rows(lanes), vector(lanes, "gravity_"))
@@ -133,7 +134,8 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
 def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -> Out:
     """Columns of the truth matrix, in the order of TRUTH_LAYOUT, then the raw sensor channels."""
     rows = rotation_rows(lanes)
-    n, heading, lateral, scale = floor_axes(rows)
+    axes = floor_axes(rows)
+    n, _, _, scale = axes
     v, w = vector(lanes, "v"), vector(lanes, "w")
     out: Out = {f"position_{a}": lanes[f"p{a}"] for a in AXES}
     out |= {f"quaternion_{a}": lanes[f"q{a}"] for a in "wxyz"}
@@ -155,7 +157,7 @@ def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -
     frictions: list[ground.Friction] = []
     for i in CORNERS:
         points = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
-        slip = slip_velocity(lanes, i, points, heading, lateral, [*v, *w])
+        slip = slip_velocity(lanes, i, points, axes, [*v, *w], features)
         out[f"slip_velocity_{i}_x"], out[f"slip_velocity_{i}_y"] = slip
         place = contact_place(lanes, rows, points)
         speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])

@@ -33,6 +33,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     cross,
     dot,
     floor_axes,
+    rolling_contact,
     rotation_rows,
     slip_velocity,
     to_body,
@@ -43,7 +44,7 @@ from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_F
 from wlr_gym.robot import FIRST_WHEEL
 
 #: Families of effects: always all, so that no robot's bits can depend on what its neighbours have.
-FEATURES = frozenset({"drive", "backlash", "ground", "creep"})
+FEATURES = frozenset({"drive", "backlash", "ground", "compliance"})
 
 #: MuJoCo's state by lane: ``qpos`` and ``qvel``. Joints along the tree: leg, wheel, leg, wheel, ...
 POSITION: tuple[str, ...] = (
@@ -72,9 +73,10 @@ STATE: tuple[str, ...] = (
     *(f"old_spin{i}" for i in CORNERS),
     *(f"old_{v}{a}" for v in "uw" for a in AXES),
     *(f"old_rate{j}" for j in range(8)),
-    *(f"{name}{j}" for j in range(8) for name in ("voltage", "share", "rotor_free", "rotor_gain", "ripple", "rotor_friction")),
+    *(f"{name}{j}" for j in range(8) for name in ("voltage", "share", "rotor_free", "rotor_gain", "ripple", "creep", "rotor_friction")),
     *(f"heading_{a}{i}" for i in CORNERS for a in "xy"),
     *(f"leg_arm_{a}{i}" for i in CORNERS for a in AXES),
+    *(f"rolling_radius{i}" for i in CORNERS),
     *(f"force_{a}{i}" for i in CORNERS for a in AXES),
     *(f"{name}{j}" for j in range(8) for name in ("motor_torque", "current_torque", "gear_torque")),
     *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
@@ -210,7 +212,12 @@ def _push_wheel(
     arm = [leg[k] + rim[k] for k in range(3)]
     velocity = _point_velocity(lanes, i, point, arm, rim)
     gap = lanes["pz"] + dot(n, point)
-    _place_sphere(lanes, i, n, scale, gap, out)
+    rolls, out[f"rolling_radius{i}"] = rolling_contact(lanes, i, (hip, leg, rim), n, scale, FEATURES)
+    rise = rolls or [0.0] * 3
+    _place_sphere(lanes, i, n, scale, gap, dot(n, rise), out)
+    approach = dot(n, velocity)
+    point, arm, rim = ([x + y for x, y in zip(whole, rise, strict=True)] for whole in (point, arm, rim))
+    velocity = _point_velocity(lanes, i, point, arm, rim)
 
     out[f"heading_x{i}"], out[f"heading_y{i}"] = dot(rows[0], heading), dot(rows[1], heading)
     for a, e in zip(AXES, (heading, lateral, n), strict=True):
@@ -224,7 +231,7 @@ def _push_wheel(
     for a, value in (("x", mu.mu_x), ("y", mu.mu_y)):
         out[f"friction_{a}{i}"] = ops.where_positive(creeps, LEAST_MU, ops.maximum(value, LEAST_MU))
 
-    push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * dot(n, velocity), 0.0)
+    push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * approach, 0.0)
     normal = ops.where_positive(-gap, push, 0.0)
     spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{FIRST_WHEEL + i}"]
     rolling = _rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{FIRST_WHEEL + i}"], step)
@@ -252,12 +259,13 @@ def _point_velocity(lanes: Lanes, i: int, point: Vector, arm: Vector, rim: Vecto
     return [lanes[f"v{a}"] + turned[k] + swing[k] for k, a in enumerate(AXES)]
 
 
-def _place_sphere(lanes: Lanes, i: int, n: Vector, scale: Value, gap: Value, out: Out) -> None:
+def _place_sphere(lanes: Lanes, i: int, n: Vector, scale: Value, gap: Value, rise: Value, out: Out) -> None:
     """Place the capsule whose lower end stands for the disc of wheel ``i``, in the wheel's frame.
 
     The disc's lowest point lies a/cos(tilt) straight below a point of the axle that is a tan(tilt) off the wheel's plane. A
     sphere around it with radius a/cos(tilt) - gap overlaps the floor by twice -gap, halfway of which lies the disc's lowest
-    point; the margin takes one -gap off again. High above the floor the gap is cut short, which keeps the radius positive.
+    point; the margin takes one -gap off again. Smaller by twice ``rise``, it is touched that much higher. High above the floor
+    the gap is cut short, which keeps the radius positive.
     """
     sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"] + lanes[f"wheel_angle{i}"])
     reach = lanes[f"radius{i}"] * scale  # scale = 1/cos(tilt)
@@ -266,7 +274,7 @@ def _place_sphere(lanes: Lanes, i: int, n: Vector, scale: Value, gap: Value, out
     centre = [CAPSULE_HALF_LENGTH * x for x in axis]
     centre[1] = centre[1] + reach * n[1]
     near = ops.minimum(gap, 0.5 * reach)
-    out[f"geom_radius{i}"], out[f"margin{i}"] = reach - near, near
+    out[f"geom_radius{i}"], out[f"margin{i}"] = reach - near - 2.0 * rise, near + 2.0 * rise
     for a, value in zip(AXES, _to_wheel(centre, sine, cosine), strict=True):
         out[f"geom_{a}{i}"] = value
     x, y, z = _to_wheel(axis, sine, cosine)
@@ -339,8 +347,10 @@ def after(lanes: Lanes, step: Value) -> Out:
         friction = lanes[f"rotor_friction{j}"]
         done = drive.finish(lanes, j, lanes[f"voltage{j}"], *rates, friction, step, FEATURES)
         mechanical, electrical = mechanical + done.pop(f"work{j}"), electrical + done.pop(f"electrical_work{j}")
+        crept = done.pop(f"crept{j}") * (1.0 / step)
         out |= done
-        out[f"gear_torque{j}"] = ops.where_positive(lanes[f"half_play{j}"], friction * (1.0 / step), out[f"gear_torque{j}"])
+        torque = ops.where_positive(lanes[f"half_play{j}"], friction * (1.0 / step), out[f"gear_torque{j}"])
+        out[f"gear_torque{j}"] = torque + crept
     out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
     out |= _drift_of_rotors(Overlay(lanes, out), step)
     push = [(lanes[f"u{a}"] - lanes[f"old_u{a}"]) * (1.0 / step) - lanes[f"gravity_{a}"] for a in AXES]
@@ -359,17 +369,18 @@ def _read_wheel(lanes: Lanes, i: int, out: Out) -> None:
     along, across, normal = c * floor[0] + s * floor[1], c * floor[1] - s * floor[0], floor[2]
     moment = lanes[f"leg_arm_x{i}"] * along + lanes[f"leg_arm_y{i}"] * across + lanes[f"leg_arm_z{i}"] * normal
     out[f"gear_torque{i}"] = lanes[f"constraint_joint_rate{i}"] - moment
-    out[f"gear_torque{FIRST_WHEEL + i}"] = lanes[f"constraint_joint_rate{FIRST_WHEEL + i}"] + lanes[f"radius{i}"] * along
+    out[f"gear_torque{FIRST_WHEEL + i}"] = lanes[f"constraint_joint_rate{FIRST_WHEEL + i}"] + lanes[f"rolling_radius{i}"] * along
     out[f"force_x{i}"], out[f"force_y{i}"] = along + lanes[f"own_force_x{i}"], across + lanes[f"own_force_y{i}"]
     out[f"force_z{i}"] = normal
 
 
 def _add_slip(lanes: Lanes, step: Value, out: Out) -> None:
-    n, heading, lateral, scale = floor_axes(rotation_rows(lanes))
+    axes = floor_axes(rotation_rows(lanes))
+    n, _, _, scale = axes
     twist = [*vector(lanes, "v"), *vector(lanes, "w")]
     for i in CORNERS:
         points = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
-        slip = slip_velocity(lanes, i, points, heading, lateral, twist)
+        slip = slip_velocity(lanes, i, points, axes, twist, FEATURES)
         for a, speed in zip("xy", slip, strict=True):
             out[f"slip_displacement_{a}{i}"] = lanes[f"slip_displacement_{a}{i}"] + step * speed
 
