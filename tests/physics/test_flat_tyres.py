@@ -26,6 +26,7 @@ def rolled(backend, parameters, setpoints=HOME, seconds=1.5, pull=None):
     way = np.hypot(*(last.position - first.position)[:, :2].T)
     return way[:, None] / turned, last
 
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_load_shortens_the_rolling_radius(backend):
     """Four robots: none, a load, tyres that flatten, both."""
@@ -44,7 +45,7 @@ def test_it_is_the_arm_of_friction_too(backend):
     parameters["payload.mass"] = load = 3.0
     parameters["external_force"][:, 0] = -pull
     parameters["ground.flattening"][1] = share = 0.5
-    found, truth = rolled(backend, parameters, HOME + np.repeat([0.0, 3.0], 4))
+    _, truth = rolled(backend, parameters, HOME + np.repeat([0.0, 3.0], 4))
     torque = (truth.motor_torque + truth.friction_torque)[:, 4:].sum(axis=1)
     deeper = load * G / 4 / ROBOT.ground.normal_stiffness
     np.testing.assert_allclose(torque, pull * (RADIUS - np.array([0.0, share * deeper])), rtol=3e-3)

@@ -85,8 +85,7 @@ class RunClock:
         near = [slice(max(row - NEAR, 0), row + NEAR + 1) for row in rows]
         angles = np.array([[run[f"pos_{joint}"], run[f"cmd_{joint}"]] for joint in LEGS])
         swing = np.array([np.fmax.reduce(np.ptp(angles[:, :, rows], axis=2), axis=1) for rows in near]).reshape(len(rows), 4)
-        unknown = np.full(len(self.t), np.nan)
-        efforts = np.array([run[f"eff_{joint}"] if f"eff_{joint}" in run else unknown for joint in JOINTS])
+        efforts = run.table.reindex(columns=[f"eff_{joint}" for joint in JOINTS]).to_numpy(float).T.copy()
         efforts[~self.torque_on.T] = np.nan
         effort = np.array([efforts[:, rows].mean(axis=1) for rows in near]).reshape(len(rows), 8)
         unrest = np.array([np.ptp(efforts[:, rows], axis=1) for rows in near]).reshape(len(rows), 8)

@@ -25,8 +25,8 @@ GUESSED = {"ground.normal_stiffness": 0.3, "ground.normal_damping": 0.5}
 REACH = 2.5
 #: The same of the biases of the IMU. They are drawn each time it is switched on: they get more room.
 REACH_OF_BIAS = 4.0
-#: What tyres and gears yield, all alike, of which no robot's file tells: one sigma from none, m/s, rad/s and a share. An effect is
-#: what goes beyond.
+#: What tyres and gears yield, all alike, of which no robot's file tells: one sigma from none, m/s, rad/s and a share. An effect
+#: is what goes beyond.
 YIELDS = {"ground.creep_speed": 0.001, "servo.creep_rate": 0.004, "ground.flattening": 0.3}
 #: A leg's own inertia is a hundredth of its rotor's: no run shows it.
 UNSEEN = ("leg.inertia",)

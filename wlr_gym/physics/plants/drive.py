@@ -12,7 +12,8 @@ Order of calls within a substep of length ``step``, from the rates at its start:
 4. :func:`finish` gives the rotor's new rate, the motor's torque and its energies.
 
 Families of effects that change what is traced: ``drive`` (weak motor, Stribeck and load-dependent friction, torque ripple,
-supply sag), ``backlash`` and ``compliance`` (gears that creep; of the floor too). A joint whose own parameters are neutral gets the same bits with and without them.
+supply sag), ``backlash`` and ``compliance`` (gears that creep). A joint whose own parameters are neutral gets the same bits
+with and without them.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value
+from wlr_gym.physics.plants.gears import TEETH_DAMPING, Push, teeth
 from wlr_gym.robot import FIRST_WHEEL, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -50,8 +52,6 @@ STATE: tuple[str, ...] = (
     *(f"rotor_lead{j}" for j in JOINTS),
     *(f"rotor_rate{j}" for j in JOINTS),
 )
-#: Damping of meeting teeth over sqrt(stiffness x rotor inertia): 0.7 of critical for the rotor against a wall.
-TEETH_DAMPING = 1.4
 
 
 def pack(parameters: Parameters, robot: Robot, step: float, moved_inertia: Array | None = None) -> dict[str, Array]:
@@ -222,35 +222,6 @@ def _supply_drop(lanes: Lanes, voltages: Sequence[Value], rates: Sequence[Value]
     return ops.minimum(drop + change, lanes["supply"])
 
 
-@dataclass(frozen=True)
-class Push:
-    """What the drive does to one joint within a substep. Impulses in N m s, for joint rate w' at its end.
-
-    The joint gets ``impulse`` - ``damping`` w' + ``share`` f, where f is the impulse of dry gear friction, |f| <= ``bound``,
-    which opposes the rotor's rate  W' = ``rotor_free`` + ``rotor_gain`` f + ``share`` w'.  Without play W' = w': share 1,
-    rotor_free and rotor_gain 0.
-
-    Attributes:
-        impulse: explicit impulse.
-        damping: implicit damping times the step, N m s per rad/s.
-        bound: bound of the friction impulse.
-        share: part of friction that reaches the joint, and of the joint's rate that reaches the rotor.
-        rotor_free: rad/s.
-        rotor_gain: rad/s per N m s.
-        ripple: N m, acts on the motor beside what its current makes.
-        creep: what of the damping is dry friction of a gear that creeps, at the motor, N m s per rad/s.
-    """
-
-    impulse: Value
-    damping: Value
-    bound: Value
-    share: Value = 1.0
-    rotor_free: Value = 0.0
-    rotor_gain: Value = 0.0
-    ripple: Value = 0.0
-    creep: Value = 0.0
-
-
 def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead: Value, features: frozenset[str]) -> Push:
     """Return what motor, gear friction and gear play do to joint ``j`` within this substep.
 
@@ -289,7 +260,7 @@ def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead:
         bound = ops.where_positive(slower, 0.0, bound)
     if "backlash" not in features:
         return Push(step * torque, step * damping, bound, ripple=ripple, creep=creep)
-    teeth = _teeth(lanes, j, joint, step * torque, step * damping, bound, step, ahead)
+    pressed = teeth(lanes, j, joint.rate, step * torque, step * damping, bound, step, ahead)
     half_play = lanes[f"half_play{j}"]
 
     def either(with_play: Value, rigid: Value) -> Value:
@@ -297,12 +268,12 @@ def push(lanes: Lanes, j: int, voltage: Value, joint: Joint, step: Value, ahead:
 
     return Push(
         # chosen before they are multiplied by the step: a product stays a product, which keeps a rigid joint's bits
-        impulse=step * either(teeth.impulse * (1.0 / step), torque),
-        damping=step * either(teeth.damping * (1.0 / step), damping),
+        impulse=step * either(pressed.impulse * (1.0 / step), torque),
+        damping=step * either(pressed.damping * (1.0 / step), damping),
         bound=bound,
-        share=either(teeth.share, 1.0),
-        rotor_free=either(teeth.rotor_free, 0.0),
-        rotor_gain=either(teeth.rotor_gain, 0.0),
+        share=either(pressed.share, 1.0),
+        rotor_free=either(pressed.rotor_free, 0.0),
+        rotor_gain=either(pressed.rotor_gain, 0.0),
         ripple=ripple,
         creep=creep,
     )
@@ -313,48 +284,6 @@ def _extra_friction(lanes: Lanes, j: int, strength: Value, voltage: Value, rate:
     ratio = rate * lanes[f"inverse_stribeck_speed{j}"]
     motor = strength * (lanes[f"volt_gain{j}"] * voltage - lanes[f"back_emf_damping{j}"] * rate) + ripple
     return lanes[f"stribeck_torque{j}"] * ops.decay(ratio * ratio) + lanes[f"load_friction{j}"] * ops.absolute(motor)
-
-
-def _teeth(lanes: Lanes, j: int, joint: Joint, impulse: Value, damping: Value, bound: Value, step: Value, ahead: Value) -> Push:
-    """Rotor and teeth of a gear with play, the rotor's rate eliminated; the rotor gets ``impulse`` - ``damping`` W'.
-
-    The teeth push with  k p' + c (W' - w')  when they touch: p' is their overlap at the end of the substep, implicit in both
-    rates, so that any stiffness is stable. Whether they touch and push is judged with the joint's old rate; they never pull.
-    """
-    inertia, half_play = lanes[f"rotor_inertia{j}"], lanes[f"half_play{j}"]
-    stiffness, resistance = lanes[f"teeth_stiffness{j}"], lanes[f"teeth_damping{j}"]
-    lead, rate = lanes[f"rotor_lead{j}"], joint.rate
-    momentum = inertia * lanes[f"rotor_rate{j}"] + impulse
-    own = inertia + damping
-
-    slip = (momentum + ops.clip(-momentum, -bound, bound)) / own - rate  # of the free rotor against the joint
-    side = ops.where_positive(lead + ahead * slip, 1.0, -1.0)
-    overlap = lead - side * half_play
-    grip = step * (ahead * stiffness + resistance)
-    pressed = momentum - step * stiffness * overlap
-    friction = ops.clip(-(pressed + grip * rate), -bound, bound)
-    slip_under_load = (pressed + friction + grip * rate) / (own + grip) - rate
-    touching = side * (overlap + ahead * slip)
-    pushing = side * (stiffness * (overlap + ahead * slip_under_load) + resistance * slip_under_load)
-    engaged = ops.minimum(touching, pushing)
-
-    grip = ops.where_positive(engaged, grip, 0.0)
-    spring = ops.where_positive(engaged, stiffness * overlap, 0.0)
-    rotor_gain = 1.0 / (own + grip)
-    share = grip * rotor_gain
-    free = momentum - step * spring
-    return Push(step * spring + share * free, share * own, bound, share, rotor_free=free * rotor_gain, rotor_gain=rotor_gain)
-
-
-def friction_on_rotor(pushed: Push, rate: Value) -> tuple[Value, Value]:
-    """Return impulse and friction impulse of :class:`Push` with the friction solved here, for the joint's old rate.
-
-    For a simulator that cannot solve a friction that acts on the rotor together with its contacts: the joint gets ``impulse``
-    + share f, and no friction of its own. Only of use where the gear has play.
-    """
-    free = pushed.rotor_free + pushed.share * rate
-    friction = ops.clip(-(free / pushed.rotor_gain), -pushed.bound, pushed.bound)
-    return pushed.impulse + pushed.share * friction, friction
 
 
 def kept_for_finish(pushed: Push, j: int) -> Out:

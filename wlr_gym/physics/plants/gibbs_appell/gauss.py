@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.model.equations import assembly_terms, platform_terms
-from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants import drive, gears, ground
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     contact_place,
     contact_row,
     dot,
     floor_axes,
     joints_of,
-    rotation_rows,
     rolling_contact,
+    rotation_rows,
     slip_velocity,
     to_body,
     vector,
@@ -187,7 +187,7 @@ def _push_of_motors(
     out: Out,
 ) -> tuple[Value, Value]:
     """Add the explicit impulses on both joints of leg ``i``; return their implicit damping (times the step)."""
-    pushes: list[drive.Push] = []
+    pushes: list[gears.Push] = []
     for j in (i, FIRST_WHEEL + i):
         pushed = drive.push(lanes, j, voltages[j], joints[j], step, step, features)
         pushes.append(pushed)

@@ -26,7 +26,7 @@ from wlr_gym.physics.codegen import (
     straight_line_source,
 )
 from wlr_gym.physics.model import equations
-from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants import drive, gears, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import friction, gauss, kinematics, lanes
 from wlr_gym.physics.plants.gibbs_appell import step as source
@@ -309,7 +309,9 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
 
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
-TRACED = (source, gauss, friction, kinematics, lanes, equations, servo, drive, ground, ops, graph, sys.modules[__name__])
+TRACED = (
+    source, gauss, friction, kinematics, lanes, equations, servo, drive, gears, ground, ops, graph, sys.modules[__name__]
+)  # fmt: skip
 _SOURCE_KEY = "\0".join(
     [source_of(*TRACED), *PARAMETER_LANES, *FORMULA_INPUTS, *FORMULA_OUTPUTS, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"]
 )

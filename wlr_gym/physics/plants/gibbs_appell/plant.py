@@ -167,7 +167,7 @@ class GibbsAppellPlant(Simulator):
         features = drive.families(self.parameters) | ground.families(self.parameters)
         if self._formulas:
             features.add("forces")
-        if "compliance" in features:  # its line search rounds otherwise beside rotors with play: the same bits with and without them
+        if "compliance" in features:  # its line search rounds otherwise beside rotors with play: the same bits with and without
             features.add("backlash")
         if self._features is None or not features <= self._features:
             self._features = frozenset(features | (self._features or frozenset()))
@@ -255,7 +255,8 @@ class GibbsAppellPlant(Simulator):
 
     def expect_all_effects(self) -> None:
         """Compile for every family of effects; see :class:`wlr_gym.physics.plants.simulator.Simulator`."""
-        self._features = frozenset({"rolling_resistance", "drive", "backlash", "ground", "compliance"}) | (self._features or set())
+        known = {"rolling_resistance", "drive", "backlash", "ground", "compliance"}
+        self._features = frozenset(known) | (self._features or set())
         formulas = self._formulas.module if self._formulas else None
         self._kernel = kernel.load_kernel(self._features, self.options.precision, self._width, formulas)
 

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops, source_of, straight_line_source
-from wlr_gym.physics.plants import drive, forces, ground
+from wlr_gym.physics.plants import drive, forces, gears, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import kinematics, lanes
 from wlr_gym.physics.plants.gibbs_appell import step as engine
+from wlr_gym.physics.plants.mujoco import own_forces
 from wlr_gym.physics.plants.mujoco import step as source
 from wlr_gym.physics.plants.mujoco.packing import PARAMETER_LANES
 from wlr_gym.physics.plants.mujoco.step import CORNERS, STATE
@@ -161,5 +162,7 @@ def load_kernel() -> ModuleType:
 
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
-TRACED = (source, engine, kinematics, lanes, forces, servo, drive, ground, ops, graph, sys.modules[__name__])
+TRACED = (
+    source, own_forces, engine, kinematics, lanes, forces, servo, drive, gears, ground, ops, graph, sys.modules[__name__]
+)  # fmt: skip
 _SOURCE_KEY = "\0".join([source_of(*TRACED), *PARAMETER_LANES, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"])

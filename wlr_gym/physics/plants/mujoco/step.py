@@ -14,7 +14,7 @@ the motors' torques and this step's model fields, after it :func:`after` reads w
   sphere is placed so that MuJoCo's contact point, which lies halfway into the overlap, is exactly the disc's lowest point.
 - Rolling resistance is a torque of our own: MuJoCo's (``condim`` 6) shares one cone with sliding friction, so a wheel that
   rolls would lose its grip. Tyre creep is a force of our own: MuJoCo's friction knows no such curve. Both depend on a rate,
-  steeply; see :func:`_relaxed`.
+  steeply; see ``own_forces.py``.
 - MuJoCo's velocities: of the body origin in the floor frame, angular in the body frame, joint rates relative to the parent.
 """
 
@@ -26,7 +26,7 @@ from typing import Any
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
-from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants import drive, gears, ground
 from wlr_gym.physics.plants.forces import COORDINATES
 from wlr_gym.physics.plants.gibbs_appell import step as engine
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
@@ -41,6 +41,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     wheel_points,
 )
 from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS
+from wlr_gym.physics.plants.mujoco import own_forces
 from wlr_gym.robot import FIRST_WHEEL
 
 #: Families of effects: always all, so that no robot's bits can depend on what its neighbours have.
@@ -63,6 +64,7 @@ CONTACT: tuple[str, ...] = tuple(f"floor_{a}{i}" for i in CORNERS for a in AXES)
 #: Generalised forces of formulas.
 FORMULA: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
 
+_KEPT = ("voltage", "share", "rotor_free", "rotor_gain", "ripple", "creep", "rotor_friction")
 #: Kept from step to step beside MuJoCo's own state; the second part describes the last step, the third sums over the tick.
 STATE: tuple[str, ...] = (
     *drive.STATE,
@@ -73,7 +75,7 @@ STATE: tuple[str, ...] = (
     *(f"old_spin{i}" for i in CORNERS),
     *(f"old_{v}{a}" for v in "uw" for a in AXES),
     *(f"old_rate{j}" for j in range(8)),
-    *(f"{name}{j}" for j in range(8) for name in ("voltage", "share", "rotor_free", "rotor_gain", "ripple", "creep", "rotor_friction")),
+    *(f"{name}{j}" for j in range(8) for name in _KEPT),
     *(f"heading_{a}{i}" for i in CORNERS for a in "xy"),
     *(f"leg_arm_{a}{i}" for i in CORNERS for a in AXES),
     *(f"rolling_radius{i}" for i in CORNERS),
@@ -88,15 +90,8 @@ TICK_SUMS: tuple[str, ...] = STATE[-10:]
 #: Half the length (m) of the capsule that touches the floor with one end, and how far its axis leans up from the floor (rad).
 CAPSULE_HALF_LENGTH = 0.01
 CAPSULE_LEAN = math.pi / 6
-#: Gains of the integral hold of rolling resistance on the spin and on its change, in wheel inertia over the step.
-HOLD_SPIN = 0.2
-HOLD_CHANGE = 0.8
-#: Above this many steps of braking by its bound, rolling resistance brakes fully.
-HOLD_REACH = 8.0
 #: MuJoCo's smallest friction coefficient.
 LEAST_MU = 1e-5
-#: Slip speed (m/s) below which a direction of slip means nothing.
-LEAST_SLIP = 1e-9
 
 
 class Overlay(Mapping[str, Any]):
@@ -188,11 +183,11 @@ def _loads(lanes: Lanes, rows: list[Vector]) -> Out:
 
 
 def _push_joint(
-    lanes: Lanes, j: int, voltage: Value, joint: drive.Joint, pushed: drive.Push, step: Value, applied: Out, out: Out
+    lanes: Lanes, j: int, voltage: Value, joint: drive.Joint, pushed: gears.Push, step: Value, applied: Out, out: Out
 ) -> None:
     """Motor torque, damping (see the module) and dry friction of joint ``j``; a gear with play rubs on its rotor, here."""
     name, play = f"joint_rate{j}", lanes[f"half_play{j}"]
-    impulse, friction = drive.friction_on_rotor(pushed, joint.rate)
+    impulse, friction = gears.friction_on_rotor(pushed, joint.rate)
     impulse = ops.where_positive(play, impulse, pushed.impulse)
     applied[name] = applied[name] + (impulse - pushed.damping * joint.rate) * (1.0 / step)
     out[f"armature_{name}"] = lanes[f"joint_armature{j}"] + pushed.damping
@@ -234,9 +229,11 @@ def _push_wheel(
     push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * approach, 0.0)
     normal = ops.where_positive(-gap, push, 0.0)
     spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{FIRST_WHEEL + i}"]
-    rolling = _rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{FIRST_WHEEL + i}"], step)
+    rolling = own_forces.rolling_torque(
+        lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{FIRST_WHEEL + i}"], step
+    )
     out[f"rolling_torque{i}"], out[f"old_spin{i}"] = rolling, lanes[f"wheel_rate{i}"]
-    creep = _creep_force(lanes, i, mu, normal, slip, speed, spin_inertia, step)
+    creep = own_forces.creep_force(lanes, i, mu, normal, slip, speed, spin_inertia, step)
     for k, a in enumerate("xy"):
         out[f"own_force_{a}{i}"] = creep[k] = ops.where_positive(creeps, creep[k], 0.0)
     force = [creep[0] * heading[k] + creep[1] * lateral[k] for k in range(3)]
@@ -288,49 +285,6 @@ def _to_wheel(a: Vector, sine: Value, cosine: Value) -> Vector:
     return [cosine * a[0] - sine * a[2], a[1], sine * a[0] + cosine * a[2]]
 
 
-def _relaxed(old: Value, target: Value, stiffness: Value) -> Value:
-    """A force that falls steeply with the rate it acts on, explicit but stable at any step.
-
-    ``target`` is the force at the present rate, ``stiffness`` = -d force/d rate * step / apparent mass. The rate after the step
-    follows from the force: force = target + stiffness (old - force). Exact where the force is steady; where it changes it lags
-    by ``stiffness`` steps. For an apparent mass that is off by a factor c the scheme is stable for all c > 1/4.
-    """
-    return (target + stiffness * old) * (1.0 / (1.0 + stiffness))
-
-
-def _rolling_torque(lanes: Lanes, i: int, normal: Value, inertia: Value, step: Value) -> Value:
-    """Rolling resistance: brakes the absolute spin with at most c N a; at rest it holds.
-
-    Below the spin that the bound takes away in HOLD_REACH steps, the torque follows the spin, and its change, until there is
-    none (an integral hold): a load below the bound does not turn the wheel. Stable for every apparent inertia from the wheel's
-    own, k = 1, up: z^2 - (2 - k) z + 1 - HOLD_CHANGE k = 0 with k = own/apparent inertia.
-    """
-    spin, old = lanes[f"wheel_rate{i}"], lanes[f"old_spin{i}"]
-    bound = lanes[f"rolling{i}"] * lanes[f"radius{i}"] * normal
-    change = HOLD_SPIN * spin + HOLD_CHANGE * (spin - old)
-    hold = ops.clip(lanes[f"rolling_torque{i}"] - (inertia * change) * (1.0 / step), -bound, bound)
-    turns = inertia * ops.absolute(spin) - HOLD_REACH * (step * bound)
-    return ops.where_positive(turns, -(bound * ops.sign(spin)), hold)
-
-
-def _creep_force(
-    lanes: Lanes, i: int, mu: ground.Friction, normal: Value, slip: Vector, speed: Value, spin_inertia: Value, step: Value
-) -> Vector:
-    """Tyre creep: N tanh(speed/creep_speed) along (mu_x^2 s_x, mu_y^2 s_y), against the slip."""
-    share, _ = ground.creep_share(lanes, i, speed)
-    ease = ops.sqrt(mu.mu_x * mu.mu_x * (slip[0] * slip[0]) + mu.mu_y * mu.mu_y * (slip[1] * slip[1])) + LEAST_SLIP * mu.mu_x
-    inverse_spin = lanes[f"radius{i}"] * lanes[f"radius{i}"] * (1.0 / spin_inertia)
-    lightness = [lanes[f"contact_lightness_x{i}"] + inverse_spin, lanes[f"contact_lightness_y{i}"]]
-    slope = normal * share * (1.0 / (ease + 1e-30))
-    force: Vector = []
-    for k, (a, m) in enumerate((("x", mu.mu_x), ("y", mu.mu_y))):
-        own = m * m * slope
-        force.append(_relaxed(lanes[f"own_force_{a}{i}"], -(own * slip[k]), step * (own * lightness[k])))
-    x, y = force[0] * mu.inverse_mu_x, force[1] * mu.inverse_mu_y
-    shrink = ops.minimum(normal / ops.sqrt(x * x + y * y + 1e-30), 1.0)
-    return [shrink * f for f in force]
-
-
 # ---- after a step ----------------------------------------------------------------------------------------------------
 
 
@@ -369,7 +323,9 @@ def _read_wheel(lanes: Lanes, i: int, out: Out) -> None:
     along, across, normal = c * floor[0] + s * floor[1], c * floor[1] - s * floor[0], floor[2]
     moment = lanes[f"leg_arm_x{i}"] * along + lanes[f"leg_arm_y{i}"] * across + lanes[f"leg_arm_z{i}"] * normal
     out[f"gear_torque{i}"] = lanes[f"constraint_joint_rate{i}"] - moment
-    out[f"gear_torque{FIRST_WHEEL + i}"] = lanes[f"constraint_joint_rate{FIRST_WHEEL + i}"] + lanes[f"rolling_radius{i}"] * along
+    out[f"gear_torque{FIRST_WHEEL + i}"] = (
+        lanes[f"constraint_joint_rate{FIRST_WHEEL + i}"] + lanes[f"rolling_radius{i}"] * along
+    )
     out[f"force_x{i}"], out[f"force_y{i}"] = along + lanes[f"own_force_x{i}"], across + lanes[f"own_force_y{i}"]
     out[f"force_z{i}"] = normal
 

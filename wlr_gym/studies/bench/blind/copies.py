@@ -31,7 +31,7 @@ SOFTNESS = (0.3, 1.0)
 FLATTENING = (0.2, 0.5)
 #: m; range of the rms height of the floor that such robots drive on: :data:`WAVES` waves of random heading and phase, whose
 #: lengths (m) lie in WAVE_LENGTH.
-UNEVENNESS = (0.03e-3, 0.1e-3)
+UNEVENNESS = (0.045e-3, 0.13e-3)
 WAVES = 8
 WAVE_LENGTH = (0.1, 0.8)
 
