@@ -12,7 +12,7 @@ CREEP, FRICTION = 0.02, 0.05
 
 
 def pulled(backend, share, step=1e-3, seconds=1.0, **changes):
-    """Rates (ticks, N) of the left front wheel of robots with wheels off, pulled along x by a share of what their gears hold."""
+    """Rates (ticks, N) of the left front wheel of robots with wheels off, pulled by a share of what gears hold."""
     count = len(share)
     parameters = Parameters.nominal(ROBOT, count)
     parameters["servo.coulomb_friction"] = np.repeat([50.0, FRICTION], 4)

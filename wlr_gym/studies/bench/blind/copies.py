@@ -201,7 +201,8 @@ def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
 
 def _waves(height: float, rng: np.random.Generator) -> Array:
     """Draw a floor whose rms height is ``height``."""
-    number = 2.0 * np.pi / np.exp(rng.uniform(*np.log(WAVE_LENGTH), WAVES))
+    shortest, longest = np.log(WAVE_LENGTH)
+    number = 2.0 * np.pi / np.exp(rng.uniform(shortest, longest, WAVES))
     heading, phase = rng.uniform(0.0, 2.0 * np.pi, (2, WAVES))
     each = np.full(WAVES, height * np.sqrt(2.0 / WAVES))
     return np.stack([each, number * np.cos(heading), number * np.sin(heading), phase], axis=1)
