@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rig import HOME, RADIUS, ROBOT, G
+from rig import HOME, RADIUS, ROBOT, WEIGHT, G
 
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
@@ -11,8 +11,8 @@ from wlr_gym.robot.parameters import Parameters
 BACKENDS = ["gibbs_appell", "mujoco"]
 
 
-def rolled(backend, parameters, setpoints=HOME, seconds=1.5, pull=None):
-    """Distance over angle, and motor torques (N, 4), of wheels that drive steadily."""
+def rolled(backend, parameters, setpoints, seconds=1.5):
+    """Distance over angle (N, 4) of wheels that drive steadily, and the truth at the end."""
     count = len(parameters)
     plant = make_plant(backend, ROBOT, count, PlantOptions(control_period=0.02, physics_step=1e-3, sensor_noise=False))
     plant.reset(parameters=parameters, state=standing_state(ROBOT, parameters))
@@ -52,3 +52,23 @@ def test_it_is_the_arm_of_friction_too(backend):
     assert torque[1] / torque[0] == pytest.approx(1.0 - share * deeper / RADIUS, abs=1e-3)
     slip = truth.slip_velocity.reshape(2, 4, 2)
     assert np.abs(slip).max() < 1e-4
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_wheel_in_the_air_lands_where_the_floor_is(backend):
+    """Only the arm of friction changes: dropped without spin, robots fall, land and bounce alike."""
+    parameters = Parameters.nominal(ROBOT, 2)
+    parameters["ground.flattening"][1] = 1.0
+    state = standing_state(ROBOT, parameters)
+    state.position[:, 2] += 0.01
+    plant = make_plant(backend, ROBOT, 2, PlantOptions(control_period=0.02, physics_step=1e-3, sensor_noise=False))
+    plant.reset(parameters=parameters, state=state)
+    lightest = np.inf
+    for _ in range(40):
+        plant.step(np.tile(HOME, (2, 1)))
+        truth = plant.truth()
+        lightest = min(lightest, truth.contact_force[:, 2::3].max())
+        np.testing.assert_allclose(truth.position[1, 2], truth.position[0, 2], atol=1e-6)
+    plant.close()
+    assert lightest == 0.0
+    assert truth.contact_force[:, 2::3].sum(axis=1) == pytest.approx(WEIGHT, rel=0.01)

@@ -57,6 +57,7 @@ EFFECTS = {
     "none": {},
     "rolling_resistance": {"ground.rolling_resistance": 0.02},
     "tyre_creep": {"ground.creep_speed": 0.02},
+    "gear_creep_and_flat_tyres": {"servo.creep_rate": 0.3, "ground.flattening": 0.5},
     "slip_weakening": {"ground.kinetic_ratio": 0.5},
     "stribeck_and_load": {"servo.stribeck_torque": 0.1, "servo.load_friction": 0.1},
     "torque_ripple": {"servo.ripple_amplitude": 0.05, "servo.ripple_order": 8.0},

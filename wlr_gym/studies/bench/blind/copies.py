@@ -185,7 +185,7 @@ def draw(robot: dict[str, Any], rng: np.random.Generator) -> Copy:
 
 
 def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
-    """Return the copy on soft tyres, with friction that creeps: what no robot file says and no two simulators share."""
+    """Soft tyres, an uneven floor, friction that creeps: what no robot file says and no two simulators share."""
 
     def drawn(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
