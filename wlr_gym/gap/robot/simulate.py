@@ -196,7 +196,7 @@ def _anchors_by_tick(clocks: Sequence[RunClock]) -> dict[int, list[tuple[int, in
 def _anchor(
     plant: Simulator, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters, readings: Sensors
 ) -> Sensors:
-    """Put one run's robots where they were measured at the start of a window."""
+    """Put one run's robots where they were measured at the start of a window; legs that move stay where they are."""
     robot, anchors, state = plant.robot, clock.anchors, _standing_where_lost(plant, lanes)
     own = Parameters(lanes.values[mine])
     legs, references = state.joint_position[mine, LEG_SLICE], state.reference_position[mine]
