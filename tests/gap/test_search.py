@@ -86,6 +86,19 @@ def test_right_name_place_and_size(effect, label):
     assert found.rounds[-1].selected is None
 
 
+@pytest.mark.parametrize(("surcharge", "found"), [(0.0, ["decoy_2 body"]), (1e4, [])])
+def test_of_what_resembles_a_common_thing_more_is_asked(surcharge, found):
+    problem = Toy({}, [sized("decoy_2", 0.8)])
+    ordinary = problem.candidates
+
+    def asked(setting, residuals, runs):
+        probes, candidates = ordinary(setting, residuals, runs)
+        return probes, [replace(c, surcharge=surcharge if c.name == "decoy_2" else 0.0) for c in candidates]
+
+    problem.candidates = asked
+    assert labels(named(problem)) == found
+
+
 @pytest.mark.parametrize("error", [0.0, 1.0, 3.0])
 def test_noise_gets_no_name(error):
     found = []

@@ -131,6 +131,7 @@ class Candidate:
         tolerances: per unknown, the calibrated parameters it meets; empty = it meets none.
         within: brings values back to where the effect is plausible, where ranges of single unknowns do not say it (a load's
             moments, whose range grows with its mass); None = the ranges say it.
+        surcharge: by how much more than others it must improve the fit.
     """
 
     name: str
@@ -144,6 +145,7 @@ class Candidate:
     tolerances: tuple[Tolerance | None, ...] = ()
     within: Callable[[Sequence[float]], tuple[float, ...]] | None = None
     doc: str = ""
+    surcharge: float = 0.0
 
     @property
     def label(self) -> str:

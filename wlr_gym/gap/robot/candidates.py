@@ -88,7 +88,7 @@ class _Library:
         own = None if search.coordinates is None else search.coordinates(where, self.observed)
         unknowns = self._unknowns(effect, search) if own is None else _fitted(own)
         tolerances = tuple(self._tolerance(effect, where, unknown.name, known) for unknown in unknowns) if known else ()
-        candidate = Candidate(effect.name, where, unknowns, starts, tolerances=tolerances)
+        candidate = Candidate(effect.name, where, unknowns, starts, tolerances=tolerances, surcharge=search.surcharge)
         if own is None:
             return candidate
         return replace(candidate, fixed=own.fixed, convert=own.parameters, within=own.within)

@@ -20,7 +20,7 @@ from wlr_gym.gap.estimation.likelihood import estimate_noise, minus_two_log_like
 from wlr_gym.gap.estimation.model import FittedModel, moved, on_bounds, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
-from wlr_gym.gap.selection.screening import LEAST_GAIN, least_gain
+from wlr_gym.gap.selection.screening import LEAST_GAIN, asked_of
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -282,7 +282,7 @@ def _tolerances_do(problem: Problem, runs: Sequence[int], threshold: float, fina
         for found in (bare, final.fit)
     ]
     room = 1.0 if _has_a_number_of_its_own(final.hypothesis.candidate) else CLEARLY
-    return costs[0] - costs[1] < room * least_gain(len(final.hypothesis.values), threshold)
+    return costs[0] - costs[1] < room * asked_of(final.hypothesis.candidate, threshold)
 
 
 def _has_a_number_of_its_own(candidate: Candidate) -> bool:
@@ -297,7 +297,7 @@ def shown_by_some_runs_only(hypothesis: Hypothesis, threshold: float) -> bool:
 
 
 def _is_good(threshold: float, hypothesis: Hypothesis) -> bool:
-    return hypothesis.gain >= least_gain(len(hypothesis.values), threshold) and hypothesis.plausible
+    return hypothesis.gain >= asked_of(hypothesis.candidate, threshold) and hypothesis.plausible
 
 
 def converge(problem: Problem, runs: Sequence[int], final: Finalist, bare: Fit, tell: Tell) -> tuple[Finalist, Fit]:

@@ -18,7 +18,7 @@ def detectable(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> dict[s
     Of an effect with directions of its own (x, y, z of a displaced mass) it is the one that shows best: in another it may hide
     at any size. First order: the gain of an effect grows with the square of its severity. Where no plausible size would show,
     its size is NaN. Formulas are left out: their laws have no size in common. ``threshold``: see
-    :func:`wlr_gym.gap.selection.screening.least_gain`.
+    :func:`wlr_gym.gap.selection.screening.asked_of`.
     """
     found: dict[str, tuple[float, Detectable]] = {}
     for score in scores:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.selection.hypothesis import MOST_HARM, Hypothesis
-from wlr_gym.gap.selection.screening import LEAST_GAIN, least_gain
+from wlr_gym.gap.selection.screening import LEAST_GAIN, asked_of
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], thre
     """Return the share of bootstrap samples of the runs in which the selected effect is accepted and no other fits better.
 
     A run counts by its part in the gain, as fitted to all runs: no sample is refitted. ``threshold``: see
-    :func:`wlr_gym.gap.selection.screening.least_gain`.
+    :func:`wlr_gym.gap.selection.screening.asked_of`.
     """
     rng = np.random.default_rng(0)
     rivals = [other for other in others if other.candidate.name != selected.candidate.name and not other.tolerable]
@@ -34,7 +34,7 @@ def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], thre
     parts = _parts(selected)[picks]
     gains = parts.sum(axis=1)
     agreed = -parts.clip(max=0.0).sum(axis=1) <= MOST_HARM * parts.clip(min=0.0).sum(axis=1)
-    wins = agreed & (gains >= least_gain(len(selected.values), threshold))
+    wins = agreed & (gains >= asked_of(selected.candidate, threshold))
     for rival in rivals:
         wins &= gains >= _parts(rival)[picks].sum(axis=1)
     return float(wins.mean())

@@ -16,7 +16,7 @@ from wlr_gym.gap.analysis import (
 )
 from wlr_gym.gap.problem import Problem
 from wlr_gym.gap.selection.hypothesis import Hypothesis
-from wlr_gym.gap.selection.screening import least_gain
+from wlr_gym.gap.selection.screening import asked_of
 from wlr_gym.gap.selection.search import Round
 
 #: Reason why an effect that was selected is not kept.
@@ -87,7 +87,7 @@ def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Contain
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"
     if best is None:
-        least = least_gain(len(hypothesis.values), look.threshold)
+        least = asked_of(hypothesis.candidate, look.threshold)
         return TOO_LITTLE, f"improves the fit by less than chance or an imperfect simulator or formula can ({least:.0f})"
     return WORSE_FIT, f"improves the fit by {max(hypothesis.gain, 0.0) / best.gain:.0%} of what the best does"
 

@@ -37,9 +37,14 @@ def least_gain(unknowns: int, threshold: float = LEAST_GAIN) -> float:
     return threshold + PER_UNKNOWN * (unknowns - 1)
 
 
+def asked_of(candidate: Candidate, threshold: float = LEAST_GAIN) -> float:
+    """Return by how much a candidate must improve the fit; ``threshold``: as for :func:`least_gain`."""
+    return least_gain(len(candidate.unknowns), threshold) + candidate.surcharge
+
+
 def least_amplitude(candidate: Candidate, information: Array, k: int, threshold: float = LEAST_GAIN) -> float:
     """Return the smallest amplitude of direction ``k`` that would be accepted: clear, and beyond what a tolerance allows."""
-    clear = float(np.sqrt(least_gain(len(candidate.unknowns), threshold) / max(float(information[k, k]), 1e-12)))
+    clear = float(np.sqrt(asked_of(candidate, threshold) / max(float(information[k, k]), 1e-12)))
     tolerance = candidate.tolerances[k] if k < len(candidate.tolerances) else None
     return clear if tolerance is None else max(clear, tolerance.reach)
 

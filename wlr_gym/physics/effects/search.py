@@ -144,6 +144,8 @@ class Search:
         least: below these values of its parameters the effect is what any robot has, and calibration's.
         relation_of_all: the relation, where it acts at all its places; empty = none in particular.
         one_per_place: beside another one of its kind at the same place no fit could move it.
+        surcharge: by how much more than others it must improve a fit (fall of minus two log posterior), where something that
+            every robot meets resembles it.
     """
 
     relation: str
@@ -155,6 +157,7 @@ class Search:
     least: Mapping[str, float] = field(default_factory=dict)
     relation_of_all: str = ""
     one_per_place: bool = False
+    surcharge: float = 0.0
 
 
 def steps(parameter: str, *sizes: float, neutral: float = 0.0) -> Callable[[Places, Observed], list[Guess]]:
