@@ -45,6 +45,7 @@ class Anchors:
         swing: (W, 4) range of a leg's readings or setpoints nearby, rad.
         effort: (W, 8) mean of the efforts nearby, N m; NaN where not measured or the motor is off.
         unrest: (W, 8) their range, N m.
+        ramp, jolt: (W, 8) value there of a parabola through them, and how far they lie from it at most, N m.
         pose, pose_rate: (W, 3) what the camera shows (x, y, heading), and its rate; NaN where not measured.
     """
 
@@ -53,6 +54,8 @@ class Anchors:
     swing: Array
     effort: Array
     unrest: Array
+    ramp: Array
+    jolt: Array
     pose: Array
     pose_rate: Array
 
@@ -89,9 +92,18 @@ class RunClock:
         efforts[~self.torque_on.T] = np.nan
         effort = np.array([efforts[:, rows].mean(axis=1) for rows in near]).reshape(len(rows), 8)
         unrest = np.array([np.ptp(efforts[:, rows], axis=1) for rows in near]).reshape(len(rows), 8)
+        smooth = [_parabola(self.t[rows] - self.t[row], efforts[:, rows]) for row, rows in zip(rows, near, strict=True)]
+        ramp, jolt = np.array(smooth).reshape(len(rows), 2, 8).transpose(1, 0, 2)
         pose = np.full((2, 3, len(rows)), np.nan)
         if has_camera(run):
             fits = [local_fit(self.t, seen, times, CAMERA_WINDOW) for seen in camera_pose(run)]
             pose = np.where(frame_near(run, times), np.stack(fits, axis=1), np.nan)
         tick = np.floor((times - self.begin) / CLOCK + 1e-9).astype(int)
-        return Anchors(tick, np.transpose(legs), swing, effort, unrest, pose[0].T, pose[1].T)
+        return Anchors(tick, np.transpose(legs), swing, effort, unrest, ramp, jolt, pose[0].T, pose[1].T)
+
+
+def _parabola(t: Array, values: Array) -> tuple[Array, Array]:
+    """Value at t = 0 of parabolas through ``values`` (K, rows), and how far these lie from them at most, both (K,)."""
+    powers = np.vander(t, 3)
+    coefficients = np.linalg.pinv(powers) @ values.T
+    return coefficients[-1], np.abs(values.T - powers @ coefficients).max(axis=0)

@@ -45,8 +45,9 @@ PRECISION = {"gibbs_appell": "float32"}
 SWEEPS = 2
 #: Counts of its encoder within which a leg stands.
 STANDS = 1.5
-#: Sigmas within which a wheel's efforts are at rest: what the spring of its controller holds is read off no jolt.
-UNREST = 6.0
+#: Sigmas within which a wheel's efforts are at rest, and by which they may differ from a parabola: what the spring of its
+#: controller holds is read off no jolt.
+UNREST, JOLT = 6.0, 2.2
 #: Robots simulated at once: what they read stays in the processor's cache.
 MOST_ROBOTS = 512
 #: Robots of a tile of the engine in single precision.
@@ -201,8 +202,7 @@ def _anchor(
     own = Parameters(lanes.values[mine])
     legs, references = state.joint_position[mine, LEG_SLICE], state.reference_position[mine]
     state.joint_position[mine, LEG_SLICE] = _standing_legs(robot, own, anchors, window, legs, references)
-    quiet = anchors.unrest[window, WHEEL_SLICE] <= UNREST * channel_noise(robot)[f"eff_{WHEELS[0]}"]
-    missing = np.where(quiet, anchors.effort[window, WHEEL_SLICE] - readings.joint_effort[mine, WHEEL_SLICE], 0.0)
+    missing = _smooth_efforts(robot, anchors, window) - readings.joint_effort[mine, WHEEL_SLICE]
     state.reference_position[mine, WHEEL_SLICE] += np.nan_to_num(missing) * _tension_per_effort(robot, own)[:, WHEEL_SLICE]
     if np.isfinite(anchors.pose[window]).all():
         _place(state, clock, window, mine, lanes)
@@ -238,6 +238,13 @@ def _standing_legs(robot: Robot, parameters: Parameters, anchors: Anchors, row: 
     held = np.clip(references[:, LEG_SLICE] - pull, reading - half, reading + half)
     stands = anchors.swing[row] <= STANDS * robot.sensors.encoder.position
     return np.where(stands, np.where(np.isfinite(held), held, reading), legs)
+
+
+def _smooth_efforts(robot: Robot, anchors: Anchors, row: int) -> Array:
+    """Efforts (4,) of the wheels at an anchor, N m; NaN where they jump."""
+    sigma = channel_noise(robot)[f"eff_{WHEELS[0]}"]
+    effort, unrest, ramp, jolt = (x[row, WHEEL_SLICE] for x in (anchors.effort, anchors.unrest, anchors.ramp, anchors.jolt))
+    return np.where(unrest <= UNREST * sigma, effort, np.where(jolt <= JOLT * sigma, ramp, np.nan))
 
 
 def _tension_per_effort(robot: Robot, parameters: Parameters) -> Array:
