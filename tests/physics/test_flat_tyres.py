@@ -63,7 +63,7 @@ def test_a_wheel_in_the_air_lands_where_the_floor_is(backend):
     state.position[:, 2] += 0.01
     plant = make_plant(backend, ROBOT, 2, PlantOptions(control_period=0.02, physics_step=1e-3, sensor_noise=False))
     plant.reset(parameters=parameters, state=state)
-    lightest = np.inf
+    lightest, truth = np.inf, plant.truth()
     for _ in range(40):
         plant.step(np.tile(HOME, (2, 1)))
         truth = plant.truth()
