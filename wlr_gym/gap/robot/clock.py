@@ -87,12 +87,12 @@ class RunClock:
         legs = [local_fit(self.t, run[f"pos_{joint}"], times, JOINT_WINDOW)[0] for joint in LEGS]
         near = [slice(max(row - NEAR, 0), row + NEAR + 1) for row in rows]
         angles = np.array([[run[f"pos_{joint}"], run[f"cmd_{joint}"]] for joint in LEGS])
-        swing = np.array([np.fmax.reduce(np.ptp(angles[:, :, rows], axis=2), axis=1) for rows in near]).reshape(len(rows), 4)
+        swing = np.array([np.fmax.reduce(np.ptp(angles[:, :, part], axis=2), axis=1) for part in near]).reshape(len(rows), 4)
         efforts = run.table.reindex(columns=[f"eff_{joint}" for joint in JOINTS]).to_numpy(float).T.copy()
         efforts[~self.torque_on.T] = np.nan
-        effort = np.array([efforts[:, rows].mean(axis=1) for rows in near]).reshape(len(rows), 8)
-        unrest = np.array([np.ptp(efforts[:, rows], axis=1) for rows in near]).reshape(len(rows), 8)
-        smooth = [_parabola(self.t[rows] - self.t[row], efforts[:, rows]) for row, rows in zip(rows, near, strict=True)]
+        effort = np.array([efforts[:, part].mean(axis=1) for part in near]).reshape(len(rows), 8)
+        unrest = np.array([np.ptp(efforts[:, part], axis=1) for part in near]).reshape(len(rows), 8)
+        smooth = [_parabola(self.t[part] - time, efforts[:, part]) for time, part in zip(times, near, strict=True)]
         ramp, jolt = np.array(smooth).reshape(len(rows), 2, 8).transpose(1, 0, 2)
         pose = np.full((2, 3, len(rows)), np.nan)
         if has_camera(run):

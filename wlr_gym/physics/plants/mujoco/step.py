@@ -207,8 +207,8 @@ def _push_wheel(
     arm = [leg[k] + rim[k] for k in range(3)]
     velocity = _point_velocity(lanes, i, point, arm, rim)
     gap = lanes["pz"] + dot(n, point)
-    rolls, out[f"rolling_radius{i}"] = rolling_contact(lanes, i, (hip, leg, rim), n, scale, FEATURES)
-    rise = rolls or [0.0] * 3
+    rise, out[f"rolling_radius{i}"] = rolling_contact(lanes, i, (hip, leg, rim), n, scale, FEATURES)
+    assert rise is not None  # FEATURES know of tyres that flatten
     _place_sphere(lanes, i, n, scale, gap, dot(n, rise), out)
     approach = dot(n, velocity)
     point, arm, rim = ([x + y for x, y in zip(whole, rise, strict=True)] for whole in (point, arm, rim))
