@@ -88,6 +88,23 @@ def test_a_constant_error_that_a_number_can_remove_is_no_single_reading():
     assert found.noise.autocorrelation_time[2] / found.noise.scatter < 2.0
 
 
+def test_a_fit_does_not_slide_back_as_what_is_left_lasts_longer():
+    """A constant that is left lengthens the autocorrelation time: were it to count, the tolerance would pull it further."""
+
+    class Held(Constant):
+        tempering = 12.0
+
+        def shape(self, name):
+            return 0.1 * super().shape(name) if name == "offset" else super().shape(name)
+
+    found = []
+    for seed in range(6):
+        problem = Held({"offset": 2.0}, seed=seed, error=0.5, white=0.3, rows=1000)
+        fitted = fit(problem, all_runs(problem), nominal_model(problem), scatter=30.0)
+        found.append((scaled_numbers(problem, fitted.model) - scaled_numbers(problem, nominal_model(problem)))[1])
+    assert np.mean(found) > 0.95  # 0.84 where it slides
+
+
 def test_runs_that_differ_by_what_the_numbers_can_explain_scatter_less_than_assumed():
     problem = Toy({"gain": 2.0})
     found = fit(problem, all_runs(problem), nominal_model(problem), scatter=100.0)

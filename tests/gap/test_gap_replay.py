@@ -1,6 +1,7 @@
 """Replays of runs that the engine itself made: what went in must come out."""
 
 import threading
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ from engine_runs import META, ROBOT, abrupt, free_rear_wheels, nominal, posture_
 from wlr_gym.data import RunMeta
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.robot import loop, simulate
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
+from wlr_gym.gap.robot.problem import RobotProblem
 from wlr_gym.gap.robot.recorder import TRUTH
 from wlr_gym.gap.robot.schedule import WrittenSetpoints
 from wlr_gym.gap.robot.simulate import replay_batch
@@ -273,6 +276,33 @@ def test_a_window_begins_with_the_loads_that_were_measured(window):
     rms = np.sqrt(np.nanmean(found**2, axis=0))
     assert rms[[CHANNELS.index(f"eff_{leg}") for leg in JOINTS[:4]]].max() < 1.3
     assert rms[[CHANNELS.index(f"pos_{wheel}") for wheel in JOINTS[4:]]].max() < 1.2
+
+
+def test_a_window_begins_with_the_springs_that_the_efforts_before_it_showed():
+    """Wheels that seem to work against each other at the start, and jolt: the mean error of the last second is the springs'."""
+    true = record(abrupt, spaced(4.0))
+    table = true.table.copy()
+    for wheel, push in zip(JOINTS[4:], (0.15, -0.15, -0.15, 0.15), strict=True):
+        table.loc[table["t"] <= 0.2, f"eff_{wheel}"] += push
+    clock = RunClock(replace(true, table=table))
+    efforts = [CHANNELS.index(f"eff_{wheel}") for wheel in JOINTS[4:]]
+    error = (replay_batch(ROBOT, [clock], nominal())[0].values[0] - measured(true))[:, efforts]
+    first = clock.windows[1].start
+    before, after = (np.abs(error[rows].mean(axis=0)) for rows in (slice(first - 10, first), slice(first, first + 10)))
+    assert before.min() > 0.08
+    assert after.max() < 0.2 * before.min()
+
+
+def test_a_run_that_begins_in_motion_is_compared_once_motors_and_imu_read():
+    whole = record(posture_and_turns, spaced(4.0))
+    moving = replace(whole, table=whole.table.iloc[60:].reset_index(drop=True))
+    problem = RobotProblem([whole, moving])
+    for r, is_known in ((0, True), (1, False)):
+        (found,) = problem.residuals([nominal_model(problem).setting], [r])
+        first = {name: bool(np.isfinite(found[0, 0, c])) for c, name in enumerate(CHANNELS)}
+        assert first["eff_leg_lf"] is first["gyro_z"] is first["volt"] is is_known
+        assert first["pos_leg_lf"]
+        assert first["vel_wheel_lf"]
 
 
 def test_a_window_does_not_show_the_drift_before_it():

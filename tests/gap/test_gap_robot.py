@@ -173,6 +173,21 @@ def test_every_effect_of_the_library_is_tried(tried):
     assert {candidate.name for candidate in tried[1]} == {name for name, effect in EFFECTS.items() if effect.search}
 
 
+def test_components_of_a_vector_are_tried_alone(tried):
+    angles = [candidate for candidate in tried[1] if candidate.name == "imu_misalignment"]
+    assert [[unknown.name for unknown in one.unknowns] for one in angles] == [
+        ["roll", "pitch", "yaw"], ["roll"], ["pitch"], ["yaw"]
+    ]  # fmt: skip
+    whole, *_, yaw = angles
+    assert yaw.starts[0].directions == whole.starts[0].directions[2:]
+    assert yaw.starts[0].values(np.array([2.0])) == whole.starts[0].values(np.array([0.0, 0.0, 2.0]))[2:]
+    turned = apply_patch(Patch((yaw.effect((0.1,)),)), NOMINAL)  # what is left out is neutral
+    assert turned["imu.mount"][0] == pytest.approx(NOMINAL["imu.mount"][0] + np.array([0.0, 0.0, 0.1]))
+    centre = [candidate for candidate in tried[1] if candidate.name == "com_offset"]
+    assert [len(candidate.tolerances) for candidate in centre] == [3, 1, 1, 1]
+    assert not [candidate for candidate in tried[1] if candidate.name == "payload"][1:]
+
+
 def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
     problem = RobotProblem([good])
     nominal = nominal_model(problem)

@@ -29,7 +29,7 @@ from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
 from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
 from wlr_gym.gap.selection.outcomes import REFUTED, evidence_of
 from wlr_gym.gap.selection.refit import refit
-from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
+from wlr_gym.gap.selection.screening import LEAST_GAIN, PER_UNKNOWN, Score, responses, screen
 from wlr_gym.gap.selection.search import (
     MORE_NAMES,
     MOST_EFFECTS,
@@ -97,6 +97,18 @@ def test_of_what_resembles_a_common_thing_more_is_asked(surcharge, found):
 
     problem.candidates = asked
     assert labels(named(problem)) == found
+
+
+@pytest.mark.parametrize(("gain", "unknowns"), [(PER_UNKNOWN - 0.1, 1), (PER_UNKNOWN + 0.1, 2)])
+def test_a_component_stays_where_the_whole_vector_gains_no_more_than_its_further_unknown_costs(gain, unknowns):
+    whole = candidate(Toy(), "ripple")
+    part = replace(
+        whole, unknowns=whole.unknowns[:1], starts=(replace(whole.starts[0], directions=whole.starts[0].directions[:1]),)
+    )
+    other = candidate(Toy(), "twin")
+    scores = [Score(c, (), g, 1.0, np.eye(1), c.starts[0]) for c, g in ((whole, 30.0 + gain), (part, 30.0), (other, 5.0))]
+    best, last = search._one_per_label(scores)
+    assert (len(best.candidate.unknowns), last.candidate) == (unknowns, other)
 
 
 @pytest.mark.parametrize("error", [0.0, 1.0, 3.0])

@@ -12,7 +12,7 @@ from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
-from wlr_gym.physics.servo import motor_constants, position_gains
+from wlr_gym.physics.servo import reference_per_effort
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -174,11 +174,9 @@ def camera_pose(run: Run) -> Array:
 
 def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:
     """Distance of the wheels' reference from their angle (1, 4) that gives the measured effort at rest."""
-    nominal_voltage = robot.servo.supply_voltage
-    constant, resistance = motor_constants(robot.servo.wheel.stall_torque, robot.servo.wheel.no_load_speed, nominal_voltage)
     still = _rows_before_motion(run)
     effort = [np.mean(run[f"eff_{joint}"][still]) if f"eff_{joint}" in run else 0.0 for joint in WHEELS]
-    return np.nan_to_num(effort) * resistance / constant / np.maximum(position_gains(parameters)[:, WHEEL_SLICE], 1e-9)
+    return np.nan_to_num(effort) * reference_per_effort(robot, parameters)[:, WHEEL_SLICE]
 
 
 def _rows_before_motion(run: Run) -> NDArray[np.bool_]:

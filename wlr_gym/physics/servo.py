@@ -130,6 +130,14 @@ def position_gains(parameters: Parameters) -> Array:
     return gains
 
 
+def reference_per_effort(robot: Robot, parameters: Parameters) -> Array:
+    """Return by how much the joints' references (N, 8) lie ahead per reported effort at rest, rad/(N m)."""
+    constant, _ = line_constants(robot)
+    stall, speed = parameters["servo.stall_torque"], parameters["servo.no_load_speed"]
+    _, resistance = motor_constants(stall, speed, robot.servo.supply_voltage)
+    return resistance / constant / np.maximum(position_gains(parameters), 1e-9)
+
+
 # --- profile generator ------------------------------------------------------------------------------------------------
 
 

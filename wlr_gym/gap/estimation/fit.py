@@ -173,10 +173,9 @@ def fit(
         residuals, columns = linearise(problem, model, runs, near.columns, near.noise)
     else:
         residuals, columns = linearise(problem, model, runs)
-    gained, most = np.inf, scatter
+    gained, most, tau = np.inf, scatter, autocorrelation_time
     for step in range(steps):
-        tau = autocorrelation_time
-        if tau is None:  # the same cost in all steps of a descent
+        if autocorrelation_time is None:  # the same cost in all steps of a descent
             reachable = _noise_within_reach(problem, model, columns, residuals, most)
             tau, scatter = reachable.autocorrelation_time, reachable.scatter
         model, residuals, gained = _descend(problem, runs, model, columns, residuals, tau, scatter)
@@ -184,7 +183,7 @@ def fit(
         if gained < RENEWED or not renew or step == steps - 1:
             break
         residuals, columns = linearise(problem, model, runs, columns, estimate_noise(residuals, autocorrelation_time, scatter))
-    model, residuals = _relaxed(problem, runs, model, columns, residuals, autocorrelation_time, scatter)
+    model, residuals = _relaxed(problem, runs, model, columns, residuals, tau, scatter)
     noise = estimate_noise(residuals, autocorrelation_time, scatter)
     matrix, _ = normal_equations(columns, residuals, noise, problem.threads)
     pinned = np.diag(PINNED * on_bounds(problem, model))

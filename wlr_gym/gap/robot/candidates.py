@@ -48,8 +48,8 @@ def robot_candidates(
         drifting: names of the quantities that drift: no effect hides in their tolerance.
     """
     library = _Library(observe(parameters, measured, simulated, residuals), tolerances, drifting)
-    candidates = [found for effect, search, where in _searches() if (found := library.candidate(effect, search, where))]
-    return list(library.probes.values()), candidates
+    found = [own for effect, search, where in _searches() for own in library.candidates(effect, search, where)]
+    return list(library.probes.values()), found
 
 
 def shown_by() -> Mapping[str, str]:
@@ -75,7 +75,14 @@ class _Library:
     drifting: Set[str]
     probes: dict[str, Probe] = field(default_factory=dict)
 
-    def candidate(self, effect: Effect, search: Search, where: Places) -> Candidate | None:
+    def candidates(self, effect: Effect, search: Search, where: Places) -> list[Candidate]:
+        """Return an effect at a set of places, and each component of a vector alone; none where these runs cannot show it."""
+        whole = self._candidate(effect, search, where)
+        if whole is None:
+            return []
+        return [whole, *(_component(whole, k) for k in range(len(whole.unknowns)) if search.components)]
+
+    def _candidate(self, effect: Effect, search: Search, where: Places) -> Candidate | None:
         """Return an effect at a set of places; None where these runs cannot show it."""
         at_all = set(where) == set(effect.where)
         known = {name: number for name, number in search.known.items() if at_all or "{}" in number.quantity}
@@ -149,6 +156,17 @@ class _Library:
         size = number.scale(self.observed) * self.tolerances[quantities[0]]
         replaces = unknown in effect.parameters and isinstance(effect.parameters[unknown].neutral, str)
         return Tolerance(quantities, size, 0.0 if number.any_size else REACH, replaces)
+
+
+def _component(whole: Candidate, k: int) -> Candidate:
+    """One component of an effect that is a vector, alone; direction ``k`` of each start moves it."""
+
+    def start(own: Start) -> Start:
+        one = np.eye(len(own.directions))[k]
+        return Start((own.directions[k],), lambda a: (own.values(float(a[0]) * one)[k],))
+
+    starts = tuple(start(own) for own in whole.starts)
+    return replace(whole, unknowns=(whole.unknowns[k],), starts=starts, tolerances=whole.tolerances[k : k + 1])
 
 
 def _fitted(coordinates: Coordinates) -> tuple[Unknown, ...]:

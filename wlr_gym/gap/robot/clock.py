@@ -22,7 +22,7 @@ from wlr_gym.data.run_states import (
 )
 from wlr_gym.gap.robot.windows import WINDOW, window_rows
 from wlr_gym.physics.plants.base import PlantState
-from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 CLOCK = 0.004
 #: s; the robot stands this long before the first row.
 LEAD = 0.3
-#: Rows before and after an anchor that are near it.
-NEAR = 3
+#: s before and after an anchor that are near it.
+NEAR = 0.065
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +43,7 @@ class Anchors:
         tick: of the plant's clock.
         legs: (W, 4) leg readings, rad.
         swing: (W, 4) range of a leg's readings or setpoints nearby, rad.
-        effort: (W, 8) mean of the efforts nearby, N m; NaN where not measured or the motor is off.
-        unrest: (W, 8) their range, N m.
-        ramp, jolt: (W, 8) value there of a parabola through them, and how far they lie from it at most, N m.
+        effort: (W, 4) mean of the legs' efforts nearby, N m; NaN where not measured or the motor is off.
         pose, pose_rate: (W, 3) what the camera shows (x, y, heading), and its rate; NaN where not measured.
     """
 
@@ -53,9 +51,6 @@ class Anchors:
     legs: Array
     swing: Array
     effort: Array
-    unrest: Array
-    ramp: Array
-    jolt: Array
     pose: Array
     pose_rate: Array
 
@@ -70,7 +65,12 @@ class RunClock:
         commands = np.stack([run[name] for name in COMMANDS], axis=1)
         self.setpoints: Array = held_setpoints(run)
         self.torque_on = np.isfinite(commands)
-        self.begin = self.t[0] - (LEAD if starts_at_rest(run) else 0.0)
+        #: s that it stands before the first row.
+        self.lead: float = LEAD if starts_at_rest(run) else 0.0
+        self.begin = self.t[0] - self.lead
+        #: (rows, 8) N m; NaN where not measured or the motor is off.
+        self.efforts: Array = run.table.reindex(columns=[f"eff_{joint}" for joint in JOINTS]).to_numpy(float).copy()
+        self.efforts[~self.torque_on] = np.nan
         self.ticks: int = int(np.ceil((self.t[-1] - self.begin) / CLOCK)) + 1
         self.anchors: Anchors = self._anchors([window.start for window in self.windows[1:]])
         self.start: Anchors = self._anchors([0])
@@ -85,25 +85,14 @@ class RunClock:
     def _anchors(self, rows: list[int]) -> Anchors:
         run, times = self.run, self.t[rows]
         legs = [local_fit(self.t, run[f"pos_{joint}"], times, JOINT_WINDOW)[0] for joint in LEGS]
-        near = [slice(max(row - NEAR, 0), row + NEAR + 1) for row in rows]
+        edges = np.searchsorted(self.t, [times - NEAR, times + NEAR]).T
+        near = [slice(first, last) for first, last in edges.tolist()]
         angles = np.array([[run[f"pos_{joint}"], run[f"cmd_{joint}"]] for joint in LEGS])
         swing = np.array([np.fmax.reduce(np.ptp(angles[:, :, part], axis=2), axis=1) for part in near]).reshape(len(rows), 4)
-        efforts = run.table.reindex(columns=[f"eff_{joint}" for joint in JOINTS]).to_numpy(float).T.copy()
-        efforts[~self.torque_on.T] = np.nan
-        effort = np.array([efforts[:, part].mean(axis=1) for part in near]).reshape(len(rows), 8)
-        unrest = np.array([np.ptp(efforts[:, part], axis=1) for part in near]).reshape(len(rows), 8)
-        smooth = [_parabola(self.t[part] - time, efforts[:, part]) for time, part in zip(times, near, strict=True)]
-        ramp, jolt = np.array(smooth).reshape(len(rows), 2, 8).transpose(1, 0, 2)
+        effort = np.array([self.efforts[part, LEG_SLICE].mean(axis=0) for part in near]).reshape(len(rows), 4)
         pose = np.full((2, 3, len(rows)), np.nan)
         if has_camera(run):
             fits = [local_fit(self.t, seen, times, CAMERA_WINDOW) for seen in camera_pose(run)]
             pose = np.where(frame_near(run, times), np.stack(fits, axis=1), np.nan)
         tick = np.floor((times - self.begin) / CLOCK + 1e-9).astype(int)
-        return Anchors(tick, np.transpose(legs), swing, effort, unrest, ramp, jolt, pose[0].T, pose[1].T)
-
-
-def _parabola(t: Array, values: Array) -> tuple[Array, Array]:
-    """Value at t = 0 of parabolas through ``values`` (K, rows), and how far these lie from them at most, both (K,)."""
-    powers = np.vander(t, 3)
-    coefficients = np.linalg.pinv(powers) @ values.T
-    return coefficients[-1], np.abs(values.T - powers @ coefficients).max(axis=0)
+        return Anchors(tick, np.transpose(legs), swing, effort, pose[0].T, pose[1].T)

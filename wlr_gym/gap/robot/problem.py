@@ -33,6 +33,8 @@ from wlr_gym.robot.parameters import Parameters
 Array = NDArray[np.float64]
 
 
+#: Channels that a motor or the IMU reads only after a first step.
+UNREAD = [c for c, name in enumerate(CHANNELS) if name.startswith(("eff_", "gyro_", "acc_", "volt"))]
 #: Noise units beyond which a residual counts no more in the gap's numbers.
 CAP = 50.0
 #: Gauss-Newton steps of a fit.
@@ -186,7 +188,10 @@ class RobotProblem:
         r, simulated = replayed
         lost = ~np.isfinite(simulated).all(axis=(1, 2))
         simulated[lost] = 0.0
-        found = anchored_residuals(self.times(r), self._measured[r], simulated, self._noise, self.clocks[r].windows)
+        measured = self._measured[r].copy()
+        if not self.clocks[r].lead:  # a robot that is put into motion has no torque and no acceleration yet
+            measured[0, UNREAD] = np.nan
+        found = anchored_residuals(self.times(r), measured, simulated, self._noise, self.clocks[r].windows)
         found[lost] = np.where(np.isfinite(found[lost]), LOST, np.nan)
         return found
 

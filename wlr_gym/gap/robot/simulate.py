@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.threads import in_threads
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
-from wlr_gym.data.noise import channel_noise
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.gap.robot.clock import CLOCK, Anchors, RunClock
 from wlr_gym.gap.robot.loop import follower
@@ -31,8 +30,8 @@ from wlr_gym.physics.plants.gibbs_appell.kernel import WIDTH
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
-from wlr_gym.physics.servo import motor_constants, position_gains
-from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, WHEELS, Robot
+from wlr_gym.physics.servo import reference_per_effort
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -45,9 +44,8 @@ PRECISION = {"gibbs_appell": "float32"}
 SWEEPS = 2
 #: Counts of its encoder within which a leg stands.
 STANDS = 1.5
-#: Sigmas within which a wheel's efforts are at rest, and by which they may differ from a parabola: what the spring of its
-#: controller holds is read off no jolt.
-UNREST, JOLT = 6.0, 2.2
+#: s before an anchor, over which efforts of wheels are compared: what the spring of a controller holds is read off no jolt.
+SPRING = 1.0
 #: Robots simulated at once: what they read stays in the processor's cache.
 MOST_ROBOTS = 512
 #: Robots of a tile of the engine in single precision.
@@ -175,7 +173,8 @@ def _replay_chunk(
             if tick in ends:
                 plant.keep_going(settings * int((ends > tick).sum()))
             for r, window in anchors.get(tick, ()):
-                readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings)
+                missing = recorder.missing_efforts(r, SPRING)[:, WHEEL_SLICE]
+                readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings, missing)
                 recorder.start_anew(r, tick, readings, plant.truth())
             torque_on = recorder.torque.get(tick, torque_on)
             follow(tick, until, torque_on)
@@ -195,15 +194,23 @@ def _anchors_by_tick(clocks: Sequence[RunClock]) -> dict[int, list[tuple[int, in
 
 
 def _anchor(
-    plant: Simulator, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters, readings: Sensors
+    plant: Simulator,
+    clock: RunClock,
+    window: int,
+    mine: NDArray[np.bool_],
+    lanes: Parameters,
+    readings: Sensors,
+    missing: Array,
 ) -> Sensors:
-    """Put one run's robots where they were measured at the start of a window; legs that move stay where they are."""
+    """Put one run's robots where they were measured at the start of a window; legs that move stay where they are.
+
+    The controllers of their wheels get the efforts (N, 4) that are ``missing``.
+    """
     robot, anchors, state = plant.robot, clock.anchors, _standing_where_lost(plant, lanes)
     own = Parameters(lanes.values[mine])
     legs, references = state.joint_position[mine, LEG_SLICE], state.reference_position[mine]
     state.joint_position[mine, LEG_SLICE] = _standing_legs(robot, own, anchors, window, legs, references)
-    missing = _smooth_efforts(robot, anchors, window) - readings.joint_effort[mine, WHEEL_SLICE]
-    state.reference_position[mine, WHEEL_SLICE] += np.nan_to_num(missing) * _tension_per_effort(robot, own)[:, WHEEL_SLICE]
+    state.reference_position[mine, WHEEL_SLICE] += missing * reference_per_effort(robot, own)[:, WHEEL_SLICE]
     if np.isfinite(anchors.pose[window]).all():
         _place(state, clock, window, mine, lanes)
     kept = {name: readings[name][mine].copy() for name in ("joint_effort", "gyro", "accelerometer", "supply_voltage")}
@@ -233,26 +240,11 @@ def _standing_legs(robot: Robot, parameters: Parameters, anchors: Anchors, row: 
     put in the middle of the count, it would carry another load, or slide on. One that moves follows its servo.
     """
     reading = anchors.legs[row] - parameters["joint.zero_offset"]
-    pull = anchors.effort[row, LEG_SLICE] * _tension_per_effort(robot, parameters)[:, LEG_SLICE]
+    pull = anchors.effort[row] * reference_per_effort(robot, parameters)[:, LEG_SLICE]
     half = 0.5 * robot.sensors.encoder.position
     held = np.clip(references[:, LEG_SLICE] - pull, reading - half, reading + half)
     stands = anchors.swing[row] <= STANDS * robot.sensors.encoder.position
     return np.where(stands, np.where(np.isfinite(held), held, reading), legs)
-
-
-def _smooth_efforts(robot: Robot, anchors: Anchors, row: int) -> Array:
-    """Efforts (4,) of the wheels at an anchor, N m; NaN where they jump."""
-    sigma = channel_noise(robot)[f"eff_{WHEELS[0]}"]
-    effort, unrest, ramp, jolt = (x[row, WHEEL_SLICE] for x in (anchors.effort, anchors.unrest, anchors.ramp, anchors.jolt))
-    return np.where(unrest <= UNREST * sigma, effort, np.where(jolt <= JOLT * sigma, ramp, np.nan))
-
-
-def _tension_per_effort(robot: Robot, parameters: Parameters) -> Array:
-    """Change of the joints' references (N, 8), rad, that changes their reported effort by 1 N m at rest."""
-    nominal, motors = robot.servo.supply_voltage, (robot.servo.leg, robot.servo.wheel)
-    constant = np.repeat([motor_constants(motor.stall_torque, motor.no_load_speed, nominal)[0] for motor in motors], 4)
-    _, resistance = motor_constants(parameters["servo.stall_torque"], parameters["servo.no_load_speed"], nominal)
-    return resistance / constant / np.maximum(position_gains(parameters), 1e-9)
 
 
 def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters) -> None:
@@ -287,8 +279,8 @@ def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
     moved = rest_pose(parameters, bent) - rest_pose(parameters, level)
     state.position[:, 2] = measured.position[0, 2] + height + (moved - moved[:1])[:, 0]
     wheels, reference = state.joint_position[:, WHEEL_SLICE], state.reference_position[:, WHEEL_SLICE]
-    kp, own_kp = (position_gains(each)[:, WHEEL_SLICE] for each in (base, parameters))
-    reference[...] = wheels + (reference - wheels) * kp / np.maximum(own_kp, 1e-9)
+    per_effort, own = (reference_per_effort(robot, each)[:, WHEEL_SLICE] for each in (base, parameters))
+    reference[...] = wheels + (reference - wheels) * own / per_effort
     state.time = np.full(count, clock.begin - clock.t[0])
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 

@@ -30,7 +30,16 @@ from wlr_gym.gap.selection.equivalence import equivalents
 from wlr_gym.gap.selection.evidence import credible_names, probabilities
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.refit import refit, refit_thoroughly
-from wlr_gym.gap.selection.screening import LEAST_GAIN, Responses, Score, is_visible, least_gain, responses, screen
+from wlr_gym.gap.selection.screening import (
+    LEAST_GAIN,
+    Responses,
+    Score,
+    asked_of,
+    is_visible,
+    least_gain,
+    responses,
+    screen,
+)
 from wlr_gym.gap.selection.threshold import acceptance_threshold, largest_by_chance
 
 Array = NDArray[np.float64]
@@ -166,7 +175,16 @@ def screened(
     found = responses(problem, current, runs, probes)
     products = Products.of(current, found, problem.threads)
     linear = screen(candidates, found)
-    return Screened(*rescored(problem, current, found, products, linear), linear, found, products)
+    scores, alone = rescored(problem, current, found, products, linear)
+    return Screened(_one_per_label(scores), alone, linear, found, products)
+
+
+def _one_per_label(scores: Sequence[Score]) -> list[Score]:
+    """Of a vector and its components the one that improves the fit by most beyond what is asked; order kept."""
+    best: dict[str, Score] = {}
+    for score in sorted(scores, key=lambda score: asked_of(score.candidate) - score.gain):
+        best.setdefault(score.candidate.label, score)
+    return [score for score in scores if best[score.candidate.label] is score]
 
 
 def search_effects(

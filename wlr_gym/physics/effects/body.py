@@ -136,7 +136,11 @@ EFFECTS: tuple[Effect, ...] = (
         xyz("m", 0.2, 0.05, (0.02, -0.01, 0.0), "shift along body {axis}"),
         add_vector("body.com_offset", "xyz"),
         search=Search(
-            BODY_MASS, "all_legs", BODY, known={axis: Known(f"body.com_offset[{axis}]", step=0.005) for axis in "xyz"}
+            BODY_MASS,
+            "all_legs",
+            BODY,
+            known={axis: Known(f"body.com_offset[{axis}]", step=0.005) for axis in "xyz"},
+            components=True,
         ),
     ),
     Effect(
@@ -149,7 +153,7 @@ EFFECTS: tuple[Effect, ...] = (
             "fy": EffectParameter("N", "along floor y", -1e3, 1e3, 0.0, (-5, 5), 1.0, optional=True),
         },
         add_vector("external_force", ("fx", "fy")),
-        search=Search(BODY_FORCE, "turns", BODY, lambda where, observed: [along(PULL, *_pulls())]),
+        search=Search(BODY_FORCE, "turns", BODY, lambda where, observed: [along(PULL, *_pulls())], components=True),
     ),
     Effect(
         "tether",

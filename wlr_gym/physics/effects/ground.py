@@ -253,6 +253,7 @@ EFFECTS: tuple[Effect, ...] = (
             "turns",
             GROUND,
             known={axis: Known(f"ground.slope[{axis}]", step=0.01) for axis in ("pitch", "roll")},
+            components=True,
         ),
     ),
     Effect(

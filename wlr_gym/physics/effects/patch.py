@@ -136,7 +136,7 @@ _Dumper.add_implicit_resolver(
 def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
     """Return ``parameters`` with every effect added; kinds act in the order of :data:`wlr_gym.physics.effects.effect.STAGES`.
 
-    Formulas are no parameters: the plant takes them as ``forces=patch.forces``.
+    Optional parameters of an effect that are left out are neutral. Formulas are no parameters: the plant takes them as ``forces=patch.forces``.
 
     Raises:
         InputError: an effect that these parameters cannot take, or a result outside the bounds of the table.
@@ -145,8 +145,10 @@ def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
     for effect in sorted(patch.effects, key=lambda effect: stage(effect.name)):
         if effect.name == UNKNOWN_EFFECT:
             continue
+        kind = EFFECTS[effect.name]
+        neutral = {name: float(spec.neutral) for name, spec in kind.parameters.items() if spec.optional}
         try:
-            EFFECTS[effect.name].apply(patched, effect.where, effect.parameters)
+            kind.apply(patched, effect.where, {**neutral, **effect.parameters})
             patched.validate()
         except InputError as error:
             raise InputError(f"{effect.place or effect.name}: {error}") from None

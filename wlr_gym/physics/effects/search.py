@@ -144,6 +144,7 @@ class Search:
         least: below these values of its parameters the effect is what any robot has, and calibration's.
         relation_of_all: the relation, where it acts at all its places; empty = none in particular.
         one_per_place: beside another one of its kind at the same place no fit could move it.
+        components: of its parameters one alone may be missing.
         surcharge: by how much more than others it must improve a fit (fall of minus two log posterior), where something that
             every robot meets resembles it.
     """
@@ -157,6 +158,7 @@ class Search:
     least: Mapping[str, float] = field(default_factory=dict)
     relation_of_all: str = ""
     one_per_place: bool = False
+    components: bool = False
     surcharge: float = 0.0
 
 

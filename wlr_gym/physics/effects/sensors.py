@@ -41,6 +41,7 @@ EFFECTS: tuple[Effect, ...] = (
             "random",
             SENSOR,
             known={axis: Known(f"imu.gyro_bias[{axis}]", step=0.005) for axis in "xyz"},
+            components=True,
         ),
     ),
     Effect(
@@ -50,7 +51,7 @@ EFFECTS: tuple[Effect, ...] = (
         ("sensor",),
         _ANGLES,
         add_vector("imu.mount", ("roll", "pitch", "yaw")),
-        search=Search("mounting of the IMU", "random", SENSOR, _imu_guesses),
+        search=Search("mounting of the IMU", "random", SENSOR, _imu_guesses, components=True),
     ),
     Effect(
         "camera_misalignment",
@@ -67,6 +68,7 @@ EFFECTS: tuple[Effect, ...] = (
             "s_curve",
             SENSOR,
             known={"yaw": Known("camera.mount_yaw", step=0.02), "scale": Known("camera.scale", step=0.02)},
+            components=True,
         ),
     ),
     Effect(
