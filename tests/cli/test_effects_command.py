@@ -64,6 +64,7 @@ def test_check_prints_what_changes(tmp_path, capsys, monkeypatch):
         (["check"], ["give the patch files"]),
         (["check", "backlash"], ["'backlash' is an effect, not a patch", "wlr effects backlash"]),
         (["check", "unknown_effect"], ["'unknown_effect' is an effect, not a patch"]),
+        (["check", "report/result.json"], ["report/result.json: not a patch", "the patch.yaml beside it"]),
         (["check", "nowhere.yaml"], ["nowhere.yaml"]),
         (["check", "icy_patch", "icy_patch", "icy_patch", "icy_patch", "icy_patch"], ["icy_patch.yaml: effect 1", "4 patches"]),
         (["check", "icy_patch", "--robot", "nominl"], ["nominl", "did you mean 'nominal'"]),

@@ -147,6 +147,8 @@ def test_what_no_trial_can_do_is_refused_at_once(fields, message):
         ({"search": {"trials": 3}}, "no 'space'"),
         ({"search": {"trails": 3}, "space": {"gamma": [0.9]}}, "did you mean 'trials'"),
         ({"space": {"seed": [1, 2]}}, "give 'seeds'"),
+        ({"space": {"tasks.Path.network.share": [1, 2]}}, "'tasks.Path.network.share' comes too late"),
+        ({"variants": {"a": {"tasks": {}}}}, "variants: a: 'tasks' comes too late"),
         ({"seeds": 0}, "seeds"),
         ({"sedes": 3}, "did you mean 'seeds'"),
     ],

@@ -151,6 +151,9 @@ class SweepPlan(SettingsModel):
             raise InputError("search: there is no 'space' to search")
         if "seed" in self.space:
             raise InputError("space: 'seed' is none of its settings; give 'seeds'")
+        for where, names in [("space", self.space), *((f"variants: {name}", own) for name, own in self.variants.items())]:
+            if late := [name for name in names if name.partition(".")[0] == "tasks"]:
+                raise InputError(f"{where}: '{late[0]}' comes too late: 'tasks' is read with the file; name the setting itself")
         return self
 
     @property

@@ -85,6 +85,10 @@ def load_patch(source: Source) -> Patch:
                     f"'{source}' is an effect, not a patch: write a file with its numbers (wlr effects {source}), "
                     f"or give it as a mapping in Python: {{'name': '{source}', 'parameters': {{...}}}}"
                 )
+            if Path(source).suffix == ".json":
+                raise InputError(
+                    f"{source}: not a patch: expected a YAML file; of a result of wlr gap that is the patch.yaml beside it"
+                )
             path = find_config("effects", source)
             return _parse(read_yaml(path), str(path))
         case Mapping():
@@ -136,7 +140,8 @@ _Dumper.add_implicit_resolver(
 def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
     """Return ``parameters`` with every effect added; kinds act in the order of :data:`wlr_gym.physics.effects.effect.STAGES`.
 
-    Optional parameters of an effect that are left out are neutral. Formulas are no parameters: the plant takes them as ``forces=patch.forces``.
+    Optional parameters of an effect that are left out are neutral. Formulas are no parameters: the plant takes them as
+    ``forces=patch.forces``.
 
     Raises:
         InputError: an effect that these parameters cannot take, or a result outside the bounds of the table.
