@@ -303,6 +303,8 @@ def test_a_run_that_begins_in_motion_is_compared_once_motors_and_imu_read():
         assert first["eff_leg_lf"] is first["gyro_z"] is first["volt"] is is_known
         assert first["pos_leg_lf"]
         assert first["vel_wheel_lf"]
+        speeds = found[0, :, [CHANNELS.index(f"vel_{wheel}") for wheel in JOINTS[4:]]]
+        assert np.nanmax(np.abs(speeds)) < (1.0 if is_known else 20.0)  # 340 without the back-EMF in the controllers' springs
 
 
 def test_a_window_does_not_show_the_drift_before_it():

@@ -188,6 +188,14 @@ def test_components_of_a_vector_are_tried_alone(tried):
     assert not [candidate for candidate in tried[1] if candidate.name == "payload"][1:]
 
 
+def test_a_tether_is_anchored_near_and_a_load_carried_within_the_robot(tried):
+    """From afar a tether is a constant force, and a load outside the robot a moved centre of mass."""
+    tether, load = (next(c for c in tried[1] if c.name == name) for name in ("tether", "payload"))
+    assert tether.kept((0.02, -0.02, 0.6)) == pytest.approx((0.02, -0.02, 0.1))
+    assert tether.parameters((0.02, -0.02, 0.1)) == pytest.approx({"stiffness": 0.02, "x": -1.0, "y": 5.0})
+    assert load.kept((0.5, 0.05, -0.2, 0.1)) == pytest.approx((0.5, 0.05, -0.1, 0.1))
+
+
 def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
     problem = RobotProblem([good])
     nominal = nominal_model(problem)

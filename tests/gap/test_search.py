@@ -17,6 +17,7 @@ from wlr_gym.gap.selection import cross_validation, search
 from wlr_gym.gap.selection.cross_validation import (
     MOST_LEFT,
     Finalist,
+    accept,
     best_on_grid,
     converge,
     cross_validated,
@@ -99,14 +100,16 @@ def test_of_what_resembles_a_common_thing_more_is_asked(surcharge, found):
     assert labels(named(problem)) == found
 
 
-@pytest.mark.parametrize(("gain", "unknowns"), [(PER_UNKNOWN - 0.1, 1), (PER_UNKNOWN + 0.1, 2)])
-def test_a_component_stays_where_the_whole_vector_gains_no_more_than_its_further_unknown_costs(gain, unknowns):
+@pytest.mark.parametrize(
+    ("gain", "more", "unknowns"), [(30.0, PER_UNKNOWN - 0.1, 1), (30.0, PER_UNKNOWN + 0.1, 2), (1.0, 0.5, 2)]
+)
+def test_a_component_stays_where_the_whole_vector_gains_no_more_than_its_further_unknown_costs(gain, more, unknowns):
     whole = candidate(Toy(), "ripple")
     part = replace(
         whole, unknowns=whole.unknowns[:1], starts=(replace(whole.starts[0], directions=whole.starts[0].directions[:1]),)
     )
     other = candidate(Toy(), "twin")
-    scores = [Score(c, (), g, 1.0, np.eye(1), c.starts[0]) for c, g in ((whole, 30.0 + gain), (part, 30.0), (other, 5.0))]
+    scores = [Score(c, (), g, 1.0, np.eye(1), c.starts[0]) for c, g in ((whole, gain + more), (part, gain), (other, 5.0))]
     best, last = search._one_per_label(scores)
     assert (len(best.candidate.unknowns), last.candidate) == (unknowns, other)
 
@@ -532,6 +535,25 @@ def test_the_second_look_takes_the_most_promising_of_other_names():
     assert chosen == [late, *others]
     many = [replace(late, candidate=replace(late.candidate, name=f"name_{k}")) for k in range(2 * MOST_LEFT)]
     assert len(left_to_fit(many, [])) == MOST_LEFT
+
+
+@pytest.mark.parametrize(("more", "first"), [(PER_UNKNOWN - 0.1, "twin"), (PER_UNKNOWN + 0.1, "ripple")])
+def test_of_nearly_equal_effects_that_with_fewer_unknowns_is_accepted(monkeypatch, more, first):
+    problem = Toy()
+    monkeypatch.setattr(problem, "thorough", True)  # all have converged
+    current = fit(problem, RUNS, nominal_model(problem))
+
+    def final(name, gain, *values):
+        model = current.model.with_effect(candidate(problem, name), values)
+        own = Hypothesis(
+            model.effects[0][0], model, gain, np.ones(5), gain, current.residuals, current.model, current.residuals
+        )
+        return Finalist(own, current)
+
+    finals = [final("ripple", 50.0 + more, 1.0, 0.5), final("twin", 50.0, 1.0)]
+    accepted, _, _ = accept(problem, RUNS, LEAST_GAIN, finals, current, lambda text: None)
+    assert accepted is not None
+    assert accepted.hypothesis.candidate.name == first
 
 
 @pytest.mark.parametrize(("thrown_off", "passes"), [([3], True), ([1, 3], False)])

@@ -12,7 +12,7 @@ from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.read import Run
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
-from wlr_gym.physics.servo import reference_per_effort
+from wlr_gym.physics.servo import reference_per_effort, reference_per_rate
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -56,18 +56,22 @@ def starts_at_rest(run: Run) -> bool:
 def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     """Return the state (1 robot) at the run's first row: measured joints, legs on the floor, references at the setpoints.
 
-    The integral of a wheel's speed controller, which holds a standing robot under tension, is read off its measured effort.
+    The integral of a wheel's speed controller is read off the effort and the rate that it holds.
     """
     background = standing_state(robot, parameters)
     first = run["t"][:1]
     legs = np.array([[run[f"cmd_{joint}"][0] for joint in LEGS]])
-    degree = 0 if starts_at_rest(run) else 2
+    moves = not starts_at_rest(run)
+    degree = 2 if moves else 0
     measured = _joints(run, first, parameters, degree)[0]
     wanted = legs - parameters["joint.zero_offset"]
     background.reference_position[:, LEG_SLICE] = np.where(np.isnan(wanted), measured[:, LEG_SLICE], wanted)
     background.reference_position[:, WHEEL_SLICE] += _wheel_tension(run, robot, parameters)
     state = measured_state(run, first, background, parameters, degree)
     state.reference_velocity[:, WHEEL_SLICE] = state.joint_velocity[:, WHEEL_SLICE]
+    if moves:
+        held = reference_per_rate(robot, parameters) * state.joint_velocity
+        state.reference_position[:, WHEEL_SLICE] += held[:, WHEEL_SLICE]
     return state
 
 

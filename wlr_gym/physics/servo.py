@@ -131,11 +131,18 @@ def position_gains(parameters: Parameters) -> Array:
 
 
 def reference_per_effort(robot: Robot, parameters: Parameters) -> Array:
-    """Return by how much the joints' references (N, 8) lie ahead per reported effort at rest, rad/(N m)."""
+    """Return by how much the joints' references (N, 8) lie ahead per reported effort, rad/(N m); beside it per rate."""
     constant, _ = line_constants(robot)
     stall, speed = parameters["servo.stall_torque"], parameters["servo.no_load_speed"]
     _, resistance = motor_constants(stall, speed, robot.servo.supply_voltage)
     return resistance / constant / np.maximum(position_gains(parameters), 1e-9)
+
+
+def reference_per_rate(robot: Robot, parameters: Parameters) -> Array:
+    """Return by how much the joints' references (N, 8) lie ahead per rate of the joint, s: for the motor's back-EMF."""
+    stall, speed = parameters["servo.stall_torque"], parameters["servo.no_load_speed"]
+    constant, _ = motor_constants(stall, speed, robot.servo.supply_voltage)
+    return constant / np.maximum(position_gains(parameters), 1e-9)
 
 
 # --- profile generator ------------------------------------------------------------------------------------------------

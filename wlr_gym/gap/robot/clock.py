@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 CLOCK = 0.004
 #: s; the robot stands this long before the first row.
 LEAD = 0.3
-#: s before and after an anchor that are near it.
+#: s before and after an anchor that are near it, and the row on each side at least.
 NEAR = 0.065
 
 
@@ -86,7 +86,7 @@ class RunClock:
         run, times = self.run, self.t[rows]
         legs = [local_fit(self.t, run[f"pos_{joint}"], times, JOINT_WINDOW)[0] for joint in LEGS]
         edges = np.searchsorted(self.t, [times - NEAR, times + NEAR]).T
-        near = [slice(first, last) for first, last in edges.tolist()]
+        near = [slice(max(min(a, row - 1), 0), max(b, row + 2)) for row, (a, b) in zip(rows, edges.tolist(), strict=True)]
         angles = np.array([[run[f"pos_{joint}"], run[f"cmd_{joint}"]] for joint in LEGS])
         swing = np.array([np.fmax.reduce(np.ptp(angles[:, :, part], axis=2), axis=1) for part in near]).reshape(len(rows), 4)
         effort = np.array([self.efforts[part, LEG_SLICE].mean(axis=0) for part in near]).reshape(len(rows), 4)

@@ -14,7 +14,7 @@ from wlr_gym.base.compiled import compiled
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.gap.robot.clock import CLOCK, RunClock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
-from wlr_gym.robot import FIRST_WHEEL, JOINTS, WHEEL_SLICE
+from wlr_gym.robot import FIRST_WHEEL, WHEEL_SLICE, WHEELS
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ _MOVED = SENSOR_LAYOUT.slices["joint_velocity"].stop
 _READ = SENSOR_LAYOUT.slices["accelerometer"].stop
 _SENSED_VOLT = SENSOR_LAYOUT.slices["supply_voltage"].start
 _VOLT = CHANNELS.index("volt")
-_EFFORTS = slice(CHANNELS.index(f"eff_{JOINTS[0]}"), CHANNELS.index(f"eff_{JOINTS[-1]}") + 1)
+_EFFORTS = slice(CHANNELS.index(f"eff_{WHEELS[0]}"), CHANNELS.index(f"eff_{WHEELS[-1]}") + 1)
 _CAMERA = slice(CHANNELS.index("cam_x"), CHANNELS.index("cam_pitch") + 1)
 #: The leading columns of the truth layout: position and quaternion.
 _POSE = TRUTH_LAYOUT.slices["quaternion"].stop
@@ -123,13 +123,14 @@ class Recorder:
         self.tape.anchored[r] = tick
 
     def missing_efforts(self, r: int, horizon: float) -> Array:
-        """Return measured less read efforts (settings, 8), N m: means over the last ``horizon`` (s) of a run so far; else 0."""
+        """Return measured less read efforts of the wheels (settings, 4), N m: means over the last ``horizon`` (s) of a run so
+        far, since its last anchor; 0 where none was measured."""
         clock, tape = self.clocks[r], self.tape
-        last = int(tape.next_row[r])
-        first = int(np.searchsorted(clock.t[:last], clock.t[last] - horizon))
-        rows = tape.begin[r + 1] - tape.begin[r]
-        read = tape.values[self.settings * tape.begin[r] : self.settings * tape.begin[r + 1]].reshape(self.settings, rows, -1)
-        return _mean_or_none(clock.efforts[first:last] - read[:, first:last, _EFFORTS])
+        begin, end, last = tape.begin[r], tape.begin[r + 1], int(tape.next_row[r])
+        anchor = int(np.searchsorted(tape.place[begin:end], tape.anchored[r]))
+        first = max(anchor, int(np.searchsorted(clock.t[:last], clock.t[last] - horizon)))
+        read = tape.values[self.settings * begin : self.settings * end].reshape(self.settings, end - begin, -1)
+        return _mean_or_zero(clock.efforts[first:last, WHEEL_SLICE] - read[:, first:last, _EFFORTS])
 
     def _mine(self, r: int) -> slice:
         return slice(r * self.settings, (r + 1) * self.settings)
@@ -152,7 +153,7 @@ class Recorder:
         return Replays(values, tape.truths[mine].reshape(shape) if self.with_truth else None)
 
 
-def _mean_or_none(values: Array) -> Array:
+def _mean_or_zero(values: Array) -> Array:
     """Means over the rows (settings, rows, columns) that are known; 0 where none is."""
     known = np.isfinite(values)
     return np.where(known, values, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)

@@ -30,7 +30,7 @@ from wlr_gym.physics.plants.gibbs_appell.kernel import WIDTH
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.physics.plants.simulator import Simulator
-from wlr_gym.physics.servo import reference_per_effort
+from wlr_gym.physics.servo import reference_per_effort, reference_per_rate
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -173,7 +173,7 @@ def _replay_chunk(
             if tick in ends:
                 plant.keep_going(settings * int((ends > tick).sum()))
             for r, window in anchors.get(tick, ()):
-                missing = recorder.missing_efforts(r, SPRING)[:, WHEEL_SLICE]
+                missing = recorder.missing_efforts(r, SPRING)
                 readings = _anchor(plant, clocks[r], window, run_of == r, lanes, readings, missing)
                 recorder.start_anew(r, tick, readings, plant.truth())
             torque_on = recorder.torque.get(tick, torque_on)
@@ -279,8 +279,10 @@ def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
     moved = rest_pose(parameters, bent) - rest_pose(parameters, level)
     state.position[:, 2] = measured.position[0, 2] + height + (moved - moved[:1])[:, 0]
     wheels, reference = state.joint_position[:, WHEEL_SLICE], state.reference_position[:, WHEEL_SLICE]
-    per_effort, own = (reference_per_effort(robot, each)[:, WHEEL_SLICE] for each in (base, parameters))
-    reference[...] = wheels + (reference - wheels) * own / per_effort
+    rates = state.joint_velocity[:, WHEEL_SLICE] if not clock.lead else 0.0
+    per_effort, own_effort = (reference_per_effort(robot, each)[:, WHEEL_SLICE] for each in (base, parameters))
+    per_rate, own_rate = (reference_per_rate(robot, each)[:, WHEEL_SLICE] for each in (base, parameters))
+    reference[...] = wheels + (reference - wheels - per_rate * rates) * own_effort / per_effort + own_rate * rates
     state.time = np.full(count, clock.begin - clock.t[0])
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 

@@ -168,17 +168,18 @@ class _System:
 
     def best(self, scores: Sequence[Score], count: int) -> tuple[list[Score], list[Score]]:
         """Return the candidates that explain most squares, or gain most under the noise of the model without them, best
-        first, scored under the alternative; and the rest.
+        first, scored under the alternative; and the rest. A vector and its components take one place of ``count``.
         """
         threads = self.problem.threads
         starts = [start for score in scores for start in score.candidate.starts]
         edges = np.cumsum([0, *(len(score.candidate.starts) for score in scores)])
         rough = np.maximum.reduceat(self._rough(starts), edges[:-1])
-        lasting = np.argsort(rough)[::-1][:count].tolist()
-        leading = np.argsort([score.gain for score in scores])[::-1][: count // 2].tolist()
-        chosen = dict.fromkeys([*lasting, *leading])
-        best = in_threads(threads, self._scored, [scores[k] for k in chosen])
-        return sorted(best, key=lambda score: -score.gain), [s for k, s in enumerate(scores) if k not in chosen]
+        labels = [score.candidate.label for score in scores]
+        lasting = dict.fromkeys(labels[k] for k in np.argsort(rough)[::-1])
+        leading = dict.fromkeys(labels[k] for k in np.argsort([score.gain for score in scores])[::-1])
+        chosen = {*list(lasting)[:count], *list(leading)[: count // 2]}
+        best = in_threads(threads, self._scored, [s for s in scores if s.candidate.label in chosen])
+        return sorted(best, key=lambda score: -score.gain), [s for s in scores if s.candidate.label not in chosen]
 
     def _rough(self, starts: Sequence[Start]) -> Array:
         """Improvement by each start if every row were independent: what orders candidates before their noise is known."""

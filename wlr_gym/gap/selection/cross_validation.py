@@ -20,7 +20,7 @@ from wlr_gym.gap.estimation.likelihood import estimate_noise, minus_two_log_like
 from wlr_gym.gap.estimation.model import FittedModel, moved, on_bounds, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
-from wlr_gym.gap.selection.screening import LEAST_GAIN, asked_of
+from wlr_gym.gap.selection.screening import LEAST_GAIN, asked_of, least_gain
 
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
@@ -244,9 +244,10 @@ def accept(
     """The best that improves the fit enough at a plausible value, also once converged; the finalists as far as they have
     converged; the best model without any of them.
 
-    A formula is selected only where no named effect improves the fit by nearly as much.
+    A formula is selected only where no named effect improves the fit by nearly as much. Every further unknown must pay.
     """
     good = [final for final in finals if _is_good(threshold, final.hypothesis)]
+    good.sort(key=lambda final: least_gain(len(final.hypothesis.candidate.unknowns)) - final.hypothesis.gain)
     named = [final for final in good if not final.hypothesis.candidate.formula]
     if named and named[0].hypothesis.gain >= NAMED_FIRST * good[0].hypothesis.gain:
         good = [named[0], *(final for final in good if final is not named[0])]

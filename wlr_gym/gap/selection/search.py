@@ -49,6 +49,8 @@ Tell = Callable[[str], None]
 SHORTLIST = 8
 #: The same per name.
 PER_NAME = 3
+#: Share of what is asked below which a first score is not worth a refit.
+LEAST_WORTH = 0.25
 #: The best of so many names that the shortlist lacks are refitted too: the first order says little where a response has a kink.
 MORE_NAMES = 3
 #: A candidate that explains a group of signals is refitted too if it improves their fit by this many times what is accepted ...
@@ -116,15 +118,15 @@ class SearchResult:
 
 
 def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Score]:
-    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a quarter of the threshold.
+    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a share of the threshold.
 
-    The improvement predicted to first order may be a quarter of the actual one. The best of :data:`MORE_NAMES` further effects
-    follow.
+    The improvement predicted to first order may be :data:`LEAST_WORTH` of the actual one. The best of :data:`MORE_NAMES`
+    further effects follow.
     """
     chosen: list[Score] = []
     more: dict[str, Score] = {}
     for score in scores:
-        if score.gain <= 0.25 * threshold:
+        if score.gain <= LEAST_WORTH * threshold:
             break
         name = score.candidate.name
         same = sum(other.candidate.name == name for other in chosen)
@@ -180,9 +182,18 @@ def screened(
 
 
 def _one_per_label(scores: Sequence[Score]) -> list[Score]:
-    """Of a vector and its components the one that improves the fit by most beyond what is asked; order kept."""
+    """Of a vector and its components the one that improves the fit by most beyond what is asked; order kept.
+
+    The whole vector where none improves it by much: it is what these runs would show or not.
+    """
+    much = {score.candidate.label for score in scores if score.gain > LEAST_WORTH * LEAST_GAIN}
+
+    def rank(score: Score) -> float:
+        own = score.candidate
+        return asked_of(own) - score.gain if own.label in much else -len(own.unknowns)
+
     best: dict[str, Score] = {}
-    for score in sorted(scores, key=lambda score: asked_of(score.candidate) - score.gain):
+    for score in sorted(scores, key=rank):
         best.setdefault(score.candidate.label, score)
     return [score for score in scores if best[score.candidate.label] is score]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -46,6 +46,8 @@ ARM = 0.1
 PULL = 0.5
 #: m; a load is carried no farther from the middle of the body.
 FARTHEST_LOAD = 0.2
+#: m; nor is a tether anchored farther from the floor's origin: from afar it is a constant force.
+FARTHEST_ANCHOR = 5.0
 
 
 def _payload_guesses(where: Places, observed: Observed) -> list[Guess]:
@@ -63,13 +65,17 @@ def _payload_guesses(where: Places, observed: Observed) -> list[Guess]:
 def _payload_coordinates(where: Places, observed: Observed) -> Coordinates:
     """Mass and moments, in place of mass and place."""
     moments = {f"moment_{axis}": Coordinate("kg m", 0.0, -0.2, 0.2, 0.01) for axis in "xyz"}
-    return Coordinates({"mass": Coordinate("kg", 0.0, 0.0, 2.0, 0.1), **moments}, _load, within=_carried)
+    return Coordinates({"mass": Coordinate("kg", 0.0, 0.0, 2.0, 0.1), **moments}, _load, within=_no_farther(FARTHEST_LOAD))
 
 
-def _carried(values: Sequence[float]) -> tuple[float, ...]:
-    """Mass and moments of a load that is carried no farther out than plausible."""
-    mass = float(values[0])
-    return mass, *(float(np.clip(moment, -mass * FARTHEST_LOAD, mass * FARTHEST_LOAD)) for moment in values[1:])
+def _no_farther(distance: float) -> Callable[[Sequence[float]], tuple[float, ...]]:
+    """Keep a size, and what it is times a place, where the place is no farther out than ``distance``."""
+
+    def within(values: Sequence[float]) -> tuple[float, ...]:
+        most = float(values[0]) * distance
+        return float(values[0]), *(float(np.clip(value, -most, most)) for value in values[1:])
+
+    return within
 
 
 def _load(values: Sequence[float]) -> dict[str, float]:
@@ -92,14 +98,16 @@ def _tether_guesses(where: Places, observed: Observed) -> list[Guess]:
 def _tether_coordinates(where: Places, observed: Observed) -> Coordinates:
     """Stiffness and the pull at the floor's origin, in place of stiffness and anchor."""
     pulls = {f"pull_{axis}": Coordinate("N", 0.0, -20.0, 20.0, 0.2) for axis in "xy"}
-    return Coordinates({"stiffness": Coordinate("N/m", 0.0, 0.0, 20.0, 0.5), **pulls}, _anchored)
+    springs = {"stiffness": Coordinate("N/m", 0.0, 0.0, 20.0, 0.5), **pulls}
+    return Coordinates(springs, _anchored, within=_no_farther(FARTHEST_ANCHOR))
 
 
 def _anchored(values: Sequence[float]) -> dict[str, float]:
     """Stiffness and anchor from stiffness and the pull at the floor's origin."""
     stiffness = max(float(values[0]), 1e-6)
     pulls = zip("xy", values[1:], strict=True)
-    return {"stiffness": stiffness, **{axis: float(np.clip(pull / stiffness, -1e3, 1e3)) for axis, pull in pulls}}
+    places = {axis: float(np.clip(pull / stiffness, -FARTHEST_ANCHOR, FARTHEST_ANCHOR)) for axis, pull in pulls}
+    return {"stiffness": stiffness, **places}
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -162,8 +170,28 @@ EFFECTS: tuple[Effect, ...] = (
         ("body",),
         {
             "stiffness": EffectParameter("N/m", "of the spring", 0, 1e4, 0.0, (0, 20), 3.0),
-            "x": EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, (-5, 5), -0.5, optional=True, is_size=False),
-            "y": EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, (-5, 5), 0.3, optional=True, is_size=False),
+            "x": EffectParameter(
+                "m",
+                "anchor, floor frame",
+                -1e3,
+                1e3,
+                0.0,
+                (-FARTHEST_ANCHOR, FARTHEST_ANCHOR),
+                -0.5,
+                optional=True,
+                is_size=False,
+            ),
+            "y": EffectParameter(
+                "m",
+                "anchor, floor frame",
+                -1e3,
+                1e3,
+                0.0,
+                (-FARTHEST_ANCHOR, FARTHEST_ANCHOR),
+                0.3,
+                optional=True,
+                is_size=False,
+            ),
         },
         _add_tether,
         search=Search(BODY_FORCE, "straight", BODY, _tether_guesses, coordinates=_tether_coordinates),

@@ -87,7 +87,7 @@ class PatchEffect:
     Attributes:
         name: of the library, or ``unknown_effect``.
         where: places it acts on.
-        parameters: all its numbers, SI.
+        parameters: its numbers, SI; optional ones that are left out are neutral.
         formula, units: law of an unknown effect and the units of its parameters; empty for an effect of the library.
         place: where it was read, for messages; does not count in comparisons.
     """

@@ -120,7 +120,7 @@ def _compose_entries(entries: Sequence[Any]) -> Patch:
 
 
 def save_patch(patch: Patch, path: str | Path) -> Path:
-    """Write a patch as YAML; :func:`load_patch` reads back the same effects."""
+    """Write a patch as YAML; :func:`load_patch` reads back the same effects, neutral numbers filled in."""
     text = yaml.dump(patch.content(), Dumper=_Dumper, sort_keys=False)  # in ASCII: PyYAML loses U+0085 and its kin otherwise
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

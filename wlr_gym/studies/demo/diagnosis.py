@@ -212,8 +212,9 @@ def judge(hidden: PatchEffect, found: Sequence[EffectEntry], equivalent: Sequenc
     if best is not None:
         for parameter, value in hidden.parameters.items():
             if value != 0.0:  # the other axes of a bias have no size to be off by
-                entry = best.parameters[parameter]
-                sizes[parameter] = (value, entry.value, *(entry.ci95 or (np.nan, np.nan)))
+                entry = best.parameters.get(parameter)  # a component of a vector may be missing
+                found_value, interval = (0.0, None) if entry is None else (entry.value, entry.ci95)
+                sizes[parameter] = (value, found_value, *(interval or (np.nan, np.nan)))
     return Diagnosis(
         named=best is not None,
         placed=best is not None and set(best.where) == set(hidden.where),

@@ -157,7 +157,7 @@ def _value(parameter: Any) -> float:
 
 
 def intervals_hold(truth: Mapping[str, Any], found: Mapping[str, Any]) -> list[bool]:
-    """Say for each true parameter with an interval whether it lies inside."""
+    """Say for each true parameter with an interval whether it lies inside; one that was left out is at its neutral value."""
     holds = []
     for key, value in truth["parameters"].items():
         if key == PHASE:
@@ -166,6 +166,8 @@ def intervals_hold(truth: Mapping[str, Any], found: Mapping[str, Any]) -> list[b
         low, high = interval.get("ci95") or (None, None)
         if low is not None and high is not None:
             holds.append(bool(low <= value <= high))
+        elif key not in found["parameters"] and value != neutral(truth["name"], key):
+            holds.append(False)
     return holds
 
 
