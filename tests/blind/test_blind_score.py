@@ -249,6 +249,12 @@ def test_sizes_count_from_where_an_effect_vanishes(name):
         assert scoring.shape_error(true, moved) is None
 
 
+def test_a_component_that_is_left_out_is_said_to_be_neutral():
+    true = {"name": "gyro_bias", "parameters": {"x": 0.01, "y": 0.0}}
+    part = {"parameters": {"z": {"value": 0.01, "ci95": [0.0, 0.02]}}}
+    assert scoring.intervals_hold(true, part) == [False]  # y is neutral
+
+
 def test_a_size_that_is_not_given_is_not_found():
     true = effect("payload", ["body"], mass=0.3, x=0.1, y=0.0, z=0.05)
     assert scoring.size_error(true, {**true, "parameters": {"x": 0.1}}) == 1.0

@@ -37,6 +37,8 @@ def test_only_what_was_hidden_has_a_size():
     answer = judge(bias, [found("gyro_bias", ["sensor"], x=0.001, y=0.001, z=0.049)])
     assert list(answer.sizes) == ["z"]
     assert answer.sentence == "The name and the place were right, the size off by 2 %."
+    (size,) = judge(bias, [found("gyro_bias", ["sensor"], x=0.001)]).sizes.values()
+    assert size[:2] == (0.05, 0.0)  # another axis alone was found
 
 
 def test_wrong_answers_are_said_to_be_wrong():

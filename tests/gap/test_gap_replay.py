@@ -278,6 +278,13 @@ def test_a_window_begins_with_the_loads_that_were_measured(window):
     assert rms[[CHANNELS.index(f"pos_{wheel}") for wheel in JOINTS[4:]]].max() < 1.2
 
 
+@pytest.mark.parametrize("period", [0.02, 0.1])
+def test_a_leg_that_moves_does_not_stand(period):
+    """At rows 0.1 s apart, too."""
+    clock = RunClock(record(posture_and_turns, spaced(6.0, period)))
+    assert clock.anchors.swing.max() > 5 * ROBOT.sensors.encoder.position
+
+
 def test_a_window_begins_with_the_springs_that_the_efforts_before_it_showed():
     """Wheels that seem to work against each other at the start, and jolt: the mean error of the last second is the springs'."""
     true = record(abrupt, spaced(4.0))

@@ -185,6 +185,7 @@ def test_components_of_a_vector_are_tried_alone(tried):
     assert turned["imu.mount"][0] == pytest.approx(NOMINAL["imu.mount"][0] + np.array([0.0, 0.0, 0.1]))
     centre = [candidate for candidate in tried[1] if candidate.name == "com_offset"]
     assert [len(candidate.tolerances) for candidate in centre] == [3, 1, 1, 1]
+    assert [t.quantities for t in centre[2].tolerances if t is not None] == [("body.com_offset[y]",)]
     assert not [candidate for candidate in tried[1] if candidate.name == "payload"][1:]
 
 

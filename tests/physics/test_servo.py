@@ -11,6 +11,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import Graph, emit, load_module
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
 
 RPM = 2 * math.pi / 60
 PAPER_WHEEL_SPEED = 80 * 0.229 * RPM
@@ -43,6 +44,21 @@ def test_voltage_is_the_wish_inside_the_supply_and_the_supply_beyond():
     assert servo.controller_voltage(8.63, 0.44, 0.5, 2.0, 0.1, 1.0, 12.0) == pytest.approx(8.63 * 0.4 + 0.44)
     assert servo.controller_voltage(55.0, 0.0, 2.0, 0.0, 0.0, 0.0, 11.0) == 11.0
     assert servo.controller_voltage(55.0, 0.0, -2.0, 0.0, 0.0, 0.0, 11.0) == -11.0
+
+
+def test_what_a_controller_holds_is_the_motors_voltage():
+    """Ohm's law with the robot's own winding; the effort is reported with the nominal motor's constant."""
+    robot = load_robot()
+    parameters = Parameters.nominal(robot)
+    parameters["servo.stall_torque"], parameters["servo.no_load_speed"] = 1.2, 7.0
+    parameters["servo.kp"], parameters["servo.integral_cycle"] = 9.0, 2e-3
+    effort, rate = 0.3, 2.5
+    ahead = effort * servo.reference_per_effort(robot, parameters) + rate * servo.reference_per_rate(robot, parameters)
+    own = 12.0 / 7.0
+    for joints, reported, kp in ((slice(0, 4), robot.servo.leg, 9.0), (slice(4, 8), robot.servo.wheel, 4.5)):
+        current = effort / (12.0 / reported.no_load_speed)
+        voltage = own * 12.0 / 1.2 * current + own * rate
+        assert kp * ahead[0, joints] == pytest.approx(np.full(4, voltage), rel=1e-12)
 
 
 # --- wheel profile
