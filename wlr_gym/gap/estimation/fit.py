@@ -175,7 +175,8 @@ def fit(
         residuals, columns = linearise(problem, model, runs)
     gained, most, tau = np.inf, scatter, autocorrelation_time
     for step in range(steps):
-        if autocorrelation_time is None:  # the same cost in all steps of a descent
+        tau = autocorrelation_time
+        if tau is None:  # the same cost in all steps of a descent
             reachable = _noise_within_reach(problem, model, columns, residuals, most)
             tau, scatter = reachable.autocorrelation_time, reachable.scatter
         model, residuals, gained = _descend(problem, runs, model, columns, residuals, tau, scatter)
