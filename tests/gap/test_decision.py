@@ -2,6 +2,9 @@
 
 import importlib
 import json
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -254,6 +257,21 @@ def test_it_ends_with_the_budget_and_goes_on_with_a_larger_one(data, tmp_path, a
     assert (second.history.ended, len(second.history.rounds)) == ("decided", 3)
     assert answers["analysed"] == 2  # what was analysed is not analysed again
     assert decide(data, tmp_path / "out", record).history == second.history
+
+
+def test_two_processes_do_not_drive_one_robot_for_one_folder(data, tmp_path, answers):
+    answers["results"] = [result(*CERTAIN)]
+    out, begun = tmp_path / "out", tmp_path / "begun"
+    out.mkdir()
+    code = f"import pathlib, time\nfrom wlr_gym.base.files import alone_in\nwith alone_in(pathlib.Path({str(out)!r})):\n"
+    holder = subprocess.Popen([sys.executable, "-c", f"{code}    pathlib.Path({str(begun)!r}).touch(); time.sleep(600)"])
+    while not begun.exists():
+        time.sleep(0.05)
+    with pytest.raises(InputError, match=r"out/\.lock: held by another process"):
+        decide(data, out, record)
+    holder.kill()
+    holder.wait()
+    assert decide(data, out, record).history.ended == "decided"
 
 
 def test_a_name_that_leaves_far_more_than_simulators_do_is_not_decided(data, tmp_path, answers):

@@ -13,6 +13,9 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError
 
+#: File of a folder for results by which one process holds it.
+LOCK = ".lock"
+
 
 def make_output_folder(path: Path, option: str = "--out") -> None:
     """Make a folder for results, if it is not there.
@@ -46,10 +49,21 @@ def resumes(folder: Path, file: str) -> bool:
     """
     if (folder / file).is_file():
         return True
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
         raise InputError(f"--out {folder}: expected a new folder, or one with a {file} of the same command")
     make_output_folder(folder)
     return False
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Work in a folder that no other process works in meanwhile; see :func:`locked`.
+
+    Raises:
+        InputError: another process does.
+    """
+    with locked(folder / LOCK, 0.0):
+        yield
 
 
 def keep_request(path: Path, requested: Mapping[str, Any]) -> None:
@@ -132,11 +146,12 @@ def locked(path: Path, patience: float) -> Iterator[None]:
         file = path.open("ab")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    for_so_long = f" for {patience:g} s" if patience else ""
     with file:
         deadline = time.monotonic() + patience
         while not _lock(file.fileno()):
             if time.monotonic() > deadline:
-                raise InputError(f"{path}: held by another process for {patience:g} s: something else works on the same")
+                raise InputError(f"{path}: held by another process{for_so_long}: something else works on the same")
             time.sleep(0.1)
         yield
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import check_same_request, resumes, write_json
+from wlr_gym.base.files import alone_in, check_same_request, resumes, write_json
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import META_FILE
@@ -160,11 +160,17 @@ def decide(
         known, robot, backend, threads, tell: see :func:`wlr_gym.gap.workflow.analyse`.
 
     Raises:
-        InputError: see :func:`wlr_gym.gap.workflow.analyse`; or ``out`` has a history of other data, robot or simulator.
+        InputError: see :func:`wlr_gym.gap.workflow.analyse`; or ``out`` has a history of other data, robot or simulator, or
+            another process works in it.
     """
     known = load_patch(known)
     asked = _Asked(Path(data), Path(out), budget or Budget(), known, robot, backend, threads, tell)
     history, last = _resumed(asked)
+    with alone_in(asked.out):
+        return _go_on(asked, record, history, last)
+
+
+def _go_on(asked: _Asked, record: Recorder, history: History, last: DecisionRound | None) -> Decided:
     while True:
         now, result, left = _analysed(asked, history, last)
         ended, promise = _choice(asked, history, now, result, left)

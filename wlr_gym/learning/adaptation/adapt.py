@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError, require_package, unknown_name
+from wlr_gym.base.files import alone_in
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.excitations import excite
@@ -84,7 +85,7 @@ def adapt(
         threads: of the gap workflow and the acceptance test. tell: called with progress.
 
     Raises:
-        InputError: bad input of any step, before anything is driven where that can be known.
+        InputError: bad input of any step, before anything is driven where that can be known; another process works in ``out``.
         KeyboardInterrupt: interrupted; the same call resumes.
     """
     require_package("torch", "train")
@@ -125,11 +126,12 @@ def adapt(
     if robot_runs is not None and not Path(robot_runs).is_dir():
         raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
     progress = open_folder(Path(out), asked, tell, threads)
-    if not progress.steps:
-        record_provenance(progress.out, asked.model_dump(mode="json"), seed)
-        save_patch(patch, progress.out / "hidden.yaml")
-        progress.save()
-    return run_steps(progress, driven, own)
+    with alone_in(progress.out):
+        if not progress.steps:
+            record_provenance(progress.out, asked.model_dump(mode="json"), seed)
+            save_patch(patch, progress.out / "hidden.yaml")
+            progress.save()
+        return run_steps(progress, driven, own)
 
 
 def _environment(policy: str | Path) -> str:
