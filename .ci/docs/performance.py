@@ -92,7 +92,10 @@ def _short(value: float) -> str:
 
 
 def _peer(row: Row) -> str:
-    return f"{_value(row['peer'], row['unit'])} ({row['peer_name']})" if row["peer"] else "-"
+    if not row["peer"]:
+        return "-"
+    most = "none; given up at " if row.get("at_least") else ""
+    return f"{most}{_value(row['peer'], row['unit'])} ({row['peer_name']})"
 
 
 def _ratio(row: Row) -> str:

@@ -183,6 +183,21 @@ def _check_answer(place: str, answer: Any) -> None:
         raise InputError(f"{place}: blind_test: expected a mapping with truth_sha256 and runs")
 
 
+def score_answers(path: Path) -> dict[str, Any]:
+    """Score the ``answers.json`` of one test, whole or begun; nothing is analysed. Its first seed is its smallest.
+
+    Raises:
+        InputError: no answers, or one is about another truth or other runs than the set of its name now.
+    """
+    answers = read_answers(path)
+    seeds = [int(name.removeprefix("set_")) for name in answers]
+    plan = Plan(Path(), sets=max(seeds) - min(seeds) + 1, first_seed=min(seeds))
+    cases = [one for one in plan.cases() if one.name in answers]
+    for one in cases:
+        _check_origin(plan, one, answers[one.name], path, "run the test again")
+    return score(answers, {one.name: one.as_dict() for one in cases})
+
+
 def _answers_to(plan: Plan, cases: Sequence[BlindCase], path: Path) -> dict[str, dict[str, Any]]:
     """Read the answers to sets of a plan; those that failed are to be analysed again.
 
