@@ -31,15 +31,8 @@ from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
 from wlr_gym.gap.selection.outcomes import REFUTED, evidence_of
 from wlr_gym.gap.selection.refit import refit
 from wlr_gym.gap.selection.screening import LEAST_GAIN, PER_UNKNOWN, Score, responses, screen
-from wlr_gym.gap.selection.search import (
-    MORE_NAMES,
-    MOST_EFFECTS,
-    PER_NAME,
-    SHORTLIST,
-    remove_redundant,
-    search_effects,
-    shortlist,
-)
+from wlr_gym.gap.selection.search import MOST_EFFECTS, remove_redundant, search_effects
+from wlr_gym.gap.selection.shortlist import MORE_NAMES, PER_NAME, SHORTLIST, one_per_label, shortlist
 from wlr_gym.gap.validation.held_out import MOST_SEARCHES
 from wlr_gym.gap.workflow import analyse_problem
 
@@ -110,7 +103,7 @@ def test_a_component_stays_where_the_whole_vector_gains_no_more_than_its_further
     )
     other = candidate(Toy(), "twin")
     scores = [Score(c, (), g, 1.0, np.eye(1), c.starts[0]) for c, g in ((whole, gain + more), (part, gain), (other, 5.0))]
-    best, last = search._one_per_label(scores)
+    best, last = one_per_label(scores)
     assert (len(best.candidate.unknowns), last.candidate) == (unknowns, other)
 
 

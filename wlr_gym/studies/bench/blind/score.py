@@ -159,14 +159,12 @@ def _value(parameter: Any) -> float:
 def intervals_hold(truth: Mapping[str, Any], found: Mapping[str, Any]) -> list[bool]:
     """Say for each true parameter with an interval whether it lies inside; one that was left out is at its neutral value."""
     holds = []
-    for key, value in truth["parameters"].items():
-        if key == PHASE:
-            continue
-        interval = (found["parameters"].get(key) or {}) if isinstance(found["parameters"].get(key), Mapping) else {}
-        low, high = interval.get("ci95") or (None, None)
+    for key in [key for key in truth["parameters"] if key != PHASE]:
+        value, entry = truth["parameters"][key], found["parameters"].get(key)
+        low, high = (isinstance(entry, Mapping) and entry.get("ci95")) or (None, None)
         if low is not None and high is not None:
             holds.append(bool(low <= value <= high))
-        elif key not in found["parameters"] and value != neutral(truth["name"], key):
+        elif entry is None and value != neutral(truth["name"], key):
             holds.append(False)
     return holds
 
