@@ -102,6 +102,11 @@ def _tether_coordinates(where: Places, observed: Observed) -> Coordinates:
     return Coordinates(springs, _anchored, within=_no_farther(FARTHEST_ANCHOR))
 
 
+def _anchor(severity: float) -> EffectParameter:
+    near = (-FARTHEST_ANCHOR, FARTHEST_ANCHOR)
+    return EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, near, severity, optional=True, is_size=False)
+
+
 def _anchored(values: Sequence[float]) -> dict[str, float]:
     """Stiffness and anchor from stiffness and the pull at the floor's origin."""
     stiffness = max(float(values[0]), 1e-6)
@@ -170,28 +175,8 @@ EFFECTS: tuple[Effect, ...] = (
         ("body",),
         {
             "stiffness": EffectParameter("N/m", "of the spring", 0, 1e4, 0.0, (0, 20), 3.0),
-            "x": EffectParameter(
-                "m",
-                "anchor, floor frame",
-                -1e3,
-                1e3,
-                0.0,
-                (-FARTHEST_ANCHOR, FARTHEST_ANCHOR),
-                -0.5,
-                optional=True,
-                is_size=False,
-            ),
-            "y": EffectParameter(
-                "m",
-                "anchor, floor frame",
-                -1e3,
-                1e3,
-                0.0,
-                (-FARTHEST_ANCHOR, FARTHEST_ANCHOR),
-                0.3,
-                optional=True,
-                is_size=False,
-            ),
+            "x": _anchor(-0.5),
+            "y": _anchor(0.3),
         },
         _add_tether,
         search=Search(BODY_FORCE, "straight", BODY, _tether_guesses, coordinates=_tether_coordinates),
