@@ -94,8 +94,8 @@ def _short(value: float) -> str:
 def _peer(row: Row) -> str:
     if not row["peer"]:
         return "-"
-    most = "none; given up at " if row.get("at_least") else ""
-    return f"{most}{_value(row['peer'], row['unit'])} ({row['peer_name']})"
+    given_up = "none; given up at " if row.get("at_least") else ""
+    return f"{given_up}{_value(row['peer'], row['unit'])} ({row['peer_name']})"
 
 
 def _ratio(row: Row) -> str:

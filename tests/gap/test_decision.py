@@ -4,11 +4,11 @@ import importlib
 import json
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
 from rich.console import Console
+from waiting import wait_until
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli.gap_decide import DecideOptions, ask, recorder_of
@@ -265,8 +265,7 @@ def test_two_processes_do_not_drive_one_robot_for_one_folder(data, tmp_path, ans
     out.mkdir()
     code = f"import pathlib, time\nfrom wlr_gym.base.files import alone_in\nwith alone_in(pathlib.Path({str(out)!r})):\n"
     holder = subprocess.Popen([sys.executable, "-c", f"{code}    pathlib.Path({str(begun)!r}).touch(); time.sleep(600)"])
-    while not begun.exists():
-        time.sleep(0.05)
+    wait_until(begun.exists, holder)
     with pytest.raises(InputError, match=r"out/\.lock: held by another process"):
         decide(data, out, record)
     holder.kill()

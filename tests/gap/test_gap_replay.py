@@ -271,7 +271,7 @@ def test_a_window_begins_with_the_loads_that_were_measured(window):
     clock = RunClock(noisy, window=window)
     values = replay_batch(ROBOT, [clock], nominal())[0].values
     legs = [CHANNELS.index(f"pos_{leg}") for leg in JOINTS[:4]]
-    assert np.abs(values[0][:, legs] - measured(exact)[:, legs]).max() < 6e-4  # half a count is 8e-4
+    assert np.abs(values[0][:, legs] - measured(exact)[:, legs]).max() < 5e-4
     found = anchored_residuals(noisy["t"], measured(noisy), values, NOISE, clock.windows)[0]
     rms = np.sqrt(np.nanmean(found**2, axis=0))
     assert rms[[CHANNELS.index(f"eff_{leg}") for leg in JOINTS[:4]]].max() < 1.3

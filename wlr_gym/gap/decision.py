@@ -171,6 +171,7 @@ def decide(
 
 
 def _go_on(asked: _Asked, record: Recorder, history: History, last: DecisionRound | None) -> Decided:
+    """Work through the rounds that are left; ``last``: see :func:`_resumed`."""
     while True:
         now, result, left = _analysed(asked, history, last)
         ended, promise = _choice(asked, history, now, result, left)

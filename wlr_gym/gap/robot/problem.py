@@ -128,6 +128,8 @@ class RobotProblem:
             for run in runs
         ]
 
+        self._compared = [_once_read(*one) for one in zip(self._measured, self.clocks, strict=True)]
+
     def times(self, run: int) -> Array:
         """Return the times (rows,) of a run, s."""
         return self.clocks[run].t
@@ -188,10 +190,7 @@ class RobotProblem:
         r, simulated = replayed
         lost = ~np.isfinite(simulated).all(axis=(1, 2))
         simulated[lost] = 0.0
-        measured = self._measured[r].copy()
-        if not self.clocks[r].lead:  # a robot that is put into motion has no torque and no acceleration yet
-            measured[0, UNREAD] = np.nan
-        found = anchored_residuals(self.times(r), measured, simulated, self._noise, self.clocks[r].windows)
+        found = anchored_residuals(self.times(r), self._compared[r], simulated, self._noise, self.clocks[r].windows)
         found[lost] = np.where(np.isfinite(found[lost]), LOST, np.nan)
         return found
 
@@ -298,6 +297,15 @@ class RobotProblem:
         names = [(slot, name) for slot, force in samples.items() for name in force.parameters]
         constants = [[forces[slot].parameters[name] if slot in forces else 0.0 for slot, name in names] for forces in own]
         return tuple(samples.values()), np.array(constants).reshape(len(settings), len(names))
+
+
+def _once_read(measured: Array, clock: RunClock) -> Array:
+    """What is compared of a run: a robot that is put into motion has no torque and no acceleration in its first row."""
+    if clock.lead:
+        return measured
+    compared = measured.copy()
+    compared[0, UNREAD] = np.nan
+    return compared
 
 
 def _place(channel: str) -> str:

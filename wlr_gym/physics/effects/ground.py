@@ -83,9 +83,9 @@ MOST_STRIPS = 24
 WIDEST_AREA = 12
 #: m; an area that is looked for may lie so far beyond the floor that was reached.
 BEYOND = 10.0
-#: By how much more than others a patch must improve a fit: what an uneven floor does goes with place too. On floors of 0.045 to
+#: By how much more than others a patch must improve a fit: what a bumpy floor does goes with place too. On floors of 0.045 to
 #: 0.14 mm rms without a patch one gained up to 52 (fall of minus two log posterior); true ones of severity 1 and more, 288 on.
-UNEVEN_FLOOR = 80.0
+BUMPY_FLOOR = 80.0
 #: Across, an area that is looked for has no end.
 ACROSS = {"y_min": -UNBOUNDED, "y_max": UNBOUNDED}
 
@@ -270,6 +270,6 @@ EFFECTS: tuple[Effect, ...] = (
         },
         _lay_patch,
         "area or ratio",
-        search=Search(FLOOR, "straight", GROUND, _patch_guesses, coordinates=_patch_coordinates, surcharge=UNEVEN_FLOOR),
+        search=Search(FLOOR, "straight", GROUND, _patch_guesses, coordinates=_patch_coordinates, surcharge=BUMPY_FLOOR),
     ),
 )

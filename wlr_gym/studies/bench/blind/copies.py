@@ -31,7 +31,7 @@ SOFTNESS = (0.3, 1.0)
 FLATTENING = (0.2, 0.5)
 #: m; range of the rms height of the floor that such robots drive on: :data:`WAVES` waves of random heading and phase, whose
 #: lengths (m) lie in WAVE_LENGTH.
-UNEVENNESS = (0.045e-3, 0.13e-3)
+BUMPS = (0.045e-3, 0.13e-3)
 WAVES = 8
 WAVE_LENGTH = (0.1, 0.8)
 
@@ -185,7 +185,7 @@ def draw(robot: dict[str, Any], rng: np.random.Generator) -> Copy:
 
 
 def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
-    """Soft tyres, an uneven floor, friction that creeps: what no robot file says and no two simulators share."""
+    """Return the copy on soft tyres and a bumpy floor, with friction that creeps: what no two simulators share."""
 
     def drawn(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
@@ -195,7 +195,7 @@ def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
         gear_creep=drawn(*YIELDING_GEAR),
         normal_stiffness=copy.normal_stiffness * drawn(*SOFTNESS),
         flattening=drawn(*FLATTENING),
-        floor_waves=_waves(drawn(*UNEVENNESS), rng),
+        floor_waves=_waves(drawn(*BUMPS), rng),
     )
 
 
