@@ -1,6 +1,6 @@
 """What each part of Velocity's recipe is worth, and what weights of slip buy: docs/data/ablations.json, figure slip_weights.
 
-``python .ci/docs/ablations.py SWEEP BLIND`` scores every setting of two sweeps (docs/learning.md has their commands) as ``wlr
+``python .ci/docs/ablations.py SWEEP BLIND`` scores every setting of two sweeps (docs/policies.md has their commands) as ``wlr
 evaluate`` does, beside the whole recipe and the controllers; an interrupted scoring goes on where it stopped. Then, or without
 arguments, the picture is drawn. tables.py has the table.
 """

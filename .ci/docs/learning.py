@@ -1,4 +1,4 @@
-"""The result tables of docs/learning.md: kept in docs/data/learning.json, from trained seeds of each recipe.
+"""The result tables of docs/policies.md: kept in docs/data/learning.json, from trained seeds of each recipe.
 
 ``python .ci/docs/learning.py TASK POLICIES BLIND`` scores the seeds of a task's slip-aware recipe (a folder or pattern of run
 folders) and of its blind one beside the hand-written controllers, as ``wlr evaluate`` does, row by row, and takes the numbers
@@ -23,7 +23,7 @@ from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "learning.json"
-PAGE = ROOT / "docs" / "learning.md"
+PAGE = ROOT / "docs" / "policies.md"
 EPISODES = 256
 CONTROLLERS = ("slip_compensating", "pid")
 #: Policies are named so in data and tables.

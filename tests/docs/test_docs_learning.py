@@ -1,4 +1,4 @@
-"""docs/learning.md has the numbers of docs/data/learning.json, and README's of Velocity are among them."""
+"""docs/policies.md has the numbers of docs/data/learning.json, and README's of Velocity are among them."""
 
 from __future__ import annotations
 

@@ -22,8 +22,9 @@ NOT_RUN = {
     "docs/own_rig.md": 2,  # examples/linear_axis.py goes the same way
     "docs/quickstart.md": 2,  # installation
     "docs/randomization.md": 1,  # the result of an analysis
+    "docs/driving.md": 1,  # a robot
     "docs/emulator.md": 1,  # until Ctrl-C
-    "docs/robot.md": 2,  # a robot
+    "docs/robot.md": 1,  # a robot
     "docs/sweep.md": 1,  # a cluster
     "docs/vision.md": 4,  # installation, pictures, a film, a photograph
 }
@@ -32,7 +33,7 @@ LONG = {
     "README.md",
     *(
         f"docs/{name}.md"
-        for name in ("camera", "commissioning", "compare", "learning", "pictures", "quickstart", "robot", "run_format", "sweep")
+        for name in ("camera", "commissioning", "compare", "driving", "learning", "pictures", "quickstart", "run_format", "sweep")
     ),
 }
 BLOCKS = [block for page in PAGES for block in blocks(page)]

@@ -47,7 +47,7 @@ def test_the_site_has_whole_rows(name):
 
 
 def test_the_page_names_what_the_acceptance_test_refuses():
-    page = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8").partition("\n## Acceptance")[2].partition("\n## ")[0]
+    page = (ROOT / "docs" / "policies.md").read_text(encoding="utf-8").partition("\n## Acceptance")[2].partition("\n## ")[0]
     refused = [row for row in rows("acceptance") if row[-1].strip() == "no"]
     assert refused
     for policy, _, _, floors, *_, bound, _ in refused:

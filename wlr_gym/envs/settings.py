@@ -41,7 +41,7 @@ class EnvironmentOptions(TypedDict, total=False):
     """What ``gym.make("WLR-...", ...)``, ``gym.make_vec`` and the environment classes accept.
 
     Attributes:
-        backend: which plant: ``gibbs_appell`` or ``mujoco``, or ``dynamixel``: the real robot, see ``docs/robot.md``.
+        backend: which plant: ``gibbs_appell`` or ``mujoco``, or ``dynamixel``: the real robot, see ``docs/driving.md``.
         plant: the same as ``backend``, for callers whose own interface takes that word (TorchRL).
         robot: name in ``configs/robot/``, path of a YAML file, its content, or a :class:`wlr_gym.robot.Robot`;
             None = the task's, of a real robot the one that its hardware file names. The task's numbers follow it by the rules

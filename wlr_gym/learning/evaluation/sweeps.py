@@ -84,7 +84,7 @@ SHAPES = ("line", "S-curve", "circle")
 FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
 #: Friction coefficient under the left wheels of split floors.
 LEFT_FRICTION = 0.25
-#: Friction under the right wheels over it. Beyond about 2 a robot standing square cannot turn: see docs/evaluation.md.
+#: Friction under the right wheels over it. Beyond about 2 a robot standing square cannot turn: see docs/physics.md.
 SPLIT_RATIO = (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
 #: Friction coefficient of the slopes.
 SLOPE_FRICTION = 0.4

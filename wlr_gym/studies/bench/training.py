@@ -37,7 +37,7 @@ WINDOW = 16_384
 MOST_FRAMES = 4_000_000
 #: A peer is given up after so many times our wall time.
 PATIENCE = 10.0
-#: Settings with which each learnt fastest of those tried (docs/learning.md): many robots, few large minibatches; few robots,
+#: Settings with which each learnt fastest of those tried (docs/policies.md): many robots, few large minibatches; few robots,
 #: more and smaller ones. ``samples`` are those of an update.
 OUR_ROBOTS = 256
 OURS = {"samples": 8192, "batch_size": 512, "learning_rate": 2e-3}
