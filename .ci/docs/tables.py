@@ -118,7 +118,7 @@ def acceptance_table() -> list[str]:
     for stored in map(read_acceptance, sorted((DATA / "acceptance").glob("*.json"))):
         header, *losses = acceptance_rows(stored)
         sensors = ", ".join(stored.sensors or ()) or "neither"
-        rows += [(f"`{stored.policy}`", sensors, f"{stored.episodes} x {stored.seeds}", *loss) for loss in losses]
+        rows += [(f"`{stored.policy}`", sensors, f"{stored.blocks} x {stored.episodes}", *loss) for loss in losses]
     return _table(("policy", "robot has", "episodes", *header), rows)
 
 

@@ -12,7 +12,7 @@ SMALL = ["--episodes", "3", "--no-progress"]
 
 @pytest.mark.slow
 def test_it_writes_the_same_card_twice(tmp_path, capsys):
-    arguments = ["evaluate", "constant_command", "--baselines", "do_nothing", "--seeds", "2", *SMALL, "--out"]
+    arguments = ["evaluate", "constant_command", "--baselines", "do_nothing", "--blocks", "2", *SMALL, "--out"]
     assert main([*arguments, str(tmp_path / "a")]) == 0
     assert main([*arguments, str(tmp_path / "b")]) == 0
     printed = capsys.readouterr().out
@@ -22,7 +22,7 @@ def test_it_writes_the_same_card_twice(tmp_path, capsys):
     assert first == second
     content = json.loads(first)
     assert list(content["policies"]) == ["constant_command", "do_nothing"]
-    assert content["conditions"]["episodes"] == "3 x 2 seeds"
+    assert content["conditions"]["episodes"] == "3, in each of 2 blocks"
     files = {path.name for path in (tmp_path / "a").iterdir()}
     assert files == {
         "card.md",
@@ -45,14 +45,14 @@ def test_an_agent_is_scored_without_what_policy_files_need(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_full_means_seeds_sweeps_and_both_simulators(tmp_path, monkeypatch, capsys):
+def test_full_means_blocks_sweeps_and_both_simulators(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(evaluate, "FULL_EPISODES", 2)
-    monkeypatch.setattr(evaluate, "FULL_SEEDS", 2)
+    monkeypatch.setattr(evaluate, "FULL_BLOCKS", 2)
     arguments = ["evaluate", "constant_command", "--full", "--baselines", "do_nothing", "--sweep", "payload", "--no-progress"]
     arguments += ["--other-episodes", "1", "--sweep-episodes", "1", "--out", str(tmp_path)]
     assert main(arguments) == 0
     content = json.loads((tmp_path / "card.json").read_text())
-    assert content["conditions"]["episodes"] == "2 x 2 seeds"
+    assert content["conditions"]["episodes"] == "2, in each of 2 blocks"
     assert content["conditions"]["second simulator"] == "mujoco, 1 episodes"
     assert [point["at"] for point in content["sweeps"]["payload"]] == ["0", "0.25", "0.5", "1", "2"]
     assert content["other_plant"]["score_kept"]["constant_command"]["mean"] > 50.0
@@ -62,12 +62,12 @@ def test_full_means_seeds_sweeps_and_both_simulators(tmp_path, monkeypatch, caps
 def test_what_is_left_open_is_decided_by_full():
     quick, full = (evaluate._complete(evaluate.EvaluateOptions(("pid",), full=full)) for full in (False, True))
     assert quick.baselines == ("do_nothing", "pid")
-    assert (quick.episodes, quick.seeds, quick.sweep, quick.backend) == (64, 1, (), "gibbs_appell")
+    assert (quick.episodes, quick.blocks, quick.sweep, quick.backend) == (64, 1, (), "gibbs_appell")
     assert set(full.baselines or ()) >= {"do_nothing", "constant_command", "pid", "slip_compensating"}
-    assert (full.episodes, full.seeds, full.backend) == (256, 5, "both")
+    assert (full.episodes, full.blocks, full.backend) == (256, 5, "both")
     assert set(full.sweep or ()) >= {"friction", "split", "floors", "latency", "payload"}
-    slope = evaluate._complete(evaluate.EvaluateOptions(("pid",), full=True, env="WLR-Slope-v0", seeds=2, sweep=("slope",)))
-    assert (slope.seeds, slope.sweep) == (2, ("slope",))
+    slope = evaluate._complete(evaluate.EvaluateOptions(("pid",), full=True, env="WLR-Slope-v0", blocks=2, sweep=("slope",)))
+    assert (slope.blocks, slope.sweep) == (2, ("slope",))
 
 
 def test_a_baseline_that_is_the_policy_is_said_to_be_none(capsys):
@@ -96,7 +96,7 @@ def test_a_policy_of_another_task_is_told_where_it_was_trained(capsys):
         (["do_nothing", "--randomization", "wid"], "did you mean 'wide'"),
         (["do_nothing", "--env", "WLR-Velocty-v0"], "unknown environment"),
         (["do_nothing", "--episodes", "0"], "episodes = 0"),
-        (["do_nothing", "--seeds", "0"], "seeds = 0"),
+        (["do_nothing", "--blocks", "0"], "blocks = 0"),
         (["do_nothing", "--seed", "-1"], "--seed -1"),
         (["do_nothing", "--sweep", "slope"], "not for task 'velocity'"),
         (["do_nothing", "--backend", "mujoko"], "did you mean 'mujoco'"),

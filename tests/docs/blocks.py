@@ -33,7 +33,7 @@ _MARK = re.compile(r"(file|slow|checked by|not run|demo-command|test-command)(?:
 SMALLER = {
     "train": "--max-minutes 0.02 --no-progress",
     "sweep": "--seeds 1 --set total_steps=16_384 evaluation_episodes=4",
-    "evaluate": "--episodes 2 --seeds 1 --sweep-episodes 1 --other-episodes 1 --video-seconds 0.1 --no-progress",
+    "evaluate": "--episodes 2 --blocks 1 --sweep-episodes 1 --other-episodes 1 --video-seconds 0.1 --no-progress",
     "evaluate --full": "--sweep friction",
     "play": "--seconds 0.2 --size 96 64",
     "deploy": "--seconds 0.5 --yes --no-status",

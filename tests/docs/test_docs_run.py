@@ -31,10 +31,8 @@ NOT_RUN = {
 #: Pages whose blocks take longest; the slow suite runs them.
 LONG = {
     "README.md",
-    *(
-        f"docs/{name}.md"
-        for name in ("camera", "commissioning", "compare", "driving", "learning", "pictures", "quickstart", "run_format", "sweep")
-    ),
+    *(f"docs/{name}.md" for name in ("camera", "commissioning", "compare", "driving", "learning", "pictures")),
+    *(f"docs/{name}.md" for name in ("quickstart", "run_format", "sweep")),
 }
 BLOCKS = [block for page in PAGES for block in blocks(page)]
 

@@ -63,8 +63,8 @@ from wlr_gym.robot import robot_content
 FULL_BASELINES = ("do_nothing", "constant_command", "pid", "slip_compensating_no_camera", "slip_compensating")
 EPISODES = 64
 FULL_EPISODES = 256
-SEEDS = 1
-FULL_SEEDS = 5
+BLOCKS = 1
+FULL_BLOCKS = 5
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,13 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     """What to compare with, on the same episodes; as the policy. Default: do_nothing and pid, with --full every agent without
     learning and the environment's shipped policies."""
     full: bool = False
-    """The whole card: 256 episodes x 5 seeds, every sweep, both simulators. Minutes per policy; options below still count."""
+    """The whole card: 5 blocks of 256 episodes, every sweep, both simulators. Minutes per policy; options below still count."""
     episodes: int | None = None
-    """Number of episodes per seed; default 64, with --full 256."""
-    seeds: int | None = None
-    """Number of seeds, each with its own episodes; default 1, with --full 5."""
+    """Number of episodes per block; default 64, with --full 256."""
+    blocks: int | None = None
+    """Number of blocks of --episodes, each with its own seeds; default 1, with --full 5."""
     seed: int = FIRST_SEED
-    """Seed of the first episode; the others count up from it, each further block of --seeds from 10000 above the last one."""
+    """Seed of the first episode; the others count up from it, each further one of --blocks from 10000 above the last one."""
     backend: str | None = None
     """Simulator: gibbs_appell, mujoco, or both (the second for the main table only); default: the first, with --full both."""
     other_episodes: int = OTHER_EPISODES
@@ -102,8 +102,8 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     """Threads of the simulator; results do not depend on it."""
     accept: bool = False
     """Acceptance test instead of the card: on every family of floors of the task the policy must not lose more than 5 % of
-    tracking error (upper 95 % bound) against the baselines (default: its controller and the blind policy); 512 episodes x 5
-    seeds. Exit code 1 where it does."""
+    tracking error (upper 95 % bound) against the baselines (default: its controller and the blind policy); 5 blocks of 512
+    episodes. Exit code 1 where it does."""
     out: Path | None = None
     """Folder for card.md, card.json, pictures, episodes.parquet (every episode's scores) and samples.csv (what randomization
     drew); default: only print."""
@@ -171,7 +171,7 @@ def _accept(options: EvaluateOptions) -> int:
             references=options.baselines,
             floors=None if options.randomization is None else (options.randomization,),
             episodes=acceptance.EPISODES if options.episodes is None else options.episodes,
-            seeds=acceptance.SEEDS if options.seeds is None else options.seeds,
+            blocks=acceptance.BLOCKS if options.blocks is None else options.blocks,
             sensors=options.present(),
             robot=options.robot,
             effects=options.patch(),
@@ -180,9 +180,7 @@ def _accept(options: EvaluateOptions) -> int:
         )
     if options.json:
         print_json(result)
-    _print(
-        f"acceptance of {result.policy}: {result.episodes} episodes x {result.seeds} seeds a family", acceptance_rows(result)
-    )
+    _print(f"acceptance of {result.policy}: {result.blocks} x {result.episodes} episodes a family", acceptance_rows(result))
     if options.out is not None:
         write_acceptance(options.out / ACCEPTANCE_FILE, result)
         print(f"written: {options.out / ACCEPTANCE_FILE}")
@@ -204,7 +202,7 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
     chosen = {
         "env": environment,
         "episodes": FULL_EPISODES if full else EPISODES,
-        "seeds": FULL_SEEDS if full else SEEDS,
+        "blocks": FULL_BLOCKS if full else BLOCKS,
         "backend": "both" if full else BACKENDS[0],
         "sweep": sweeps_for(task_name_of(environment)) if full else (),
     }
@@ -250,7 +248,7 @@ def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
             options.env,
             baselines=options.baselines,
             episodes=options.episodes or 0,
-            seeds=options.seeds or 0,
+            blocks=options.blocks or 0,
             seed=options.seed,
             backend=str(options.backend),
             other_episodes=options.other_episodes,

@@ -26,7 +26,7 @@ from wlr_gym.learning.evaluation.acceptance import (
 from wlr_gym.policy import shipped_names
 
 STORED = sorted((Path(__file__).parents[3] / "docs" / "data" / "acceptance").glob("*.json"))
-TINY = {"floors": ["ice"], "episodes": 8, "seeds": 2}
+TINY = {"floors": ["ice"], "episodes": 8, "blocks": 2}
 
 
 @pytest.mark.slow
@@ -53,7 +53,7 @@ def test_a_task_of_ones_own_is_played_on_its_own_floors(tmp_path):
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**task, "name": "mine", "randomization": "ice"}))
     own = register_task(tmp_path / "mine.yaml")
     try:
-        result = accept("pid", own, references=["do_nothing"], episodes=2, seeds=1)
+        result = accept("pid", own, references=["do_nothing"], episodes=2, blocks=1)
     finally:
         del ENVIRONMENTS[own], gymnasium.registry[own]
     assert [one.floors for one in result.losses] == ["ice"]
@@ -62,7 +62,7 @@ def test_a_task_of_ones_own_is_played_on_its_own_floors(tmp_path):
 def test_floors_may_be_a_path_or_settings(tmp_path):
     (tmp_path / "floor.yaml").write_text("{base: ice}\n")
     for floors, said in ((tmp_path / "floor.yaml", str(tmp_path / "floor.yaml")), (RandomizationConfig(name="mine"), "mine")):
-        result = accept("pid", references=["do_nothing"], floors=[floors], episodes=2, seeds=1)
+        result = accept("pid", references=["do_nothing"], floors=[floors], episodes=2, blocks=1)
         assert [one.floors for one in result.losses] == [said]
 
 
@@ -86,7 +86,7 @@ def test_the_command_says_so_by_its_exit_code(tmp_path, capsys):
         "ice",
         "--episodes",
         "4",
-        "--seeds",
+        "--blocks",
         "2",
     ]
     assert main([*words, "--no-progress", "--out", str(tmp_path / "out")]) == 1
@@ -138,7 +138,7 @@ def test_a_stored_row_comes_out_again(path):
         references=[first.reference],
         floors=[first.floors],
         episodes=stored.episodes,
-        seeds=stored.seeds,
+        blocks=stored.blocks,
         sensors=stored.sensors,
     ).losses[0]
     assert again.error == pytest.approx(first.error, rel=0.01)

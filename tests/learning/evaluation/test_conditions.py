@@ -170,7 +170,7 @@ def test_a_sweep_of_another_task_is_refused():
         read_sweep("frictoin", "velocity")
 
 
-@pytest.mark.parametrize(("numbers", "message"), [({"episodes": 0}, "episodes = 0"), ({"blocks": 0}, "seeds = 0")])
+@pytest.mark.parametrize(("numbers", "message"), [({"episodes": 0}, "episodes = 0"), ({"blocks": 0}, "blocks = 0")])
 def test_impossible_numbers_are_refused(numbers, message):
     with pytest.raises(InputError, match=message):
         Condition("main", **numbers)

@@ -249,7 +249,7 @@ def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threa
         references=[old],
         floors=[{**family.randomization, "name": family.name}],
         episodes=asked.episodes,
-        seeds=1,
+        blocks=1,
         sensors=asked.sensors,
         robot=own,
         effects=list(family.effects) or None,

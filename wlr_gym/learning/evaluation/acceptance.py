@@ -30,7 +30,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
 }
 #: Largest loss of tracking error that is accepted, %: the upper end of its 95 % interval counts.
 LARGEST_LOSS = 5.0
-EPISODES, SEEDS = 512, 5
+EPISODES, BLOCKS = 512, 5
 #: Of the engine: twice as fast as float64, and what rounding changes is far below what floors do.
 PRECISION = "float32"
 #: Name of the file, and its version.
@@ -64,7 +64,7 @@ class Acceptance:
     """Result of the test of one policy.
 
     Attributes:
-        policy: as given. environment: id. episodes, seeds: per family of floors.
+        policy: as given. environment: id. episodes, blocks: per family of floors.
         sensors: those of the robots that not every robot has; None = as their file says.
         largest_loss: %, what was allowed.
         inputs: SHA-256 of the policies and of the task, robot and randomisations that were played.
@@ -74,7 +74,7 @@ class Acceptance:
     policy: str
     environment: str
     episodes: int
-    seeds: int
+    blocks: int
     sensors: tuple[str, ...] | None
     largest_loss: float
     inputs: str
@@ -98,7 +98,7 @@ def accept(
     references: Sequence[Source] | None = None,
     floors: Sequence[Any] | None = None,
     episodes: int = EPISODES,
-    seeds: int = SEEDS,
+    blocks: int = BLOCKS,
     largest_loss: float = LARGEST_LOSS,
     sensors: Sequence[str] | None = None,
     robot: Any = None,
@@ -113,7 +113,7 @@ def accept(
         env_id: id of the environment; None = the one the policy was trained in.
         references: None = :func:`references_of` the policy. The policy itself is none.
         floors: randomisations; None = those of the task's card.
-        episodes: per seed. seeds: blocks of episodes.
+        episodes: per block. blocks: of episodes, each with its own seeds.
         largest_loss: % of the tracking error.
         sensors, robot, effects, threads: of the environment; None = the task's.
         tell: called with what is going on and the share of the work that was done since.
@@ -137,7 +137,7 @@ def accept(
             environment,
             baselines=against,
             episodes=episodes,
-            seeds=seeds,
+            blocks=blocks,
             randomization=family,
             sensors=sensors,
             robot=robot,
@@ -155,7 +155,7 @@ def accept(
         str(policy),
         environment,
         episodes,
-        seeds,
+        blocks,
         None if sensors is None else tuple(sensors),
         largest_loss,
         inputs,

@@ -138,7 +138,7 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
 
     lines = [f"# Score card: {ours}", "", *(f"- {name}: {value}" for name, value in card.conditions.items()), ""]
     lines += [*_table(rows(card.scores[MAIN], card.metrics)), ""]
-    over = "training seeds and episodes" if card.training_seeds else "seeds and episodes"
+    over = "training seeds and episodes" if card.training_seeds else "blocks and episodes"
     lines += [f"Mean over episodes [{CONFIDENCE:.0%} bootstrap interval over {over}]; `-` where nothing moved.", ""]
     lines += _training_seeds(card)
     if len(card.names) > 1:

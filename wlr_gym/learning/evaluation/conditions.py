@@ -48,7 +48,7 @@ class Condition:
     blocks: int = 1
 
     def __post_init__(self) -> None:
-        for name, value, most in (("episodes", self.episodes, BLOCK), ("seeds", self.blocks, 1000)):
+        for name, value, most in (("episodes", self.episodes, BLOCK), ("blocks", self.blocks, 1000)):
             if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
                 raise InputError(f"{name} = {value!r}: expected a whole number from 1 to {most}")
 

@@ -39,7 +39,7 @@ def evaluate(
     *,
     baselines: Sequence[Source | Sequence[Source]] | None = None,
     episodes: int = 64,
-    seeds: int = 1,
+    blocks: int = 1,
     seed: int = FIRST_SEED,
     backend: str = "gibbs_appell",
     other_episodes: int = OTHER_EPISODES,
@@ -63,7 +63,7 @@ def evaluate(
         env_id: id of the environment; None = the one the policy was trained in, else ``WLR-Velocity-v0``.
         baselines: what to compare with, given as the policy is; None = ``do_nothing`` and ``pid`` as far as they fit the task.
             The policy itself is not played twice.
-        episodes: per seed. seeds: blocks of episodes.
+        episodes: per block. blocks: of episodes, each with its own seeds.
         seed: of the first episode; the others count up from it, each further block from 10000 above the last one.
         backend: ``gibbs_appell``, ``mujoco``, or ``both`` (the second for the main table only).
         other_episodes: in the second simulator.
@@ -100,15 +100,16 @@ def evaluate(
     keywords: dict[str, Any] = {"randomization": randomization, "robot": robot, "effects": patch}
     keywords |= {"backend": main, "threads": threads, "precision": precision, **having(sensors)}
     chosen = tuple(read_sweep(name, task) for name in dict.fromkeys(sweeps))
-    conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=seeds)]
+    conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=blocks)]
     for sweep in chosen:
         conditions += sweep.conditions(keywords, sweep_episodes)
     fewer = min(other_episodes, episodes)
     conditions += [Condition(OTHER_PLANT, {**keywords, "backend": other}, episodes=fewer) for other in others]
     total = work(conditions, subjects, make_task(task_source_of(environment), read_settings(keywords)).episode_steps)
     results = play(environment, subjects, conditions, seed, lambda text, done: tell(text, done / total), watch)
+    count = f"{episodes}, in each of {blocks} blocks" if blocks > 1 else str(episodes)
     said = {
-        "environment": environment, "backend": main, "episodes": f"{episodes} x {seeds} seeds", "first seed": seed,
+        "environment": environment, "backend": main, "episodes": count, "first seed": seed,
         "randomization": randomization_said(randomization), "robot": _named(robot), "effects": patch.summary(),
     }  # fmt: skip
     if sensors is not None:
