@@ -36,6 +36,23 @@ def test_page_and_readme_have_the_numbers():
     assert {row["name"] for row in ROWS} <= set(MEASUREMENTS)
 
 
+def test_the_fairness_of_the_speed_claim_has_the_numbers():
+    page = " ".join((ROOT / "docs" / "performance.md").read_text(encoding="utf-8").split())
+    settings = [one for one in DATA["engine"]["settings"] if one["precision"] == "float64"]
+    speed = {(one["side"], one["label"]): one["speed"]["median"] for one in settings}
+    (best,) = [row for row in ROWS if row["what"].startswith("float64, error at most 0.1 mm")]
+    assert f"At `gym.make`'s 1 ms it is {speed['engine', '1 ms'] / best['peer']['median']:.0f}." in page
+    (alone,) = [row["ours"]["median"] for row in ROWS if row["what"] == "1 robots, float64, 1 thread"]
+    peer = speed["MuJoCo", "1 ms, pyramidal, default contact, Euler"] * 1000
+    assert f"{alone / 1000:.0f} k substeps of 1 ms per second, {alone / peer:.0f} times MuJoCo at 1 ms" in page
+    worst = max(one["worst"] for one in settings if one["label"].startswith("0.25 ms, elliptic, tuned"))
+    assert f"at most {worst * 1000:.2f} mm away at 0.25 ms" in page
+    (loose,) = [row for row in ROWS if row["what"].startswith("float64, error at most 25 mm")]
+    assert f"{loose['ratio']['median']:.0f}\N{MULTIPLICATION SIGN} where an error of 25 mm" in performance.README.read_text(
+        encoding="utf-8"
+    )
+
+
 def test_a_snapshot_is_as_large_as_the_page_says():
     text = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
     with closing(gymnasium.make("WLR-Velocity-v0", randomization="ice")) as env:
