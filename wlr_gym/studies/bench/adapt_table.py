@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import quantile_test
 
 from wlr_gym.base.text import tally
 from wlr_gym.learning.adaptation.driving import paired
@@ -66,8 +67,8 @@ def summary(table: Table) -> list[str]:
     if with_ours:
         shares = np.array([regained(table[name]).mean for name in with_ours])
         said.append(
-            f"- Regained in {len(with_ours)} of these, %: median {np.median(shares):.0f}; at least 50 in "
-            f"{(shares >= 50.0).sum()} of {len(shares)}."
+            f"- Regained in {len(with_ours)} of these, %: median {_median(shares)}; at least 50 in {(shares >= 50.0).sum()} of "
+            f"{len(shares)}."
         )
     adapted = [name for name, case in table.items() if {"ours", "none"} <= case.keys()]
     worse = [name for name in adapted if better(table[name], "ours", "none").high < 0.0]
@@ -83,6 +84,13 @@ def summary(table: Table) -> list[str]:
             found = _all(table, both, "ours", other)
             said.append(f"- Ours against '{CONTENDERS[other]}', {len(both)} cases: {_interval(found)} % better.")
     return said
+
+
+def _median(shares: Array) -> str:
+    """Return the median over cases, each with a training of its own, and its exact interval (of the order statistics)."""
+    found = quantile_test(shares, p=0.5).confidence_interval()
+    few = np.isnan(found.low) or np.isnan(found.high)  # below six cases there is none
+    return f"{np.median(shares):.0f}" if few else f"{np.median(shares):.0f} [{found.low:.0f}, {found.high:.0f}]"
 
 
 def _all(table: Table, names: Sequence[str], ours: str, theirs: str) -> Estimate:
