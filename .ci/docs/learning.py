@@ -2,7 +2,7 @@
 
 ``python .ci/docs/learning.py TASK POLICIES BLIND`` scores the seeds of a task's slip-aware recipe (a folder or pattern of run
 folders) and of its blind one beside the hand-written controllers, as ``wlr evaluate`` does, row by row, and takes the numbers
-over; without arguments only the tables are written anew. An interrupted scoring goes on where it stopped.
+over. An interrupted scoring goes on where it stopped. tables.py has the tables.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "learning.json"
-PAGE = ROOT / "docs" / "policies.md"
 EPISODES = 256
 CONTROLLERS = ("slip_compensating", "pid")
 #: Policies are named so in data and tables.
@@ -48,8 +47,9 @@ ROWS: Mapping[str, tuple[tuple[str, Any], ...]] = {
     "posture": tuple((sensors, floors) for sensors in ("camera", "none") for floors in ("asymmetric", "nominal")),
     "slope": (("none", "slope"), ("camera", "slope")),
 }
-_TITLES = ("robot has", "floors", "tracking error", "median seed, spread", "success (%)", "slip (mm/s)", "`blind`, better (%)")
-_TITLES += ("`slip_compensating`, better (%)", "`pid`, better (%)", "slips less than blind (%)", "than `pid` (%)")
+_OTHERS = (BLIND, *CONTROLLERS)
+HEADER = ("robot has", "floors", "tracking error", "median seed, spread", "success (%)", "slip (mm/s)")
+HEADER += (*(f"`{name}`: error, better (%)" for name in _OTHERS), *(f"slips less than `{name}` (%)" for name in _OTHERS))
 
 
 # ---- scoring ---------------------------------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def row_of(card: Card, sensors: str, floors: str) -> dict[str, Any]:
             "better": interval(better[name]["tracking_error"]),
             "slips_less": interval(better[name]["slip_speed"]),
         }
-        for name in (BLIND, *CONTROLLERS)
+        for name in _OTHERS
     }
     return row
 
@@ -112,10 +112,9 @@ def interval(estimate: Estimate) -> list[float]:
 # ---- tables ----------------------------------------------------------------------------------------------------------
 
 
-def table(task: Mapping[str, Any]) -> list[str]:
-    """Return the table of a task as lines of Markdown."""
-    lines = [f"| {' | '.join(_TITLES)} |", "|---" * len(_TITLES) + "|"]
-    return [*lines, *(f"| {' | '.join(cells(row))} |" for row in task["rows"])]
+def table(task: str) -> list[list[str]]:
+    """Return the rows of the table of a task."""
+    return [cells(row) for row in read_data()[task]["rows"]]
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
@@ -126,8 +125,8 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     found = ["neither" if row["sensors"] == "none" else row["sensors"], row["floors"]]
     found += [f"**{error:.3f} [{low:.3f}, {high:.3f}]**", spread]
     found += [f"{row['success'][0]:.0f}", f"{1000 * row['slip_speed'][0]:.1f}"]
-    found += [f"{others[name]['tracking_error']:.3f}, {percent(others[name]['better'])}" for name in (BLIND, *CONTROLLERS)]
-    return found + [percent(others[name]["slips_less"]) for name in (BLIND, "pid")]
+    found += [f"{others[name]['tracking_error']:.3f}, {percent(others[name]['better'])}" for name in _OTHERS]
+    return found + [percent(others[name]["slips_less"]) for name in _OTHERS]
 
 
 def percent(numbers: list[float]) -> str:
@@ -136,22 +135,10 @@ def percent(numbers: list[float]) -> str:
     return f"{mean} [{low}, {high}]"
 
 
-def write_page(text: str, data: Mapping[str, Any]) -> str:
-    """Return the page with the tables of the data between their marks."""
-    for task, found in data.items():
-        before, rest = text.split(f"<!-- results of {task}: made by .ci/docs/learning.py -->\n", 1)
-        _, after = rest.split(f"<!-- end of {task} -->", 1)
-        text = f"{before}<!-- results of {task}: made by .ci/docs/learning.py -->\n"
-        text += "\n".join(["", *table(found), "", f"<!-- end of {task} -->"]) + after
-    return text
-
-
 def read_data() -> dict[str, Any]:
     """Return the kept numbers: task -> SHA-256 of the policies, commit, date, rows."""
     return json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {}
 
 
 if __name__ == "__main__":
-    if sys.argv[1:]:
-        score(*sys.argv[1:])
-    PAGE.write_text(write_page(PAGE.read_text(encoding="utf-8"), read_data()), encoding="utf-8")
+    score(*sys.argv[1:])

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 
 import ablations
+import learning
 import performance
 
 from wlr_gym.data.excitations import EXCITATIONS
@@ -125,6 +126,11 @@ def acceptance_table() -> list[str]:
 def blind_test_table() -> list[str]:
     """Return the score of the stored answers of the blind test; its data are not needed."""
     return markdown(score_answers(ANSWERS)).splitlines()
+
+
+def result_table(task: str) -> list[str]:
+    """Return the scores of a task's trained seeds."""
+    return _table(learning.HEADER, learning.table(task))
 
 
 def ablation_table() -> list[str]:
@@ -303,6 +309,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "equations": verdict_table,
     "adapt": adapt_table,
     "decide": decide_table,
+    **{f"results_{task}": partial(result_table, task) for task in learning.ROWS},
     "ablations": ablation_table,
     "scripts": script_table,
     "blind_test": blind_test_table,

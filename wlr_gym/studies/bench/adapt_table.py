@@ -36,9 +36,9 @@ def helps(case: Mapping[str, Line]) -> bool | None:
     return float(_errors(case["truth"]).mean()) <= (1.0 - HELPS) * float(_errors(case["none"]).mean())
 
 
-def regained(case: Mapping[str, Line]) -> Estimate:
-    """Return (old - ours) / (old - truth), %, paired over the episodes."""
-    pairs = [_pairs(case[name]) for name in ("none", "none", "ours", "truth")]
+def regained(case: Mapping[str, Line], contender: str = "ours") -> Estimate:
+    """Return (old - contender) / (old - truth), %, paired over the episodes."""
+    pairs = [_pairs(case[name]) for name in ("none", "none", contender, "truth")]
     return Bootstrap(1, len(_errors(case["none"]))).share(*pairs, subjects=(0, 0, 1, 2))
 
 
@@ -62,19 +62,26 @@ def summary(table: Table) -> list[str]:
     """Return what all cases say together, one sentence a line."""
     known = {name: one for name, case in table.items() if (one := helps(case)) is not None}
     counted = [name for name, one in known.items() if one]
-    said = [f"- The truth makes the policy at least {HELPS:.0%} better in {len(counted)} of {len(known)} cases."]
-    with_ours = [name for name in counted if "ours" in table[name]]
-    if with_ours:
-        shares = np.array([regained(table[name]).mean for name in with_ours])
-        said.append(
-            f"- Regained in {len(with_ours)} of these, %: median {_median(shares)}; at least 50 in {(shares >= 50.0).sum()} of "
-            f"{len(shares)}."
-        )
+    against = sum(better(table[name], "truth", "none").mean < 0.0 for name in known)
+    said = [
+        f"- The truth makes the policy at least {HELPS:.0%} better in {len(counted)} of {len(known)} cases, worse in {against}."
+    ]
+    for contender in ("ours", "calibrated"):
+        theirs = [name for name in counted if contender in table[name]]
+        if theirs:
+            shares = np.array([regained(table[name], contender).mean for name in theirs])
+            enough = f"at least 50 in {(shares >= 50.0).sum()} of {len(shares)}"
+            said.append(
+                f"- Regained by '{CONTENDERS[contender]}' in {len(theirs)} of these, %: median {_median(shares)}; {enough}."
+            )
     adapted = [name for name, case in table.items() if {"ours", "none"} <= case.keys()]
-    worse = [name for name in adapted if better(table[name], "ours", "none").high < 0.0]
     if adapted:
+        gains = [better(table[name], "ours", "none") for name in adapted]
+        worse = [name for name, gain in zip(adapted, gains, strict=True) if gain.high < 0.0]
+        median = _median(np.array([gain.mean for gain in gains]))
         said.append(
-            f"- Worse than before adaptation beyond the interval: {len(worse)} of {len(adapted)} ({', '.join(worse) or '-'})."
+            f"- Tracking error after adaptation: {median} % smaller (median); beyond the interval smaller in "
+            f"{sum(gain.low > 0.0 for gain in gains)} of {len(adapted)}, larger in {len(worse)} ({', '.join(worse) or '-'})."
         )
         kept = sum(table[name]["ours"].get("kept") == "old" for name in adapted)
         said.append(f"- The acceptance test kept the old policy in {kept} of {len(adapted)} cases.")
