@@ -22,6 +22,7 @@ from wlr_gym.hardware.driving import drive_robot
 from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
+from wlr_gym.learning.adaptation.robots import interrupted
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.plants.robot_options import RobotOptions
@@ -192,6 +193,24 @@ def test_a_stop_asked_for_at_the_very_end_ends_the_command(tmp_path, when):
     assert drive.reason == "the motion is over; SIGINT"
     assert drive.well
     assert drive.ticks == len(motion.setpoints)
+
+
+@pytest.mark.parametrize(("key", "reason"), [(b" ", "emergency stop key"), (b"q", "stop key")])
+def test_keys_of_a_terminal_end_a_motion(tmp_path, monkeypatch, key, reason):
+    """Of wlr record, replay and adapt as of wlr deploy."""
+    plant, _ = emulated_plant(tmp_path)
+    master, slave = os.openpty()
+    step = plant.step
+    monkeypatch.setattr(plant, "step", lambda *given: (os.write(master, key), step(*given)))
+    with open(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        drive = drive_robot(plant, short())
+    plant.close()
+    os.close(master)
+    assert reason in drive.reason
+    assert drive.well
+    assert drive.ticks < len(short().setpoints)
+    assert interrupted(drive.reason)
 
 
 def test_a_stop_in_the_last_motion_tick_starts_no_other(tmp_path, monkeypatch):

@@ -77,7 +77,7 @@ def test_a_card_says_what_the_file_is(policy):
     ("sources", "observer", "words"),
     [
         (["computed"], None, "It is blind to slip"),
-        (["sensors", "computed"], {"camera": False}, "from the slip observer's pose, without a camera"),
+        (["sensors", "computed"], {"camera": False}, "It is blind to slip"),
         (["sensors", "estimate"], {"camera": True}, "slip observer, with a camera"),
         (["sensors", "estimate"], {"camera": False}, "slip observer, without a camera"),
         (["sensors", "estimate"], {"camera": True, "present": 0.5}, "slip observer, with or without a camera"),
@@ -102,6 +102,15 @@ def test_a_card_names_the_commit_it_was_trained_with(policy, commit, shown):
     content["training"]["git_commit"] = commit
     policy.write_bytes(seal(policy.read_bytes(), content))
     assert shown in write_model_card(policy, scores(policy)).read_text()
+
+
+def test_a_card_says_what_follows_a_pose(policy):
+    content = contract_of(policy)
+    content["environment"]["observer"] = {"camera": False}
+    for column in content["environment"]["observation"]:
+        column |= {"source": "computed", "name": "path_error[lateral]"}
+    policy.write_bytes(seal(policy.read_bytes(), content))
+    assert "from the slip observer's pose, without a camera" in write_model_card(policy, scores(policy)).read_text()
 
 
 def test_scores_of_other_policies_are_refused(policy):

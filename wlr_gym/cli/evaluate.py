@@ -71,7 +71,7 @@ FULL_BLOCKS = 5
 class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     policy: tyro.conf.Positional[tuple[str, ...]]
     """Agent, policy file (.onnx), policy or run folder, or shipped policy; NAME=POLICY names it. Several, NAME=POLICY,POLICY, a
-    pattern ('out/trials/lr=1e-3-*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
+    pattern ('out/five/trials/*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
     env: str | None = None
     """Environment id (see: wlr envs); default: the one the policy was trained in, else WLR-Velocity-v0."""
     baselines: tuple[str, ...] | None = None

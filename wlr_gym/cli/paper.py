@@ -138,7 +138,7 @@ def _drive_robot(options: PaperOptions, console: Console) -> dict[str, Record]:
     """Guarded and logged; between the tests the operator carries the robot back."""
     from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.driving import refuse_deadman
-    from wlr_gym.hardware.operator import stop_on_signals
+    from wlr_gym.hardware.operator import stop_on_request
     from wlr_gym.physics.effects import load_patch
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters
@@ -151,7 +151,7 @@ def _drive_robot(options: PaperOptions, console: Console) -> dict[str, Record]:
             confirm(test.motion(), robot, console)
         plant = options.plant_of(robot, options.out / "runs", meta, load_patch(None))
         refuse_deadman(plant)
-        with stop_on_signals(plant.loop.operator), contextlib.closing(plant):
+        with stop_on_request(plant.loop.operator), contextlib.closing(plant):
             records[name] = drive_plant(plant, test, Parameters.nominal(robot))
             plant.loop.finish("the test is over")
     return records

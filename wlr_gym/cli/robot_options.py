@@ -171,10 +171,13 @@ def confirm(motion: Motion, robot: Robot, console: Console) -> None:
     Raises:
         InputError: nobody there.
     """
+    from wlr_gym.hardware.operator import KEYS_SAID
+
     travel = motion.travel(robot.wheel.radius)
     rolled = f"{travel[-1]:+.1f} m in all, from {travel.min():+.1f} to {travel.max():+.1f} m on the way (+ is forward)"
     console.print(f"The robot will stand up and drive {motion.name}: {motion.duration:.0f} s; it rolls {rolled}.")
-    wait_for_enter(console, "Free floor? Hand on the switch?")
+    console.print(KEYS_SAID, style="dim")
+    wait_for_enter(console, "Free floor, or wheels off the ground? Hand on the switch?")
 
 
 def wait_for_enter(console: Console, question: str, action: str = "start the robot", otherwise: str = ", or say --yes") -> None:

@@ -12,7 +12,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.record import start_setpoints
 from wlr_gym.hardware.loop import StoppedError
-from wlr_gym.hardware.operator import stop_on_signals
+from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.physics.plants.base import standing_state
 from wlr_gym.robot import LEG_SLICE
@@ -68,7 +68,7 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     reason, ticks = "", 0
     torque_on = np.isfinite(motion.setpoints)
     setpoints = np.nan_to_num(motion.setpoints)
-    with stop_on_signals(loop.operator):
+    with stop_on_request(loop.operator):
         try:
             plant.reset(state=state)
             for tick in range(len(setpoints)):

@@ -16,7 +16,10 @@ from wlr_gym.hardware.timing import Clock
 
 EMERGENCY_KEY = " "
 STOP_KEY = "q"
-HELP = "space: motors off at once   q: stop   any key: I am here"
+#: Why a run ended by a key: torque off at once, or in good order.
+STOP_KEYS = ("emergency stop key", "stop key")
+KEYS_SAID = "space: motors off at once   q: stop"
+HELP = f"{KEYS_SAID}   any key: I am here"
 #: Signals that stop the robot, where the system has them.
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 
@@ -111,6 +114,11 @@ class Keys:
 
             termios.tcsetattr(self._source, termios.TCSADRAIN, self._before)
 
+    @property
+    def is_terminal(self) -> bool:
+        """Whether a person may be typing them."""
+        return self._before is not None
+
     def pressed(self) -> str:
         """Return the keys pressed since the last call."""
         if self._source is None or not select.select([self._source], [], [], 0.0)[0]:
@@ -126,9 +134,9 @@ class Keys:
         if keys:
             operator.note_sign()
         if EMERGENCY_KEY in keys:
-            operator.ask_off("emergency stop key")
+            operator.ask_off(STOP_KEYS[0])
         elif STOP_KEY in keys:
-            operator.ask_to_stop("stop key")
+            operator.ask_to_stop(STOP_KEYS[1])
 
 
 @contextlib.contextmanager
@@ -164,3 +172,16 @@ def stop_on_signals(operator: Operator) -> Iterator[None]:
             signal.signal(number, handler)
     if heard and operator.asked and not interrupted:
         raise KeyboardInterrupt(operator.asked)
+
+
+@contextlib.contextmanager
+def stop_on_request(operator: Operator) -> Iterator[None]:
+    """Let signals stop the robot, and a terminal's keys, which are read in the time that is left in each control step.
+
+    Raises:
+        KeyboardInterrupt: as of :func:`stop_on_signals`.
+    """
+    with stop_on_signals(operator), Keys() as keys:
+        if keys.is_terminal:
+            operator.spare = lambda: keys.serve(operator)
+        yield

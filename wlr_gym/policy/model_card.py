@@ -16,6 +16,8 @@ from wlr_gym.policy.file import needs_camera
 from wlr_gym.policy.onnx_file import open_policy
 
 SUFFIX = ".md"
+#: Observations that come from the pose that the slip observer has.
+_FROM_POSE = ("path_error", "course_error")
 
 
 def write_model_card(policy: Path, evaluation: str) -> Path:
@@ -56,7 +58,7 @@ def _summary(content: Mapping[str, Any]) -> str:
         sees = "It sees what no robot can measure, friction for example: an upper bound, for simulators only."
     elif "estimate" in sources:
         sees = f"It sees the estimates of the slip observer, {camera} a camera."
-    elif environment.get("observer"):
+    elif _term_counts(environment["observation"]).keys() & set(_FROM_POSE):
         sees = f"It sees no estimate of slip, but errors of its way from the slip observer's pose, {camera} a camera."
     else:
         sees = "It is blind to slip: it sees neither estimates of it nor a camera."
@@ -89,8 +91,11 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
 
 def _terms(columns: list[Mapping[str, Any]]) -> str:
     """``command 2, gyro 3``: the terms in their order, with how many numbers each has."""
-    counts = Counter(column["name"].partition("[")[0] for column in columns)
-    return tally(counts)
+    return tally(_term_counts(columns))
+
+
+def _term_counts(columns: list[Mapping[str, Any]]) -> Counter[str]:
+    return Counter(column["name"].partition("[")[0] for column in columns)
 
 
 def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:

@@ -166,8 +166,8 @@ def build_task(config: TaskConfig, robot: Robot) -> Task:
     """
     if config.sensors.flow and robot.sensors.flow is None:
         raise InputError(
-            f"sensors.flow = {config.sensors.flow:g}: robot '{robot.name}' has no optical-flow sensor; expected a section "
-            "sensors.flow in its file, as in configs/robot/flow.yaml"
+            f"sensors.flow = {config.sensors.flow:g}: robot '{robot.name}' has no optical-flow sensor; expected a robot "
+            "with a section sensors.flow, such as --robot flow"
         )
     policy = tuple(column for name in config.observations for column in _policy_columns(config, robot, name))
     privileged = tuple(column for name in config.privileged for column in _privileged_columns(config, robot, name))

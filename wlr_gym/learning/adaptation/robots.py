@@ -19,7 +19,7 @@ from wlr_gym.hardware.driving import DriveResult, drive_robot
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
-from wlr_gym.hardware.operator import STOP_SIGNALS
+from wlr_gym.hardware.operator import STOP_KEYS, STOP_SIGNALS
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.physics.effects import Patch, apply_patch
 from wlr_gym.physics.plants import make_plant
@@ -117,5 +117,5 @@ def _stop_if_asked(drive: DriveResult) -> None:
 
 
 def interrupted(reason: str) -> bool:
-    """Whether a drive ended because a signal asked for it."""
-    return any(name in reason for name in STOP_SIGNALS)
+    """Whether a drive ended because a signal or a key asked for it."""
+    return any(name in reason for name in (*STOP_SIGNALS, *STOP_KEYS))

@@ -20,7 +20,7 @@ from wlr_gym.envs.tasks.success import scales_of, tracking_error
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
 from wlr_gym.hardware.deployment import Deployment, deploy
 from wlr_gym.hardware.driving import refuse_deadman
-from wlr_gym.hardware.operator import stop_on_signals
+from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
@@ -100,7 +100,7 @@ def drive_episode(
             raise InputError(f"policy '{policy}': it has no slip observer, which is what tells how a real robot moves")
         whole = make_task(task_source_of(environment), read_settings(environment_for(policy, {})))  # with all measures
         score = _Score(whole, core, truth)
-        with stop_on_signals(plant.loop.operator):
+        with stop_on_request(plant.loop.operator):
             driven = deploy(core, make_policy(policy, core.contract()), seed, watcher=score)
     finally:
         core.close()

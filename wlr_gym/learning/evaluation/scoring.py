@@ -58,7 +58,7 @@ def evaluate(
 
     Args:
         policy: agent, policy file (.onnx), policy or run folder, or shipped policy; ``NAME=POLICY`` names it. A list, a pattern
-            such as ``out/trials/lr=1e-3-*``, a folder that holds run folders, or ``NAME=POLICY,POLICY,...``: trainings of one
+            such as ``out/five/trials/*``, a folder that holds run folders, or ``NAME=POLICY,POLICY,...``: trainings of one
             recipe that differ in the seed. All play all episodes; intervals contain training-seed variance.
         env_id: id of the environment; None = the one the policy was trained in, else ``WLR-Velocity-v0``.
         baselines: what to compare with, given as the policy is; None = ``do_nothing`` and ``pid`` as far as they fit the task.

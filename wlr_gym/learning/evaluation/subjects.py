@@ -64,7 +64,7 @@ def read_subjects(given: Sequence[Source | Sequence[Source]]) -> tuple[Subject, 
 
     Args:
         given: for each subject ``SOURCE`` or ``NAME=SOURCE``, and for trainings of one recipe that differ in the seed
-            ``SOURCE,SOURCE,...`` after a name, a list of sources, a pattern such as ``out/trials/lr=1e-3-*``, or a folder that
+            ``SOURCE,SOURCE,...`` after a name, a list of sources, a pattern such as ``out/five/trials/*``, or a folder that
             holds nothing but their run folders.
 
     Raises:

@@ -27,7 +27,7 @@ _SEED = re.compile(r"[-_/. ]*(seed)?[-_=]*\d*$")
 def expand(text: str) -> tuple[str, ...]:
     """Return the policies that a text without a name names, in the order of their paths; nothing where it names none.
 
-    It is a policy itself, a pattern of policies (``out/sweep/trials/lr=1e-3-*``), or a folder of run folders.
+    It is a policy itself, a pattern of policies (``out/five/trials/*``), or a folder of run folders.
 
     Raises:
         InputError: a run among them without a policy.
