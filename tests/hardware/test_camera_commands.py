@@ -15,6 +15,7 @@ from policy_log import act_again
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK, run_command
+from wlr_gym.cli.doctor import check_policy
 from wlr_gym.data.read import read_run
 from wlr_gym.hardware.log import read_events
 from wlr_gym.learning.evaluation import make_core
@@ -43,6 +44,21 @@ def test_a_camera_is_no_part_of_a_simulator(tmp_path):
     words = ["--backend", "mujoco", "--camera", "emulated", "--excitation", "straight", "--out", str(tmp_path)]
     with pytest.raises(InputError, match="--camera are about the robot"):
         run_command("record", words)
+
+
+@pytest.mark.parametrize(("policy", "is_told"), [("slip_compensating", True), ("velocity_slip_aware", False)])
+def test_who_needs_a_camera_is_told_without_one(tmp_path, policy, is_told, capsys):
+    """Not a policy that learnt to drive without, too."""
+    words = [policy, "--emulated", "--stepped", "--seconds", "0.2", "--out", str(tmp_path)]
+    assert run_command("deploy", words) == OK
+    assert ("expect worse tracking" in " ".join(capsys.readouterr().out.split())) == is_told
+
+
+def test_the_doctor_says_what_a_policy_loses_without_a_camera():
+    (found,) = [check for check in check_policy("posture_slip_aware", "nominal") if check.what == "camera"]
+    assert found.ok
+    assert "one in 70% of its training" in found.found
+    assert not [check for check in check_policy("posture_slip_aware", "nominal", has_camera=True) if check.what == "camera"]
 
 
 @pytest.mark.slow

@@ -113,7 +113,7 @@ def run(options: DeployOptions) -> int:
         keywords = {"backend": "dynamixel", "hardware": _robot(options, ports, poses), "episode_length": options.seconds}
         core = make_core(environment, 1, environment_for(options.policy, keywords | {"robot": robot}))
         stack.callback(core.close)
-        _say_what_is_not_known(core, console)
+        _say_what_is_not_known(core, options.policy, console)
         loop = loop_of(core)
         pads = [stack.enter_context(pad) for pad in _gamepads(options, core, loop, console)]
         if options.realtime is not None:
@@ -332,12 +332,16 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
             process.communicate()
 
 
-def _say_what_is_not_known(core: Core, console: Console) -> None:
-    from wlr_gym.policy import needs_camera
+def _say_what_is_not_known(core: Core, policy: str, console: Console) -> None:
+    from wlr_gym.policy import contract_of, needs_camera
 
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
-    if needs_camera(core.contract()) and not core.settings.has_camera:
-        note = "note: the policy's slip observer had a camera in training, and none is named (--camera): expect worse tracking"
+    try:
+        trained = contract_of(policy)["environment"]
+    except InputError:  # an agent that was not trained
+        trained = core.contract()
+    if needs_camera(trained) and not core.settings.has_camera:
+        note = "note: the slip observer is meant to have a camera, and none is named (--camera): expect worse tracking"
         console.print(note, style="yellow")
 
 

@@ -145,6 +145,10 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
     except InputError as error:
         return [Check("policy", "contract", False, str(error), "one that fits", remedy)]
     checks = [Check("policy", "contract", True, f"{policy['agent']}, {policy['environment']['task']}", "", "")]
+    share = (policy["environment"].get("sensors") or {}).get("camera", 1.0)
+    if not has_camera and 0.0 < share < 1.0:
+        found = f"none; the policy had one in {share:.0%} of its training (docs/policies.md: what each task loses without)"
+        checks.append(Check("policy", "camera", True, found, "", ""))
     if needs_camera(policy["environment"]) and not has_camera:
         remedy = "Its slip observer goes by wheels and IMU alone: expect worse tracking. Name the camera (--camera FILE)."
         checks.append(Check("policy", "camera", False, "none on this robot", "the one of its training", remedy, False))

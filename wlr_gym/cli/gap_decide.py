@@ -69,7 +69,9 @@ def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callab
     there = set(run_files(data))
     path = write_commands(out / ASKED, motion)
     console.print(f"drive {motion.name} ({motion.duration:.0f} s): wlr record --commands {path} --out {data}", markup=False)
-    console.print("waiting for its run; Ctrl-C: the same command goes on later", markup=False)
+    console.print(
+        "(a real robot: with --hardware FILE) waiting for its run; Ctrl-C: the same command goes on later", markup=False
+    )
     size = -1
     while True:
         new = [path for path in run_files(data) if path not in there]
