@@ -11,6 +11,7 @@ from standing import PLAIN, truth_of
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants import SIMULATORS, PlantOptions, make_plant
 from wlr_gym.render import camera, gl, marks
+from wlr_gym.render.scene import describe
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View, read_view
 from wlr_gym.robot.parameters import Parameters
@@ -235,6 +236,18 @@ def test_squares_of_the_floor_are_20_cm(new_scene, parameters):
     assert np.allclose(np.diff(edges), 0.2, atol=0.02)
 
 
+def test_squares_lie_on_patches_too_and_stay_when_the_robot_moves(new_scene, parameters):
+    """Ice over the half of a square: its other half has the same shade; where the robot is does not matter."""
+    scene = new_scene(View(size=(640, 480), camera="top", text=False))
+    lay_patch(parameters, 0, 0.05, (0.35, 0.9), (-0.6, 0.6))
+    for x in (0.0, 0.2, 0.31):
+        picture = scene.draw(truth_of(parameters, position=[[x, 0, -5.0]]), parameters)
+        whole = np.array([at(picture, scene, [0.3, y, 0.0]).mean() for y in (-0.1, 0.1)])
+        ice = np.array([at(picture, scene, [0.38, y, 0.0]).mean() for y in (-0.1, 0.1)])
+        assert ice[0] / ice[1] == pytest.approx(whole[0] / whole[1], abs=0.02)
+        assert abs(ice[0] / ice[1] - 1.0) > 0.05
+
+
 # ---- arrows ----
 
 
@@ -329,6 +342,13 @@ def test_up_is_against_the_gravity_of_the_plants(robot, parameters):
     parameters["ground.slope"][0] = [0.2, -0.1]
     gravity = build_model(robot, parameters).opt.gravity
     assert np.allclose(-gravity / np.linalg.norm(gravity), camera.up_direction(parameters["ground.slope"][0]))
+
+
+@pytest.mark.parametrize(("slope", "line"), [((0.1, 0.4), None), ((-0.7, 0.3), "slope -0.7° along x"), ((2, 1), "along y")])
+def test_only_slopes_that_matter_are_written(parameters, slope, line):
+    parameters["ground.slope"][0] = np.radians(slope)
+    last = describe(truth_of(parameters), parameters, 0)[-1]
+    assert (line in last and "-0.0" not in last) if line else "slope" not in last
 
 
 # ---- text ----

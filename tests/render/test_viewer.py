@@ -73,11 +73,11 @@ def test_pose_text_and_marks_go_into_the_window(opened, parameters):
     (window,) = windows
     assert viewer.is_open
     assert np.allclose(window.poses[0], [0.5, -0.2, 0.17])
-    assert window.user_scn.ngeom == 2
+    assert window.user_scn.ngeom == 3  # squares, patch, arrow
     assert np.allclose(window.cam.lookat[:2], [0.5, -0.2])
     assert window.texts[0].splitlines()[:2] == ["me", "t 1.00 s"]
     viewer.show(truth_of(parameters), parameters, period=0.02)
-    assert window.user_scn.ngeom == 1
+    assert window.user_scn.ngeom == 2
     assert len(windows) == 1
 
 

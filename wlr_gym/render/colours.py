@@ -6,8 +6,8 @@ import numpy as np
 
 Colour = tuple[float, float, float]
 
-#: Friction coefficient -> colour: ice is blue, the nominal floor (0.6) light grey, a very rough floor brown.
-FRICTION = ((0.0, (0.30, 0.62, 0.96)), (0.3, (0.62, 0.82, 0.90)), (0.6, (0.80, 0.80, 0.78)), (1.0, (0.72, 0.50, 0.30)))
+#: Friction coefficient -> colour: ice is blue (not the sky's), the nominal floor (0.6) light grey, a very rough floor brown.
+FRICTION = ((0.0, (0.22, 0.54, 0.74)), (0.3, (0.62, 0.82, 0.90)), (0.6, (0.80, 0.80, 0.78)), (1.0, (0.72, 0.50, 0.30)))
 #: Slip speed (m/s) -> colour of its arrow.
 SLIP = ((0.0, (1.0, 0.85, 0.10)), (0.05, (1.0, 0.55, 0.05)), (0.2, (0.90, 0.08, 0.08)))
 #: Arrows of friction and of normal force on a wheel.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render.colours import FORCE, LOAD, Colour, friction_colour, slip_colour
-from wlr_gym.render.stage import Stage
+from wlr_gym.render.stage import SQUARE, Stage
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
 
@@ -39,6 +39,9 @@ FORCE_BESIDE = 0.040
 #: m; areas are drawn on the floor this far around the robot.
 REACH = 15.0
 LAYER = 4e-4
+#: m; the floor's squares are drawn this far around the robot, and this high: over areas and pads.
+SQUARES_REACH = 40.0
+SQUARES_HEIGHT = 6 * LAYER
 #: Away from the body along the axle (left): corners are lf, rf, lr, rr.
 OUTWARDS = np.array([[1.0], [-1.0], [1.0], [-1.0]])
 #: m; half the width of a trail.
@@ -101,6 +104,23 @@ class Spot:
 
     centre: Array
     mu: float
+
+
+@dataclass(frozen=True)
+class Squares:
+    """The floor's squares, a shade over floor and areas alike: middle (x, y), m, and number of their material."""
+
+    middle: Array
+    material: int
+
+
+Mark = Squares | Area | Spot | Arrow | Piece
+
+
+def squares(stage: Stage, around: Array) -> Squares:
+    """Return the squares around a place (x, y); they stay where they are when it moves."""
+    pattern = 2.0 * SQUARE
+    return Squares(pattern * np.round(around[:2] / pattern), int(stage.model.material("squares").id))
 
 
 def areas(parameters: Parameters, row: int, around: Array) -> list[Area]:
@@ -193,7 +213,7 @@ def _arrows(
 # --- into MuJoCo's scene ----------------------------------------------------------------------------------------------
 
 
-def add_marks(scene: mujoco.MjvScene, marks: Iterable[Area | Arrow | Spot | Piece]) -> None:
+def add_marks(scene: mujoco.MjvScene, marks: Iterable[Mark]) -> None:
     """Append marks to a scene; what does not fit in is left out."""
     for mark in marks:
         if scene.ngeom >= scene.maxgeom:
@@ -210,6 +230,12 @@ def _add_piece(geom: mujoco.MjvGeom, piece: Piece) -> None:
 def _add_area(geom: mujoco.MjvGeom, area: Area) -> None:
     low, high = np.array(area.low), np.array(area.high)
     _start(geom, "BOX", [*(0.5 * (high - low)), area.height], [*(0.5 * (low + high)), 0.0], friction_colour(area.mu))
+
+
+def _add_squares(geom: mujoco.MjvGeom, squares: Squares) -> None:
+    _start(geom, "PLANE", [SQUARES_REACH, SQUARES_REACH, 0.0], [*squares.middle, SQUARES_HEIGHT], (1.0, 1.0, 1.0))
+    geom.matid = squares.material
+    geom.rgba[3] = 0.99  # only what is not quite opaque is blended with what lies below
 
 
 def _add_spot(geom: mujoco.MjvGeom, spot: Spot) -> None:
@@ -231,4 +257,4 @@ def _start(geom: mujoco.MjvGeom, kind: str, size: Iterable[float], position: Ite
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value
 
 
-_ADD = {Area: _add_area, Spot: _add_spot, Arrow: _add_arrow, Piece: _add_piece}
+_ADD = {Squares: _add_squares, Area: _add_area, Spot: _add_spot, Arrow: _add_arrow, Piece: _add_piece}

@@ -24,6 +24,8 @@ Picture = NDArray[np.uint8]
 
 #: Areas, pads and arrows a scene has room for.
 MAX_MARKS = 400
+#: Degrees; a smaller slope is not written.
+LEAST_SLOPE = 0.5
 
 
 class Scene:
@@ -148,9 +150,9 @@ class Scene:
 
 def marks_of(
     stage: Stage, truth: Truth, parameters: Parameters, row: int, floor: list[marks.Area], view: View
-) -> list[marks.Area | marks.Spot | marks.Arrow]:
+) -> list[marks.Mark]:
     """Return all that is drawn besides the robot, posed in ``stage``."""
-    drawn: list[marks.Area | marks.Spot | marks.Arrow] = [*floor]
+    drawn: list[marks.Mark] = [marks.squares(stage, truth.position[row]), *floor]
     if view.friction:
         drawn += marks.spots(stage, parameters, row)
     if view.forces:
@@ -205,6 +207,5 @@ def describe(
         pairs = truth.slip_velocity[row].reshape(4, 2)
         lines.append(f"slip {np.hypot(pairs[:, 0], pairs[:, 1]).max():.3f} m/s (fastest wheel)")
     pitch, roll = np.degrees(parameters["ground.slope"][row])
-    if abs(pitch) > 0.05 or abs(roll) > 0.05:
-        lines.append(f"slope {pitch:.1f}° along x, {roll:.1f}° along y")
-    return lines
+    slopes = [f"{angle:.1f}° along {axis}" for angle, axis in ((pitch, "x"), (roll, "y")) if abs(angle) >= LEAST_SLOPE]
+    return [*lines, f"slope {', '.join(slopes)}"] if slopes else lines

@@ -28,6 +28,8 @@ SHAPING = ("hip.position", "leg.length", "wheel.radius", "payload.mass", "payloa
 _SHAPES = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rbound", "geom_aabb", "geom_rgba", "qpos0")
 PAYLOAD_DENSITY = 2500.0  # kg/m3, for its size only
 SPOKES = 3
+#: m; width of the floor's squares.
+SQUARE = 0.2
 # Colours (red, green, blue, opacity), 0 to 1.
 METAL = (0.72, 0.74, 0.78, 1.0)
 DARK = (0.16, 0.17, 0.19, 1.0)
@@ -128,15 +130,30 @@ def _light_and_floor(spec: mujoco.MjSpec, size: tuple[int, int]) -> None:
         name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=256, height=1536,
         rgb1=[0.62, 0.74, 0.90], rgb2=[0.90, 0.93, 0.97],
     )  # fmt: skip
+    shades = _shades()
     spec.add_texture(
-        name="grid", type=texture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER, width=256, height=256,
-        rgb1=[1.0, 1.0, 1.0], rgb2=[0.90, 0.90, 0.90], mark=mujoco.mjtMark.mjMARK_EDGE, markrgb=[0.62, 0.62, 0.62],
-    )  # fmt: skip
-    # Squares of the floor are 0.2 m wide.
-    floor = spec.add_material(name="floor", texuniform=True, texrepeat=[5, 5], reflectance=0.0, specular=0.0)
-    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+        name="squares",
+        type=texture.mjTEXTURE_2D,
+        width=shades.shape[1],
+        height=shades.shape[0],
+        nchannel=4,
+        data=shades.ravel(),
+    )
+    squares = spec.add_material(name="squares", texuniform=True, texrepeat=[1 / SQUARE] * 2, reflectance=0.0, specular=0.0)
+    squares.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "squares"
+    spec.add_material(name="floor", reflectance=0.0, specular=0.0)
     plane = spec.geom("floor")
     plane.size, plane.material = [0.0, 0.0, 0.05], "floor"  # without end
+
+
+def _shades() -> NDArray[np.uint8]:
+    """Return two by two squares as a shade (red, green, blue, opacity) to be laid over floors of any colour."""
+    shades = np.zeros((256, 256, 4), np.uint8)
+    # What shines through twice: MuJoCo draws once for the light that casts shadows, once for all others.
+    dark, line = (round(255 * (1.0 - np.sqrt(share))) for share in (0.90, 0.62))
+    shades[:128, :128, 3] = shades[128:, 128:, 3] = dark
+    shades[[0, -1], :, 3] = shades[:, [0, -1], 3] = line
+    return shades
 
 
 def _dress_platform(body: mujoco.MjsBody, robot: Robot) -> None:
