@@ -16,7 +16,7 @@ from wlr_gym.envs.tasks.signals import Signals
 from wlr_gym.envs.tasks.terms.geometry import PlanarPose
 from wlr_gym.envs.tasks.terms.references import path_error
 from wlr_gym.learning.evaluation import make_core
-from wlr_gym.learning.evaluation.film import Journey, commands, drive, film, film_length
+from wlr_gym.learning.evaluation.film import Journey, commands, drive, film, film_length, result
 from wlr_gym.policy import make_policy
 from wlr_gym.render.teleop import RESET, UP, Script
 from wlr_gym.render.view import View
@@ -74,6 +74,20 @@ def test_a_path_is_where_the_robot_went_and_where_it_was_told_to_go():
     np.testing.assert_allclose(wanted[-1], circle, atol=0.002)
     assert np.abs(driven - start).max() < 0.01  # this one stays where it is
     assert len(wanted) == len(driven) == 101
+
+
+def test_a_film_of_a_climb_knows_the_speed_asked_for_and_the_error_so_far():
+    core = make_core("WLR-Slope-v0", 1, {"randomization": "none"})
+    core.begin_episodes(core.everyone, {"command": {"climb_speed": 0.05, "climb_time": 6.0}})
+    asked, results = [], []
+    for _ in range(330):
+        asked.append(commands(core)["linear_velocity_x"])
+        results.append(result(core))
+        core.step(np.zeros((1, 8), np.float32), core.everyone)
+    core.close()
+    assert (asked[0], asked[10], asked[200], asked[320]) == pytest.approx((0.0, 0.02, 0.05, 0.01))
+    assert results[0] == "tracking error 0.00 so far"
+    assert results[-1] != results[0]
 
 
 @pytest.mark.parametrize("shape", [0.5, 1.5, 2.5])

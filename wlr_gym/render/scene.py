@@ -54,6 +54,7 @@ class Scene:
         time: float | None = None,
         command: Mapping[str, float] | None = None,
         title: str = "",
+        result: str = "",
         look_at: ArrayLike | None = None,
         trails: Sequence[marks.Trail] = (),
     ) -> Picture:
@@ -66,6 +67,7 @@ class Scene:
             time: s, written into the picture.
             command: name -> value in SI units, written into the picture beside what the robot does.
             title: first line of the text.
+            result: last line of the text.
             look_at: (x, y) of the floor in the middle of the picture, m; None = the robot.
             trails: paths over the floor to draw.
 
@@ -82,7 +84,7 @@ class Scene:
         picture = canvas.draw(scene)
         if not self.view.text:
             return picture
-        lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip)
+        lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip) + [result] * bool(result)
         return overlay.write(
             picture, lines, legend(parameters, row, self.view), self.view.friction, self._labels(floor, truth.position[row])
         )

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.envs.infos import Infos
+from wlr_gym.envs.tasks.signals import Signals
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
-from wlr_gym.envs.tasks.terms.references import path_point
+from wlr_gym.envs.tasks.terms.references import climb_speed, path_point
 from wlr_gym.render.colours import DRIVEN, WANTED
 from wlr_gym.render.view import View
 
@@ -117,7 +119,7 @@ def film(
                 next(ticks)
                 path.note(core)
             trails = path.trails() if scene.view.path else []
-            texts = {"time": present_time(core), "command": commands(core), "title": title}
+            texts = {"time": present_time(core), "command": commands(core), "title": title, "result": result(core)}
             yield scene.draw(core.plant.truth(), core.parameters, trails=trails, **texts)
     finally:
         scene.close()
@@ -171,6 +173,11 @@ def film_beside(
         return write_video(path, watch(pictures, count), rate, count)
 
 
+def result(core: Core) -> str:
+    """Return the tracking error of the first robot's episode so far, as text; nothing where the task has none."""
+    return f"tracking error {Infos(core).tracking_error()[0]:.2f} so far" if core.task.config.success else ""
+
+
 class Journey:
     """Where the robot went in this episode, and its commanded path, or where its commands would have taken it from its start.
 
@@ -219,5 +226,9 @@ def present_time(core: Core) -> float:
 
 
 def commands(core: Core) -> dict[str, float]:
-    """Return the present commands of the first robot by name."""
-    return dict(zip(core.task.commands, core.command[0].tolist(), strict=True))
+    """Return the present commands of the first robot by name; of a climb also the forward velocity asked for now."""
+    found = dict(zip(core.task.commands, core.command[0].tolist(), strict=True))
+    if "climb_speed" not in found:
+        return found
+    signals = {"time": present_time(core)} | {f"command.{name}": value for name, value in found.items()}
+    return found | {"linear_velocity_x": float(climb_speed(Signals(signals.__getitem__)))}
