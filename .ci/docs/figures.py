@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,16 @@ from numpy.typing import NDArray
 from wlr_gym.base.plots import BLUE, legend_below, new_figure, save, tidy
 from wlr_gym.envs.tasks import load_randomization
 from wlr_gym.envs.tasks.terms.references import path_point
+from wlr_gym.learning.evaluation.film import Journey, commands, drive, present_time
 from wlr_gym.learning.evaluation.floor_plots import draw_floors
 from wlr_gym.learning.evaluation.rollout import roll_out, start_episodes
 from wlr_gym.learning.evaluation.subjects import make_player
 from wlr_gym.learning.evaluation.sweeps import SHAPES, SWEEPS
+from wlr_gym.render.teleop import Script
 from wlr_gym.render.view import View
 from wlr_gym.robot import load_robot
+
+Picture = NDArray[np.uint8]
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "figures"
 #: Presets whose floors can be told by friction along the heading.
@@ -28,6 +33,8 @@ DRAWS = 3
 EPISODES = 8
 #: Environment steps of a leg sweep that are shown.
 SHOWN = (190, 345, 525)
+#: Pixels; of a still with text.
+SIZE = (480, 400)
 
 
 def randomization_floors(path: Path) -> None:
@@ -59,6 +66,20 @@ def environment_path(path: Path) -> None:
     save(figure, path)
 
 
+def environment_velocity(path: Path) -> None:
+    """An episode on a floor with patches: straight on, then a turn."""
+    shown = {4.0: "straight on", 10.0: "turning since 4 s"}
+    _write_stills(path, "WLR-Velocity-v0", {}, View(size=SIZE, path=True), "0:0.1,0; 4:0.1,0.25", shown)
+
+
+def environment_slope(path: Path) -> None:
+    """A climb, and holding, seen from one place beside the slope."""
+    shown = {1.0: "begins to climb", 11.0: "holds since 6 s"}
+    _write_stills(
+        path, "WLR-Slope-v0", {}, View(size=SIZE, camera="side", forces=True, path=True), "0.05,6", shown, (0.14, -0.12)
+    )
+
+
 def environment_posture(path: Path) -> None:
     """The robot before, in and after the leg sweep of the paper's second test, from the side."""
     from PIL import Image
@@ -77,6 +98,74 @@ def environment_posture(path: Path) -> None:
     scene.close()
     core.close()
     Image.fromarray(np.hstack(pictures)).quantize(128).save(path)
+
+
+def scene(path: Path) -> None:
+    """Three cameras on one robot between two patches, and a robot on a slope with a payload and a floor under each wheel."""
+    size = (480, 360)
+    turn = [View(size), View(size, camera="top"), View(size, camera="side", forces=True)]
+    three = _drawn(turn, _patch(1, 0.1, (0.25, 0.75)) | _patch(2, 1.0, (-0.85, -0.25)), {"yaw_rate": 0.3}, 63)
+    wheels = {f"ground.mu_{axis}[wheel_{k}]": 0.2 if k[0] == "l" else 0.8 for axis in "xy" for k in ("lf", "rf", "lr", "rr")}
+    slope = {"ground.slope[pitch]": 0.15, "payload.mass": 1.0, "payload.position[z]": 0.07, **wheels}
+    (one,) = _drawn([View(size, camera="side")], slope, {"linear_velocity_x": 0.0}, 0)
+    _write(path, np.vstack([np.hstack(three[:2]), np.hstack([three[2], one])]))
+
+
+def _patch(number: int, mu: float, x: tuple[float, float]) -> dict[str, float]:
+    sides = {"mu": mu, "x_min": x[0], "x_max": x[1], "y_min": -0.4, "y_max": 0.4}
+    return {f"patch.{side}[patch_{number}]": value for side, value in sides.items()}
+
+
+def _drawn(views: list[View], parameters: dict[str, float], asked: dict[str, float], steps: int) -> list[Picture]:
+    """Return pictures of a robot at 0.1 m/s after so many steps."""
+    from wlr_gym.render import Scene
+
+    core, policy = make_player("WLR-Velocity-v0", "pid", 1, {"randomization": "none"})
+    start_episodes(core, policy, 0, {"parameters": parameters, "command": {"linear_velocity_x": 0.1, "yaw_rate": 0.0} | asked})
+    for _ in range(steps):
+        core.step(policy.act(core.observation), core.everyone)
+    pictures = []
+    for view in views:
+        scene = Scene(core.task.robot, view)
+        pictures.append(scene.draw(core.plant.truth(), core.parameters, time=present_time(core), command=commands(core)))
+        scene.close()
+    core.close()
+    return pictures
+
+
+def _write(path: Path, picture: Picture) -> None:
+    from PIL import Image
+
+    Image.fromarray(picture).quantize(256, kmeans=1).save(path)
+
+
+def _write_stills(
+    path: Path,
+    environment: str,
+    keywords: dict[str, Any],
+    view: View,
+    schedule: str,
+    shown: dict[float, str],
+    look_at: tuple[float, float] | None = None,
+) -> None:
+    """Write pictures of the episode of seed 0 beside each other: at which time (s) -> what the robot does, for the title."""
+    from wlr_gym.render import Scene
+    from wlr_gym.render.overlay import banner
+
+    core, policy = make_player(environment, "slip_compensating", 1, keywords)
+    scene, journey, pictures = Scene(core.task.robot, view), Journey(), []
+    ticks = drive(core, policy, 0, Script(schedule, core.task.commands))
+    while len(pictures) < len(shown):
+        next(ticks)
+        journey.note(core)
+        time = round(present_time(core), 6)
+        if time in shown:
+            texts = {"time": time, "command": commands(core), "trails": journey.trails(), "look_at": look_at}
+            title = banner(view.size[0], f"t = {time:g} s: {shown[time]}", 24)
+            pictures.append(np.vstack([title, scene.draw(core.plant.truth(), core.parameters, **texts)]))
+    scene.close()
+    core.close()
+    _write(path, np.hstack(pictures))
 
 
 def _driven(bend: dict[str, float]) -> tuple[NDArray[np.float64], float]:
@@ -116,7 +205,16 @@ def vision_slip(path: Path) -> None:
 
 
 FIGURES: dict[str, Callable[[Path], None]] = {
-    draw.__name__: draw for draw in (randomization_floors, environment_path, environment_posture, vision_slip)
+    draw.__name__: draw
+    for draw in (
+        randomization_floors,
+        environment_velocity,
+        environment_path,
+        environment_posture,
+        environment_slope,
+        scene,
+        vision_slip,
+    )
 }
 
 if __name__ == "__main__":
