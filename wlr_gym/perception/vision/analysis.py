@@ -343,21 +343,26 @@ def _draw_slip(analysis: VideoAnalysis) -> Any:
     figure = new_figure(9.0, 6.5)
     panels = figure.subplots(3, 1, sharex=True)
     slip = analysis.slip
+    spread = 2.0 * np.hypot(slip.slip_std, slip.slip_layout_std)
+    spread[..., 0] = np.hypot(spread[..., 0], 2.0 * slip.slip_radius_std)
     for w, (wheel, colour, (width, line)) in enumerate(zip(CORNER_NAMES.values(), COLOURS, _LINES, strict=False)):
-        for axes, a in ((panels[0], 0), (panels[1], 1)):
-            spread = np.hypot(slip.slip_std[:, w, a], slip.slip_layout_std[:, w, a])
-            spread = np.hypot(spread, slip.slip_radius_std[:, w]) if a == 0 else spread
-            axes.plot(slip.time, 1e3 * slip.slip[:, w, a], line, color=colour, linewidth=width, label=wheel)
-            axes.fill_between(slip.time, 1e3 * (slip.slip[:, w, a] - 2 * spread), 1e3 * (slip.slip[:, w, a] + 2 * spread),
-                              color=colour, alpha=0.12, linewidth=0)  # fmt: skip
+        for a, axes in enumerate(panels[:2]):
+            middle, band = 1e3 * slip.slip[:, w, a], 1e3 * spread[:, w, a]
+            axes.plot(slip.time, middle, line, color=colour, linewidth=width, label=wheel)
+            axes.fill_between(slip.time, middle - band, middle + band, color=colour, alpha=0.3, linewidth=0.5)
         panels[2].plot(slip.time, slip.ratio[:, w], line, color=colour, linewidth=width)
+    along, across = (f"{1e3 * wide:.2g} mm at the end" for wide in spread[-1].max(axis=0))
     titles = (
         (
-            "accumulated longitudinal slip (+ skids forward, - spins); band: 2 sigma with wheel radius and marker layout",
+            "accumulated longitudinal slip: + skids forward (turns too little), - spins (turns too much)\n"
+            f"band: 2 sigma with wheel radius and marker layout, up to {along}",
             "longitudinal slip (mm)",
         ),
-        ("accumulated lateral slip (+ to the left); band: 2 sigma with marker layout", "lateral slip (mm)"),
-        ("slip ratio (0 rolls freely, +1 spins on the spot, -1 locked)", "slip ratio (-)"),
+        (f"accumulated lateral slip: + to the left; band: 2 sigma with marker layout, up to {across}", "lateral slip (mm)"),
+        (
+            "slip ratio, signs the other way round: +1 spins on the spot, -1 is locked, beyond them turns against its travel",
+            "slip ratio (-)",
+        ),
     )
     for axes, (title, unit) in zip(panels, titles, strict=True):
         axes.set_title(title, fontsize=9, loc="left")
