@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from wlr_gym.base.plots import COLOURS, legend_below, new_figure, save, tidy
+from wlr_gym.base.plots import COLOURS, legend_below, new_figure, save, text_colour, tidy
 
 #: Linear sRGB as people without red, green and blue cones see it (Machado, Oliveira, Fernandes 2009), and as it is.
 SIGHTS = {
@@ -43,3 +43,12 @@ def test_a_figure_has_one_legend_and_is_written(tmp_path):
     assert [text.get_text() for text in legend.get_texts()] == ["driven"]
     assert save(figure, tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in save(figure, tmp_path / "a.svg").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("background", "text"),
+    [((0.65, 0.0, 0.15), "white"), ((0.9, 0.95, 1.0), "black"), ((0.2, 0.2, 0.58), "white"), ((1.0, 0.7, 0.4, 1.0), "black")],
+)
+def test_text_is_read_on_its_colour(background, text):
+    """The contrast with the background (WCAG 2) is at least that of the other one."""
+    assert text_colour(background) == text

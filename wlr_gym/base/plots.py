@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -43,6 +44,13 @@ def tidy(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
             locator.set_params(steps=[1, 2, 5, 10])
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+
+
+def text_colour(background: Sequence[float]) -> Literal["black", "white"]:
+    """Return the colour of text that is easier to read on a colour (red, green, blue, ...; 0 to 1), by its luminance."""
+    linear = [((part + 0.055) / 1.055) ** 2.4 for part in background[:3]]
+    luminance = sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    return "black" if luminance > 0.18 else "white"  # there the contrasts with both are equal
 
 
 def legend_below(figure: Figure, columns: int = 4) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wlr_gym.base.plots import BLUE, GREEN, ORANGE, new_figure, save, tidy
+from wlr_gym.base.plots import BLUE, GREEN, ORANGE, new_figure, save, text_colour, tidy
 from wlr_gym.data.comparison import BOUNDS, HORIZON, Agreement, Comparison, MotionComparison, difference
 
 if TYPE_CHECKING:
@@ -200,10 +200,10 @@ def save_map(comparison: Comparison, path: Path) -> Path:
         range(len(comparison.cases)), [case.motion for case in comparison.cases], rotation=40, ha="right", fontsize=9
     )
     axes.set_yticks(range(len(names)), [_starred(comparison, name) for name in names], fontsize=9)
+    colours = image.to_rgba(np.maximum(values, 1e-2))
     for row, column in np.ndindex(*values.shape):
-        size = float(values[row, column])
-        colour = "black" if 0.1 < size < 30.0 else "white"
-        axes.text(column, row, _noise(size), ha="center", va="center", fontsize=7, color=colour)
+        colour = text_colour(colours[row, column].tolist())
+        axes.text(column, row, _noise(float(values[row, column])), ha="center", va="center", fontsize=8, color=colour)
     axes.set_title(
         f"{comparison.second.plant.label} minus {comparison.first.plant.label}\n"
         f"rms in units of sensor noise; effects: {comparison.effects}",
