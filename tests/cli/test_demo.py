@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -16,15 +17,27 @@ from wlr_gym.data import read_dataset
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
 from wlr_gym.physics.effects import load_patch, save_patch
 from wlr_gym.studies.demo import hidden_fault, retraining, workers
+from wlr_gym.studies.demo.page import page as page_of
 from wlr_gym.studies.demo.settings import Demo
-from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section
 
 COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]
 NO_NUMBERS = {
     "verdict": "not_excited", "effects": [], "equivalent": [], "calibration": {}, "localisation": {}, "gap": None,
     "runs": {"fit": [], "heldout": []}, "patch": "patch.yaml",
 }  # fmt: skip
+ROOT = Path(__file__).parents[2]
 TITLES = [stage.title for stages in workers.WORKERS.values() for stage in stages]
+
+
+def check_links(page, folder):
+    """Every link leads to a section of the page, or to a file or folder beside it."""
+    targets = re.findall(r'href="([^"]+)"', page)
+    named = re.findall(r'id="([^"]+)"', page)
+    assert len(named) == len(set(named))
+    for target in targets:
+        assert target[1:] in named if target.startswith("#") else (folder / target).exists(), target
+    assert {target[1:] for target in targets if target.startswith("#")} == set(named)
 
 
 @pytest.mark.slow
@@ -37,7 +50,9 @@ def test_the_whole_loop_ends_in_one_page(tmp_path, capsys):
     page = (out / "demo.html").read_text()
     assert all(f"<h2>{title}</h2>" in page.replace("&#x27;", "'") for title in TITLES)
     assert not re.search(r'src="(?!data:)', page)  # all of it is inside, but for the files that it names
-    assert all((out / target).is_file() for target in re.findall(r'href="([^"]+)"', page))
+    check_links(page, out)
+    assert 'href="gap/report.html"' in page
+    assert 'href="measured_runs/"' in page
     assert "http" not in re.sub(r'"data:[^"]*"', "", page)
     assert page.count("data:image/png") >= 4
     hidden = load_patch(out / "hidden.yaml").effects[0]
@@ -47,6 +62,20 @@ def test_the_whole_loop_ends_in_one_page(tmp_path, capsys):
     for table in re.findall(r"<table>.*?</table>", page, re.DOTALL):
         assert "nan" not in table
     assert "Left out" in page or (out / "trained_on.webp").is_file()
+
+
+def test_links_lead_to_what_is_there(tmp_path):
+    demo = Demo(tmp_path)
+    sections = [Section(title, "said", "<p>text</p>") for title in TITLES]
+    assert "Files:" not in page_of(demo, sections)
+    demo.measured.mkdir()
+    demo.hidden.touch()
+    text = page_of(demo, sections)
+    check_links(text, tmp_path)
+    assert 'Files: <a href="measured_runs/">measured runs</a>, <a href="hidden.yaml">hidden fault</a>.' in text
+    assert "gap.md" in text
+    for name in re.findall(r"\w+\.md", text):
+        assert (ROOT / "docs" / name).is_file()
 
 
 def test_what_is_not_installed_is_left_out_and_said(tmp_path, monkeypatch):

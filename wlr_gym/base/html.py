@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
@@ -19,7 +20,8 @@ h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; }
 .figures { display: flex; flex-wrap: wrap; gap: .8rem; padding: 0; }
 .figures li { list-style: none; border: 1px solid #ddd; border-radius: .3rem; padding: .5rem .9rem; min-width: 8rem; }
 .figures b { display: block; font-size: 1.35rem; font-weight: 600; }
-table { border-collapse: collapse; margin: .6rem 0 1rem; font-size: .86rem; }
+.scroll { overflow-x: auto; margin: .6rem 0 1rem; }
+table { border-collapse: collapse; font-size: .86rem; }
 th, td { text-align: left; vertical-align: top; padding: .22rem .8rem .22rem 0; border-bottom: 1px solid #e4e4e4; }
 th { font-weight: 600; border-bottom: 1px solid #888; }
 .n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
@@ -37,6 +39,7 @@ summary { cursor: pointer; }
   body { max-width: none; margin: 0; }
   h2, h3 { break-after: avoid; }
   tr { break-inside: avoid; }
+  .scroll { overflow-x: visible; }
 }
 """
 
@@ -55,9 +58,15 @@ def document(title: str, colour: str, parts: Sequence[str]) -> str:
 
 
 def section(title: str, *parts: str) -> str:
-    """Return a titled section, or nothing if all parts are empty."""
+    """Return a titled section that :func:`anchor` names, or nothing if all parts are empty."""
     shown = [part for part in parts if part]
-    return "\n".join(["<section>", f"<h2>{escape(title)}</h2>", *shown, "</section>"]) if shown else ""
+    opened = [f'<section id="{anchor(title)}">', f"<h2>{escape(title)}</h2>"]
+    return "\n".join([*opened, *shown, "</section>"]) if shown else ""
+
+
+def anchor(title: str) -> str:
+    """Return what a link to a section of this title ends with, after the ``#``."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def heading(text: str) -> str:
@@ -68,7 +77,7 @@ def heading(text: str) -> str:
 def table(
     headings: Sequence[str], rows: Sequence[Sequence[str]], numeric: Iterable[int] = (), classes: Sequence[str] = ()
 ) -> str:
-    """Return a table, or nothing without rows.
+    """Return a table, or nothing without rows; where it is wider than the page, it scrolls, and the page does not.
 
     Args:
         headings, rows: texts.
@@ -79,7 +88,8 @@ def table(
         return ""
     right = set(numeric)
     body = [_row("td", row, right, name) for row, name in zip(rows, classes or [""] * len(rows), strict=True)]
-    return "\n".join(["<table>", "<thead>", _row("th", headings, right), "</thead>", "<tbody>", *body, "</tbody>", "</table>"])
+    head = ["<thead>", _row("th", headings, right), "</thead>"]
+    return "\n".join(['<div class="scroll">', "<table>", *head, "<tbody>", *body, "</tbody>", "</table>", "</div>"])
 
 
 def _row(tag: str, cells: Sequence[str], right: set[int], name: str = "") -> str:

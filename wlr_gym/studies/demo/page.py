@@ -8,14 +8,32 @@ from pathlib import Path
 
 from wlr_gym import __version__
 from wlr_gym.base.files import write_text
-from wlr_gym.base.html import document, section
+from wlr_gym.base.html import anchor, document, section
 from wlr_gym.studies.demo.settings import Demo
-from wlr_gym.studies.demo.stage import FAILED, NOT_SHOWN, SHOWN, SKIPPED, Section
+from wlr_gym.studies.demo.stage import FAILED, NOT_SHOWN, SHOWN, SKIPPED, Section, link
 
 _MARKS = {SHOWN: "✓", NOT_SHOWN: "✗", SKIPPED: "-", FAILED: "✗"}
 _COLOURS = {SHOWN: "#2e7d32", NOT_SHOWN: "#8a6d00", SKIPPED: "#8a6d00", FAILED: "#b03030"}
 #: From best to worst: the page has the colour of its worst section.
 _ORDER = (SHOWN, SKIPPED, NOT_SHOWN, FAILED)
+#: What may lie beside the page -> its name there.
+_FILES = {
+    "run": "training of section 1",
+    "ice.webp": "film on ice",
+    "measured_runs": "measured runs",
+    "hidden.yaml": "hidden fault",
+    "gap/report.html": "gap report",
+    "gap/patch.yaml": "patch",
+    "gap/result.json": "its numbers",
+    "adapted/training/policy": "adapted policy",
+    "trained_on.webp": "film of the adapted policy",
+    "provenance.yaml": "versions and machine",
+    "log.txt": "log",
+}
+_DOCS = (
+    "In the documentation of wlr_gym, under docs/: quickstart.md, policies.md (sections 1 and 2), gap.md (3 to 5), "
+    "adapt.md (6), glossary.md (every term)."
+)
 
 
 def write_page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> Path:
@@ -33,7 +51,7 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
     stopped = "<p><b>Stopped before it was over: the page has what was made until then.</b></p>" if interrupted else ""
     header = (
         f'<header>\n<p class="label">wlr demo</p>\n<h1>{escape(title)}</h1>\n</header>\n{stopped}'
-        f'<ul style="list-style: none; padding: 0">{lines}</ul>\n'
+        f'<ul style="list-style: none; padding: 0">{lines}</ul>\n{_files(demo)}<p class="small">{escape(_DOCS)}</p>\n'
         '<p class="small">Everything here is simulated or emulated; no hardware was driven.</p>'
     )
     footer = (
@@ -45,7 +63,13 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
 
 def _line(one: Section) -> str:
     text = escape(one.headline or _WITHOUT[one.verdict])
-    return f"<li>{_MARKS[one.verdict]} <b>{escape(one.title)}</b> {text}</li>"
+    return f'<li>{_MARKS[one.verdict]} <a href="#{anchor(one.title)}"><b>{escape(one.title)}</b></a> {text}</li>'
+
+
+def _files(demo: Demo) -> str:
+    """Return links to what lies beside the page."""
+    links = [link(demo, demo.out / path, text) for path, text in _FILES.items() if (demo.out / path).exists()]
+    return f'<p class="small">Files: {", ".join(links)}.</p>\n' if links else ""
 
 
 _WITHOUT = {SHOWN: "", NOT_SHOWN: "Not shown.", SKIPPED: "Left out.", FAILED: "Failed."}

@@ -65,8 +65,9 @@ def paragraph(text: str) -> str:
 
 
 def link(demo: Demo, path: Path, text: str) -> str:
-    """Return a link to a file beside the page."""
-    return f'<a href="{path.relative_to(demo.page.parent).as_posix()}">{escape(text)}</a>'
+    """Return a link to a file or folder beside the page."""
+    target = path.relative_to(demo.page.parent).as_posix()
+    return f'<a href="{escape(target)}{"/" if path.is_dir() else ""}">{escape(text)}</a>'
 
 
 def picture(path: Path, caption: str) -> str:
