@@ -78,6 +78,15 @@ def test_links_lead_to_what_is_there(tmp_path):
         assert (ROOT / "docs" / name).is_file()
 
 
+def test_what_is_not_good_is_said_where_there_is_any():
+    good = Section("1. Good", "said", "<p>text</p>")
+    bad = Section("2. Bad", "said", "<p>text</p>", not_good=("this < that", "nor is this"))
+    assert "Not good" not in page_of(Demo(Path()), [good])
+    text = page_of(Demo(Path()), [good, bad])
+    assert text.count("<b>Not good:</b> this &lt; that; nor is this.") == 2  # at the top, and in the section
+    assert text.index("Not good") > text.index("2. Bad")
+
+
 def test_what_is_not_installed_is_left_out_and_said(tmp_path, monkeypatch):
     def missing(package, extra):
         raise workers.MissingPackageError(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")

@@ -1,9 +1,14 @@
 """The hidden fault of the demo's robot, and how a diagnosis is judged."""
 
+import math
+
+import pytest
+
 from wlr_gym.data.replay import ChannelError
+from wlr_gym.gap.analysis import Analysis, ChannelGap, FoundEffect, GapFigures
 from wlr_gym.gap.report.entries import EffectEntry, ParameterEntry
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.studies.demo.diagnosis import judge, worse_channels
+from wlr_gym.studies.demo.diagnosis import judge, left_over, patch_alone_lacks, worse_channels
 from wlr_gym.studies.demo.hidden_fault import hide
 
 
@@ -65,10 +70,47 @@ def test_what_is_named_besides_is_not_right():
     assert "payload was named, too, but is not there" in answer.sentence
 
 
-def test_a_channel_that_got_worse_is_named():
-    def errors(**values):
-        return {channel: ChannelError(value, value, "rad", 0.5) for channel, value in values.items()}
+def errors(**values):
+    return {channel: ChannelError(value, value, "rad", 0.5) for channel, value in values.items()}
 
-    before = [errors(pos_leg_lf=1.0, gyro_z=0.5), errors(pos_leg_lf=1.0, gyro_z=0.5)]
-    assert worse_channels(before, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.54)]) == []
-    assert worse_channels(before, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.9)]) == ["gyro_z"]
+
+BEFORE = [errors(pos_leg_lf=1.0, gyro_z=0.5), errors(pos_leg_lf=1.0, gyro_z=0.5)]
+
+
+def test_a_channel_that_got_worse_is_named():
+    assert worse_channels(BEFORE, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.54)]) == []
+    assert worse_channels(BEFORE, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.9)]) == ["gyro_z"]
+
+
+def test_what_the_patch_alone_leaves_is_said():
+    assert patch_alone_lacks(BEFORE, [errors(pos_leg_lf=0.6, gyro_z=0.5)] * 2, []) == []
+    (left,) = patch_alone_lacks(BEFORE, [errors(pos_leg_lf=0.8, gyro_z=0.5)] * 2, [])
+    assert left == "with the patch alone, pos_leg_lf (angle, left front leg) is still off by 1.60 times the sensor noise"
+    no_smaller, worse = patch_alone_lacks(BEFORE[:1], [errors(pos_leg_lf=0.74, gyro_z=0.9)], ["gyro_z"])[:2]
+    assert "no smaller" in no_smaller
+    assert worse == "with the patch alone, gyro_z got worse"
+    assert patch_alone_lacks([], [], []) == ["no run was held out to try the patch on"]
+
+
+def analysis(interval=(0.9, 0.98), after=1.02, **worse):
+    gap = GapFigures("rms", 8.0, 1.0, 8.0, 7.0, after, 1.02, 0.95, interval)
+    effect = FoundEffect("gyro_bias", ("sensor",), {}, 1.0, 100.0)
+    channels = [ChannelGap(name, "rad", 0.1, 2.0, 1.0, 1.4, worse=flag) for name, flag in worse.items()]
+    return Analysis("", "effect_found", "", effects=(effect,), gap=gap, channel_gaps=tuple(channels))
+
+
+def test_what_an_analysis_leaves_over_is_said_only_where_it_does():
+    assert left_over(analysis(gyro_z=False)) == []
+    assert left_over(analysis(after=0.97)) == []  # below the floor, by chance
+    assert left_over(analysis(after=1.2)) == ["an error of 1.20 is left in the held-out runs, above the noise floor of 1.02"]
+    assert left_over(analysis((-0.1, 0.9))) == ["the interval of what the effects remove contains 0"]
+    assert "too few runs" in left_over(analysis((math.nan, math.nan)))[0]
+    (worse,) = left_over(analysis(gyro_z=True, gyro_x=False))
+    assert worse.startswith("one channel gets significantly worse in the held-out runs: ")
+    assert not worse.endswith(".")
+
+
+@pytest.mark.parametrize(("hidden", "said"), [(0.4, []), (0.5, ["the interval does not hold the hidden torque"])])
+def test_an_interval_that_does_not_hold_the_truth_is_said(hidden, said):
+    patch = load_patch([{"name": "coulomb_friction", "where": ["leg_lf"], "parameters": {"torque": hidden}}])
+    assert judge(patch.effects[0], [found("coulomb_friction", ["leg_lf"], torque=0.42)]).outside == said

@@ -77,7 +77,9 @@ def run(options: DemoOptions) -> int:
     console.print(f"{'stopped' if outcome.interrupted else 'done'} after {duration(time.monotonic() - began)}; the page:")
     console.print(str(demo.page), markup=False)
     if options.json:
-        found = [{name: getattr(one, name) for name in ("title", "headline", "verdict")} for one in outcome.sections]
+        found = [
+            {name: getattr(one, name) for name in ("title", "headline", "verdict", "not_good")} for one in outcome.sections
+        ]
         print_json({"page": demo.page, "interrupted": outcome.interrupted, "sections": found})
     return INTERRUPTED if outcome.interrupted else _code(outcome.sections)
 

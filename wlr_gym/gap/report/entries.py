@@ -110,11 +110,14 @@ class RelationEntry(_Entry):
 
 
 class RunGapEntry(_Entry):
-    """Error of one run after all effects."""
+    """Error of one run: of the model as given, calibrated, and with all effects; ``reduction``: the share that they remove."""
 
     run: str
     heldout: bool
+    before: MaybeNumber = None
+    calibrated: MaybeNumber = None
     after: MaybeNumber
+    reduction: MaybeNumber = None
 
 
 class RunsEntry(_Entry):

@@ -58,12 +58,20 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
         f"<footer><p>wlr_gym {escape(__version__)}, seed {demo.seed}: the same seed gives the same numbers on one machine. "
         f"Another hidden fault: <code>wlr demo --seed {demo.seed + 1}</code>.</p></footer>"
     )
-    return document(title, _COLOURS[worst], [header, *(section(one.title, one.html) for one in sections), footer])
+    return document(
+        title, _COLOURS[worst], [header, *(section(one.title, _not_good(one), one.html) for one in sections), footer]
+    )
 
 
 def _line(one: Section) -> str:
     text = escape(one.headline or _WITHOUT[one.verdict])
-    return f'<li>{_MARKS[one.verdict]} <a href="#{anchor(one.title)}"><b>{escape(one.title)}</b></a> {text}</li>'
+    return (
+        f'<li>{_MARKS[one.verdict]} <a href="#{anchor(one.title)}"><b>{escape(one.title)}</b></a> {text}{_not_good(one)}</li>'
+    )
+
+
+def _not_good(one: Section) -> str:
+    return f'<p class="small"><b>Not good:</b> {escape("; ".join(one.not_good))}.</p>' if one.not_good else ""
 
 
 def _files(demo: Demo) -> str:

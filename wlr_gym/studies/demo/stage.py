@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -34,12 +34,14 @@ class Section:
         headline: one sentence for the top of the page; empty = none.
         html: what stands below the title.
         verdict: one of the four above.
+        not_good: what the numbers do not speak for, in clauses.
     """
 
     title: str
     headline: str
     html: str
     verdict: str = SHOWN
+    not_good: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
