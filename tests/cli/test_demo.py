@@ -7,6 +7,8 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -15,8 +17,10 @@ from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import INTERRUPTED, main
 from wlr_gym.data import read_dataset
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
+from wlr_gym.learning.evaluation import Estimate
 from wlr_gym.physics.effects import load_patch, save_patch
-from wlr_gym.studies.demo import hidden_fault, retraining, workers
+from wlr_gym.studies.demo import hidden_fault, ice_comparison, learn, retraining, workers
+from wlr_gym.studies.demo.page import TERMS
 from wlr_gym.studies.demo.page import page as page_of
 from wlr_gym.studies.demo.settings import Demo
 from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section
@@ -120,6 +124,60 @@ def test_training_on_is_ticked_only_where_the_interval_says_so():
     assert verdict == NOT_SHOWN
     assert "20 % higher (95 % interval 12 to 31 %" in sentence
     assert "made it worse" in sentence
+
+
+def test_what_is_won_back_of_the_fault_is_said():
+    driven = numbers([0.4, 0.6], [0.3, 0.4], 30.0, 12.0, 40.0)
+    said, not_good = retraining.won_back(driven | {"healthy": [0.2, 0.2]})
+    assert "tracking error is 0.200 in these episodes: training on wins back 50 % (95 % interval 50 to 50)" in said
+    assert not_good == [
+        "training on wins back 50 % (95 % interval 50 to 50) of what the fault costs, the rest is left (0.500 to 0.350, "
+        "0.200 without the fault)"
+    ]
+    assert retraining.won_back(driven | {"healthy": [0.3, 0.4]})[1] == []
+    assert "costs it nothing" in retraining.won_back(driven | {"healthy": [0.5, 0.5]})[0]
+    unsure = numbers([0.4, 0.6], [0.45, 0.4], 15.0, -3.0, 40.0) | {"healthy": [0.3, 0.3]}
+    assert retraining.won_back(unsure)[1][:2] == [
+        "the interval of the change contains 0",
+        "in 1 of 2 episodes the policy that was trained on is worse",
+    ]
+
+
+def test_references_that_earn_more_are_named():
+    assert learn.behind(1.8, {"do_nothing": 0.4, "pid": 1.7}) == []
+    (said,) = learn.behind(1.8, {"do_nothing": 0.4, "pid": 1.85})
+    assert said == "in whole episodes, pid (1.85) gets more reward per second than the new policy (1.80)"
+
+
+def test_terms_are_those_of_the_glossary():
+    glossary = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    for term, meaning in TERMS.items():
+        assert f"| {term} | {meaning} |" in glossary
+    assert "Tracking error: rms of the episode&#x27;s measures" in page_of(Demo(Path()), [])
+
+
+def card(**better):
+    """A card whose policies score alike; ``better``: intervals by which the slip-aware one beats the blind one."""
+    even = {column.key: Estimate(90.0, 80.0, 99.0) for column in ice_comparison._COLUMNS}
+    won = {column.key: Estimate(9.0, 5.0, 12.0) for column in ice_comparison._COLUMNS}
+    scores = {ice_comparison.OURS: even | {"excess_slip": Estimate(0.0043, 0.004, 0.005)}, ice_comparison.BLIND: even}
+    labels = list(ice_comparison.FLOORS)
+    compared = {key: {ice_comparison.BLIND: won} for key in labels}
+    compared[labels[0]] = {ice_comparison.BLIND: won | better}
+    return SimpleNamespace(scores=dict.fromkeys(labels, scores), comparison=compared)
+
+
+def test_where_the_slip_aware_policy_is_no_better_is_said():
+    def short(**better) -> list[str]:
+        return ice_comparison.falls_short(cast(Any, card(**better)))
+
+    assert short() == []
+    assert short(excess_slip=Estimate(-8.0, -12.0, -5.0)) == [
+        "on ice, velocity_blind has the better excess slip (90000.0 against 4.3 mm/s)"
+    ]
+    assert short(yaw_rate_error=Estimate(1.0, -2.0, 5.0)) == [
+        "on ice, velocity_slip_aware is no better than velocity_blind in yaw rate error (90.000 against 90.000 rad/s)"
+    ]
 
 
 def test_without_numbers_of_the_gap_workflow_nothing_is_trained(tmp_path):

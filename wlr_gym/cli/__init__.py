@@ -28,7 +28,7 @@ IMPORTED: list[str] = []
 
 #: Command -> what it does, in one line. The module of the same name is imported only when the command is used.
 COMMANDS = {
-    "demo": "the whole loop in about three minutes: learn, drive on ice, find a hidden fault, adapt to it",
+    "demo": "the whole loop in three and a half minutes: learn, drive on ice, find a hidden fault, adapt to it",
     "envs": "list the environments, or describe one",
     "effects": "list what can be added to the robot's model, explain it, or check patch files",
     "robot": "robot files: new, check, show; import from and export to MJCF and URDF",

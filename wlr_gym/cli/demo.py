@@ -1,4 +1,4 @@
-"""The whole loop in about three minutes: learn, drive on ice, find a hidden fault, train on with it; ends with one page.
+"""The whole loop in three and a half minutes: learn, drive on ice, find a hidden fault, train on with it; ends with one page.
 
 A policy learns; slip-aware and blind drive on the same ice; an emulated robot with a hidden fault is driven; the gap workflow
 names the fault; the patched simulator is tried on held-out runs; the policy trains on with it and drives the robot again,

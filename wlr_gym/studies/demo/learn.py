@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.gap.report.text import listed
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, drawn, paragraph
 
@@ -64,7 +65,17 @@ def train(demo: Demo, tell: Tell) -> Section:
         demo.out / "episode.png",
         "An episode of the new policy that it has not trained on, the one of the most driving and turning.",
     )
-    return Section(TITLE, headline, html, SHOWN if learnt else NOT_SHOWN)
+    return Section(TITLE, headline, html, SHOWN if learnt else NOT_SHOWN, behind(_reward_per_second(episodes), references))
+
+
+def behind(reward: float, references: Mapping[str, float]) -> list[str]:
+    """Return which references earn more than the new policy, in whole episodes."""
+    better = [f"{name} ({value:.2f})" for name, value in references.items() if value > reward]
+    return (
+        [f"in whole episodes, {listed(better)} gets more reward per second than the new policy ({reward:.2f})"]
+        if better
+        else []
+    )
 
 
 @contextmanager

@@ -30,6 +30,14 @@ _FILES = {
     "provenance.yaml": "versions and machine",
     "log.txt": "log",
 }
+#: Terms of the page, as docs/glossary.md has them.
+TERMS = {
+    "tracking error": "rms of the episode's measures, each over its scale; a fall adds 10 (lower is better)",
+    "excess slip": "slip beyond what a steady skid turn needs",
+    "held-out runs": "runs that no fit has used",
+    "noise floor": "the error that a perfect model would have, in units of sensor noise",
+}
+_MEASURES = "Measures here: the errors of velocity and yaw rate, each over 10 % of the range of commands."
 _DOCS = (
     "In the documentation of wlr_gym, under docs/: quickstart.md, policies.md (sections 1 and 2), gap.md (3 to 5), "
     "adapt.md (6), glossary.md (every term)."
@@ -51,7 +59,8 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
     stopped = "<p><b>Stopped before it was over: the page has what was made until then.</b></p>" if interrupted else ""
     header = (
         f'<header>\n<p class="label">wlr demo</p>\n<h1>{escape(title)}</h1>\n</header>\n{stopped}'
-        f'<ul style="list-style: none; padding: 0">{lines}</ul>\n{_files(demo)}<p class="small">{escape(_DOCS)}</p>\n'
+        f'<ul style="list-style: none; padding: 0">{lines}</ul>\n{_files(demo)}'
+        f'<p class="small">{escape(_words())}</p>\n<p class="small">{escape(_DOCS)}</p>\n'
         '<p class="small">Everything here is simulated or emulated; no hardware was driven.</p>'
     )
     footer = (
@@ -78,6 +87,10 @@ def _files(demo: Demo) -> str:
     """Return links to what lies beside the page."""
     links = [link(demo, demo.out / path, text) for path, text in _FILES.items() if (demo.out / path).exists()]
     return f'<p class="small">Files: {", ".join(links)}.</p>\n' if links else ""
+
+
+def _words() -> str:
+    return f"{'. '.join(f'{term.capitalize()}: {meaning}' for term, meaning in TERMS.items())}. {_MEASURES}"
 
 
 _WITHOUT = {SHOWN: "", NOT_SHOWN: "Not shown.", SKIPPED: "Left out.", FAILED: "Failed."}

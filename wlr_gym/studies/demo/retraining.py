@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import commands, table
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.gap.report.text import listed, places, plain
-from wlr_gym.learning.evaluation import FIRST_SEED, Subject
+from wlr_gym.learning.evaluation import FIRST_SEED, Estimate, Subject
+from wlr_gym.learning.evaluation.statistics import Bootstrap
 from wlr_gym.studies.demo.hidden_fault import POLICY
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell, paragraph, picture
+
+if TYPE_CHECKING:
+    from wlr_gym.learning.adaptation.plan import Progress
+    from wlr_gym.learning.adaptation.robots import EmulatedRobot
+
+Array = NDArray[np.float64]
 
 TITLE = "6. What training on wins back"
 OLD, NEW = "old policy", "trained on"
@@ -59,7 +69,9 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     training = train_on(progress, found)
     progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING * share)
     after = drive_after(progress, EmulatedRobot(own, hidden), trained_policy(progress))
-    headline, verdict = outcome(after.numbers)
+    numbers = after.numbers | {"healthy": _without_fault(progress, EmulatedRobot(own))}
+    headline, verdict = outcome(numbers)
+    said, not_good = won_back(numbers)
     html = paragraph(
         f"The shipped policy {POLICY}, which has driven this robot, trains on for {demo.further_steps:,} environment steps on "
         "the simulator with what the gap workflow found and calibrated, each number drawn from its interval. It is not told "
@@ -68,11 +80,48 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     html += _said(model) + commands([training.command])
     html += paragraph(
         f"Then both drive the emulated robot with the hidden fault in turns: {demo.drives} episodes of "
-        f"{demo.drive_seconds:g} s each, the same commands for both, none met in training. Tracking error: rms errors of "
-        "velocity and yaw rate in units of 10 % of the range of commands."
+        f"{demo.drive_seconds:g} s each, the same commands for both, none met in training; the old one also drives the robot "
+        "without it."
     )
-    html += _episodes(after.numbers) + _said(after) + _film(demo, hidden, after.numbers, tell)
-    return Section(TITLE, headline, html, verdict)
+    html += _episodes(numbers) + _said(after) + paragraph(said) + _film(demo, hidden, numbers, tell)
+    return Section(TITLE, headline, html, verdict, not_good)
+
+
+def _without_fault(progress: Progress, robot: EmulatedRobot) -> list[float]:
+    """Return the old policy's tracking errors on the same robot without the fault, in the episodes that both have driven."""
+    from wlr_gym.learning.adaptation.driving import AFTER, episodes_of, errors_of
+
+    asked = progress.asked
+    seeds = [AFTER + 1000 * asked.seed + k for k in range(asked.drives)]
+    return errors_of(episodes_of(progress, "without_fault", {"old": asked.policy}, robot, seeds)["old"]).tolist()
+
+
+def won_back(numbers: dict[str, Any]) -> tuple[str, list[str]]:
+    """Return in words what share of the fault's cost training on wins back, and what is not good about it.
+
+    Args:
+        numbers: tracking errors ``old``, ``new`` and ``healthy`` (old policy, no fault) of the same episodes, ``better_ci95``.
+    """
+    old, new, healthy = (np.array(numbers[name]) for name in ("old", "new", "healthy"))
+    said = f"On the same robot without the fault, the old policy's tracking error is {healthy.mean():.3f} in these episodes"
+    low, high = numbers["better_ci95"]
+    not_good = ["the interval of the change contains 0"] if low <= 0.0 <= high else []
+    if worse := int((new > old).sum()):
+        not_good.append(f"in {worse} of {len(old)} episodes the policy that was trained on is worse")
+    if old.mean() <= healthy.mean():
+        return f"{said}: the fault costs it nothing.", [*not_good, "the fault costs the old policy nothing in these episodes"]
+    share = _share(old, new, healthy)
+    won = f"{share.mean:.0f} % (95 % interval {share.low:.0f} to {share.high:.0f}) of what the fault costs"
+    if share.mean < 100.0:
+        left = f"{old.mean():.3f} to {new.mean():.3f}, {healthy.mean():.3f} without the fault"
+        not_good.append(f"training on wins back {won}, the rest is left ({left})")
+    return f"{said}: training on wins back {won}.", not_good
+
+
+def _share(old: Array, new: Array, healthy: Array) -> Estimate:
+    """Return what is won back of what was lost, %, with its interval over the episodes."""
+    errors = [np.stack([values, np.ones(len(values))], axis=1)[None] for values in (old, new, healthy)]
+    return Bootstrap(1, len(old)).estimate(lambda a, b, c: 100.0 * (a - b) / (a - c), *errors)
 
 
 def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
@@ -106,10 +155,11 @@ def _said(step: Any) -> str:
 
 def _episodes(numbers: dict[str, Any]) -> str:
     rows = [
-        (f"{index + 1}", f"{old:.3f}", f"{new:.3f}", f"{100.0 * (1.0 - new / old):+.0f}")
-        for index, (old, new) in enumerate(zip(numbers["old"], numbers["new"], strict=True))
+        (f"{index + 1}", f"{old:.3f}", f"{new:.3f}", f"{100.0 * (1.0 - new / old):+.0f}", f"{healthy:.3f}")
+        for index, (old, new, healthy) in enumerate(zip(numbers["old"], numbers["new"], numbers["healthy"], strict=True))
     ]
-    return table(("episode", f"tracking error, {OLD}", f"tracking error, {NEW}", "better by (%)"), rows, range(1, 4))
+    headings = ("episode", f"tracking error, {OLD}", f"tracking error, {NEW}", "better by (%)", f"{OLD}, without the fault")
+    return table(headings, rows, range(1, 5))
 
 
 def _film(demo: Demo, hidden: Any, numbers: dict[str, Any], tell: Tell) -> str:
