@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from wlr_gym.base.plots import BLUE, COLOURS, new_figure, tidy
+from wlr_gym.base.plots import BLUE, COLOURS, GREY, new_figure, tidy
 from wlr_gym.learning.evaluation.rollout import Rollout
 from wlr_gym.robot import WHEELS
 
@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 # Colours of curves.
 ACTUAL = BLUE
 COMMANDED = "black"
+#: Terms of the reward that have a curve of their own.
+TERMS = 4
 #: Seconds between the heading arrows along a path.
 ARROW_PERIOD = 2.0
 
@@ -39,18 +41,25 @@ def learning_curve(curve: Sequence[Mapping[str, float]], references: Mapping[str
     left.set(
         xlabel="environment steps (millions)",
         ylabel="reward per second",
-        title="Learning curve (dips: all robots start new episodes)",
+        title="Reward while training",
     )
     left.legend(fontsize=8)
-    for name in [key for key in curve[0] if key.startswith("term.")]:
-        values = [row[name] for row in curve]
-        if any(values):
-            right.plot(steps, values, label=name.removeprefix("term."))
-    right.set(xlabel="environment steps (millions)", ylabel="reward per second", title="Terms of the reward")
-    right.legend(fontsize=7, ncols=2)
+    _draw_terms(right, steps, curve)
     for axes in (left, right):
         tidy(axes)
     return figure
+
+
+def _draw_terms(axes: Axes, steps: Array, curve: Sequence[Mapping[str, float]]) -> None:
+    """Draw the terms of the reward that ever count most, and the sum of the others."""
+    values = {key.removeprefix("term."): np.array([row[key] for row in curve]) for key in curve[0] if key.startswith("term.")}
+    ranked = sorted(values, key=lambda name: -float(np.abs(values[name]).max()))
+    for name, colour in zip(ranked[:TERMS], COLOURS, strict=False):
+        axes.plot(steps, values[name], color=colour, label=name)
+    if others := ranked[TERMS:]:
+        axes.plot(steps, np.sum([values[name] for name in others], axis=0), color=GREY, label=f"{len(others)} others")
+    axes.set(xlabel="environment steps (millions)", ylabel="reward per second", title="What the reward is made of")
+    axes.legend(fontsize=8)
 
 
 def episode(rollout: Rollout, index: int, title: str) -> Figure:

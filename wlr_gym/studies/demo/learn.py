@@ -57,7 +57,8 @@ def train(demo: Demo, tell: Tell) -> Section:
         plots.learning_curve(curve, references),
         demo.out / "learning_curve.png",
         "Left: reward per second of simulated time, over environment steps of all robots together; the references play whole "
-        "episodes of the same task without exploring. Right: what the reward is made of.",
+        "episodes of the same task without exploring. Right: the terms of the reward that count most, "
+        "and the sum of the others.",
     )
     chosen = _liveliest(episodes)
     html += drawn(
