@@ -34,7 +34,20 @@ from wlr_gym.gap.report.folder import check_folder, save_analysis
 from wlr_gym.gap.report.page import report
 from wlr_gym.gap.report.plots import draw, figures
 from wlr_gym.gap.report.result import result_of
-from wlr_gym.gap.report.text import _GROUPS, channel, closure, error, estimate, feature, percent, places, plain, sentence, title
+from wlr_gym.gap.report.text import (
+    _GROUPS,
+    below_floor,
+    channel,
+    closure,
+    error,
+    estimate,
+    feature,
+    percent,
+    places,
+    plain,
+    sentence,
+    title,
+)
 
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 PICTURE = {"gap": b"\x89PNG"}
@@ -187,6 +200,16 @@ def test_an_error_as_large_as_counts_is_shown_as_at_least_that(tmp_path):
     assert "Held-out runs: 50 or more as given" in page.text
     assert vars(result_of(far).gap)["cap"] == 50.0
     assert "50 or more" not in page_of(examples.EFFECT_FOUND, tmp_path).text
+
+
+def test_an_error_below_the_noise_floor_is_explained(tmp_path):
+    below = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, heldout_after=0.97, noise_floor=1.04))
+    said = "0.97 is below the expected level of noise (1.04), by chance: 100 % is the most that is counted."
+    assert page_of(below, tmp_path).text.count(said) == 2
+    bare = replace(examples.NOTHING_MISSING, gap=replace(examples.GAP, heldout_after=0.97, noise_floor=1.04))
+    assert "0.97 is below the expected level of noise (1.04), by chance." in page_of(bare, tmp_path).text
+    assert "expected level of noise" not in page_of(examples.NOTHING_MISSING, tmp_path).text
+    assert below_floor(replace(below, gap=replace(examples.GAP, heldout_after=1.038, noise_floor=1.041))) == ""
 
 
 def test_without_effects_nothing_is_said_of_effects(tmp_path):
@@ -470,6 +493,35 @@ def test_pictures_show_the_numbers():
     bare = figures(replace(small(examples.NOTHING_MISSING), evidence=()))
     assert widths(bare["gap"]) == [2.31, 1.04]
     assert "effects added" not in [line.get_label() for line in bare["overlays_1"].axes[0].lines]
+
+
+def test_a_row_that_no_sensor_has_read_is_not_drawn():
+    analysis = small(examples.EFFECT_FOUND)
+    trace = analysis.traces[0]
+    unread = np.r_[np.nan, trace.after_error[1:]]
+    shown = figures(replace(analysis, traces=(replace(trace, calibrated_error=unread, after_error=unread),)))
+    above, below = shown["overlays_1"].axes[:2]
+    for line in (*above.lines, below.lines[1]):
+        assert np.asarray(line.get_xdata())[0] == pytest.approx(trace.t[1] - trace.t[0])
+
+
+def test_equal_errors_do_not_hide_each_other():
+    right = figures(small(examples.EFFECT_FOUND))["gap"].axes[1]
+    heights = [np.asarray(markers.get_offsets())[0, 1] for markers in right.collections[1:]]
+    assert len(set(heights)) == 3
+    (sensors,) = right.lines
+    (floor,) = [line for line in figures(small(examples.EFFECT_FOUND))["gap"].axes[0].lines if line.get_linestyle() == "--"]
+    assert sensors.get_color() != floor.get_color()
+
+
+def test_numbers_in_cells_stand_out():
+    axes = figures(small(examples.EFFECT_FOUND))["where_1"].axes[0]
+    (image,) = axes.images
+    for text in axes.texts:
+        column, row = (round(one) for one in text.get_position())
+        bright = float(np.dot((0.299, 0.587, 0.114), image.cmap(image.norm(examples.heat_map().values[row, column]))[:3]))
+        assert text.get_color() == ("white" if bright < 0.5 else "black")
+    assert {text.get_color() for text in axes.texts} == {"white", "black"}
 
 
 def test_what_has_no_numbers_is_not_drawn():

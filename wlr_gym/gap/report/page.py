@@ -35,6 +35,7 @@ from wlr_gym.gap.report.recommendation import record_commands
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of
 from wlr_gym.gap.report.text import (
     adequacy,
+    below_floor,
     capped,
     channel,
     closure,
@@ -73,7 +74,7 @@ CAPTIONS = {
     "(pose and wheel angles: since a window of some 2 s began, x and y along and across its heading; what shakes on the tyres: "
     "averaged, noise keeps its size); the green band is two standard deviations of sensor noise.",
     "gap": "Error of replayed runs. Left: over the held-out runs, with the 95 % interval of the reduction by the effects. "
-    "Right: run by run.",
+    "Right: run by run; dotted: 1, the noise of the sensors, which the noise floor of these runs need not be.",
     "channels": "The same for each measured channel, over the held-out runs.",
     "evidence": "By how much each candidate improves the fit: all that were fitted, and the best that were not. The "
     "selected one is dark.",
@@ -145,7 +146,7 @@ def _tiles(analysis: Analysis) -> str:
     items = "".join(f"<li><b>{escape(value)}</b>{escape(text)}</li>" for value, text in tiles)
     return (
         f'<ul class="figures">{items}</ul>\n<p class="small">Errors are of the held-out runs, replayed by the model with the '
-        f"commands of the measured run: {escape(gap.metric)}; 1 = the noise of the sensors.</p>"
+        f"commands of the measured run: {escape(gap.metric)}; 1 = the noise of the sensors. {escape(below_floor(analysis))}</p>"
     )
 
 
@@ -205,7 +206,7 @@ def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
         f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: "
         f"{capped(gap.fit_before, gap)} before, {capped(gap.fit_after, gap)} after. Held-out runs: "
         f"{capped(gap.heldout_before, gap)} as given, {capped(gap.heldout_calibrated, gap)} calibrated{added}; "
-        f"noise floor {error(gap.noise_floor)}.</p>"
+        f"noise floor {error(gap.noise_floor)}. {escape(below_floor(analysis))}</p>"
     )
     if not analysis.added:
         return text

@@ -31,8 +31,8 @@ from wlr_gym.gap.report.text import channel, error, feature, percent, places, pl
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 Array = NDArray[np.float64]
 
@@ -54,6 +54,10 @@ _OTHERS = 6
 #: Ends of the heat map's scale, noise units.
 _COLDEST = 0.7
 _HOTTEST = 10.0
+#: Of red, green, blue in how bright a colour looks.
+_LUMINANCE = (0.299, 0.587, 0.114)
+#: Rows by which the markers of the three models stand apart: equal errors do not hide each other.
+_APART = 0.2
 #: Relations in one figure.
 _MOST_RELATIONS = 12
 
@@ -132,7 +136,7 @@ def _heat_map(heat_map: HeatMap) -> Figure:
     axes.grid(which="minor", color="white", linewidth=0.8)
     axes.tick_params(which="both", length=0)
     if rows * columns <= 800:
-        _write_values(axes, heat_map.values, norm)
+        _write_values(axes, heat_map.values, image)
     axes.set_xlabel(feature(heat_map.feature), fontsize=9)
     axes.set_title("rms error of the calibrated model; 1 = sensor noise", fontsize=9, loc="left")
     ticks = [tick for tick in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if tick <= hottest]
@@ -142,11 +146,13 @@ def _heat_map(heat_map: HeatMap) -> Figure:
     return figure
 
 
-def _write_values(axes: Axes, values: Array, norm: Normalize) -> None:
+def _write_values(axes: Axes, values: Array, image: AxesImage) -> None:
+    """Write the numbers into the cells, in the one of black and white that stands out."""
     for row, column in np.ndindex(*values.shape):
         value = float(values[row, column])
         if np.isfinite(value):
-            colour = "white" if norm(value) > 0.7 else "#333333"
+            luminance = float(np.dot(_LUMINANCE, image.cmap(image.norm(value))[:3]))
+            colour = "white" if luminance < 0.5 else "black"
             axes.text(column, row, f"{value:.1f}" if value < 9.95 else f"{value:.0f}", ha="center", va="center", fontsize=6.5,
                       color=colour)  # fmt: skip
 
@@ -262,11 +268,11 @@ def _draw_moves(
     before, calibrated, after = (np.array([getattr(one, name) for one in gaps]) for name in ("before", "calibrated", "after"))
     ends = [before, calibrated, *([after] if with_effects else [])]
     axes.hlines(rows, np.nanmin(ends, axis=0), np.nanmax(ends, axis=0), color="#d0d0d0", linewidth=2.0, zorder=1)
-    given = axes.scatter(before, rows, s=30, facecolor="white", edgecolor="#7a7a7a", label="model as given", zorder=2)
+    given = axes.scatter(before, rows + _APART, s=26, facecolor="white", edgecolor="#7a7a7a", label="model as given", zorder=2)
     handles: list[Artist] = [given, axes.scatter(calibrated, rows, s=26, color=CALIBRATED, label="calibrated", zorder=3)]
     if with_effects:
-        handles.append(axes.scatter(after, rows, s=26, color=AFTER, label="effects added", zorder=4))
-    handles.append(axes.axvline(1.0, color=GREEN, linestyle="--", linewidth=1.2, label="sensor noise"))
+        handles.append(axes.scatter(after, rows - _APART, s=26, color=AFTER, label="effects added", zorder=4))
+    handles.append(axes.axvline(1.0, color=GREY, linestyle=":", linewidth=1.4, label="sensor noise"))
     axes.set_yticks(rows, labels)
     axes.set_ylim(-0.6, len(gaps) - 0.4)
     axes.set_xscale("log")
@@ -315,17 +321,19 @@ def _overlays(traces: Sequence[Trace], noise: dict[str, float], *, with_effects:
 
 
 def _draw_trace(above: Axes, below: Axes, trace: Trace, noise: float | None, *, with_effects: bool) -> None:
-    t: Array = trace.t - trace.t[0]
-    known = np.isfinite(trace.measured)
+    read = slice(int(not np.isfinite(trace.calibrated_error[0])), None)  # a first row that no sensor has read is not compared
+    t: Array = trace.t[read] - trace.t[0]
+    measured = trace.measured[read]
+    known = np.isfinite(measured)
     dots: dict[str, Any] = {"marker": ".", "markersize": 3.0, "linestyle": ""} if not known.all() else {"linewidth": 2.4}
-    above.plot(t[known], trace.measured[known], color=MEASURED, label="measured", **dots)
-    above.plot(t, trace.before, color="black", linewidth=0.8, linestyle=":", label="model as given")
+    above.plot(t[known], measured[known], color=MEASURED, label="measured", **dots)
+    above.plot(t, trace.before[read], color="black", linewidth=0.8, linestyle=":", label="model as given")
     models = [(trace.calibrated, trace.calibrated_error, CALIBRATED, "calibrated")]
     models += [(trace.after, trace.after_error, AFTER, "effects added")] if with_effects else []
     for values, left, colour, label in models:
-        counted = np.isfinite(left)
-        above.plot(t, values, color=colour, linewidth=1.0, label=label)
-        below.plot(t[counted], left[counted], color=colour, linewidth=0.8)
+        counted = np.isfinite(left[read])
+        above.plot(t, values[read], color=colour, linewidth=1.0, label=label)
+        below.plot(t[counted], left[read][counted], color=colour, linewidth=0.8)
     if noise is not None:
         below.axhspan(-2.0 * noise, 2.0 * noise, color=GREEN, alpha=0.15, linewidth=0.0)
     below.axhline(0.0, color="black", linewidth=0.5)

@@ -208,6 +208,15 @@ def _above(gap: ChannelGap, floor: float) -> float:
     return max(gap.after**2 - floor**2, 0.0) if math.isfinite(gap.after) else 0.0
 
 
+def below_floor(analysis: Analysis) -> str:
+    """Return why the error of the held-out runs is smaller than a perfect model's, in one sentence; empty where it is not."""
+    gap = analysis.gap
+    if gap is None or not gap.heldout_after < gap.noise_floor or error(gap.heldout_after) == error(gap.noise_floor):
+        return ""
+    most = ": 100 % is the most that is counted" if analysis.added else ""
+    return f"{error(gap.heldout_after)} is below the expected level of noise ({error(gap.noise_floor)}), by chance{most}."
+
+
 def made_worse(analysis: Analysis) -> str:
     """Return which channels of the held-out runs the effects make worse, in one sentence; empty if none."""
     worse = [one for one in analysis.channel_gaps if one.worse] if analysis.added else []

@@ -74,7 +74,7 @@ def left_over(found: Analysis) -> list[str]:
     gap, said = found.gap, []
     if gap is None:
         return ["no run could be held out to validate it"]
-    if error(gap.heldout_after) != error(gap.noise_floor) and gap.heldout_after > gap.noise_floor:
+    if gap.heldout_after > gap.noise_floor and error(gap.heldout_after) != error(gap.noise_floor):
         said.append(
             f"an error of {error(gap.heldout_after)} is left in the held-out runs, above the noise floor of "
             f"{error(gap.noise_floor)}"
