@@ -148,11 +148,11 @@ def _heat_map(heat_map: HeatMap) -> Figure:
 
 def _write_values(axes: Axes, values: Array, image: AxesImage) -> None:
     """Write the numbers into the cells, in the one of black and white that stands out."""
+    luminance = np.asarray(image.to_rgba(values))[..., :3] @ _LUMINANCE
     for row, column in np.ndindex(*values.shape):
         value = float(values[row, column])
         if np.isfinite(value):
-            luminance = float(np.dot(_LUMINANCE, image.cmap(image.norm(value))[:3]))
-            colour = "white" if luminance < 0.5 else "black"
+            colour = "white" if luminance[row, column] < 0.5 else "black"
             axes.text(column, row, f"{value:.1f}" if value < 9.95 else f"{value:.0f}", ha="center", va="center", fontsize=6.5,
                       color=colour)  # fmt: skip
 
