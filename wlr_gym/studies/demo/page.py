@@ -39,8 +39,8 @@ TERMS = {
 }
 _MEASURES = "Measures here: the errors of velocity and yaw rate, each over 10 % of the range of commands."
 _DOCS = (
-    "In the documentation of wlr_gym, under docs/: quickstart.md, policies.md (sections 1 and 2), gap.md (3 to 5), "
-    "adapt.md (6), glossary.md (every term)."
+    "Documentation, in the repository: docs/quickstart.md; docs/policies.md (sections 1 and 2); docs/gap.md (3 to 5); "
+    "docs/adapt.md (6); docs/glossary.md (every term)."
 )
 
 
