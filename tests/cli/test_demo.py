@@ -175,8 +175,11 @@ def test_where_the_slip_aware_policy_is_no_better_is_said():
     assert short(excess_slip=Estimate(-8.0, -12.0, -5.0)) == [
         "on ice, velocity_blind has the better excess slip (90000.0 against 4.3 mm/s)"
     ]
+    assert short(excess_slip=Estimate(-3.0, -8.0, 2.0)) == [
+        "on ice, velocity_slip_aware is not measurably better than velocity_blind in excess slip (4.3 against 90000.0 mm/s)"
+    ]
     assert short(yaw_rate_error=Estimate(1.0, -2.0, 5.0)) == [
-        "on ice, velocity_slip_aware is no better than velocity_blind in yaw rate error (90.000 against 90.000 rad/s)"
+        "on ice, velocity_slip_aware is not measurably better than velocity_blind in yaw rate error (90.000 against 90.000 rad/s)"
     ]
 
 

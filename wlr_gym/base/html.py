@@ -25,6 +25,7 @@ table { border-collapse: collapse; font-size: .86rem; }
 th, td { text-align: left; vertical-align: top; padding: .22rem .8rem .22rem 0; border-bottom: 1px solid #e4e4e4; }
 th { font-weight: 600; border-bottom: 1px solid #888; }
 .n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+th.n { white-space: normal; }
 tr.selected td { font-weight: 600; background: #eaf1fa; }
 tr.fatal td { background: #fdecea; }
 code, pre { font: .86rem/1.45 ui-monospace, "Cascadia Mono", Menlo, Consolas, monospace; }

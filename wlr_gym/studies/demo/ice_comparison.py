@@ -123,24 +123,24 @@ def falls_short(card: Card) -> list[str]:
     for label, where in _WHERE.items():
         for other, own in card.comparison[label].items():
             better = [column for column in _COLUMNS if own[column.key].high < 0.0]
-            said += [f"{where}, {other} has the better {_listed(card, label, other, better)}"] if better else []
+            said += [f"{where}, {other} has the better {_listed(card, label, (other, OURS), better)}"] if better else []
         blind = card.comparison[label][BLIND]
         equal = [column for column in _COLUMNS if not blind[column.key].excludes_zero]
-        said += [f"{where}, {OURS} is no better than {BLIND} in {_listed(card, label, BLIND, equal)}"] if equal else []
+        said += (
+            [f"{where}, {OURS} is not measurably better than {BLIND} in {_listed(card, label, (OURS, BLIND), equal)}"]
+            if equal
+            else []
+        )
         failed = 100.0 - card.scores[label][OURS]["success"].mean
         said += [f"{where}, {OURS} fails in {failed:.0f} % of the episodes"] if failed > _MANY else []
     return said
 
 
-def _listed(card: Card, label: str, other: str, columns: Iterable[Column]) -> str:
-    """Return metrics with the value of another policy and of ours: ``excess slip (1.9 against 4.3 mm/s)``."""
-    theirs, ours = card.scores[label][other], card.scores[label][OURS]
-    return listed(
-        [
-            f"{one.name} ({one.text(theirs[one.key].mean)} against {one.text(ours[one.key].mean)}{unit_of(one.unit)})"
-            for one in columns
-        ]
-    )
+def _listed(card: Card, label: str, policies: tuple[str, str], columns: Iterable[Column]) -> str:
+    """Return metrics with the values of two policies: ``excess slip (1.9 against 4.3 mm/s)``."""
+    scores = [card.scores[label][name] for name in policies]
+    values = {one: " against ".join(one.text(own[one.key].mean) for own in scores) for one in columns}
+    return listed([f"{one.name} ({text}{unit_of(one.unit)})" for one, text in values.items()])
 
 
 def _against(card: Card, label: str) -> str:

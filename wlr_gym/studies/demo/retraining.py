@@ -30,8 +30,8 @@ SCHEDULE = "0:0.1,0; 1:0.1,-0.4; 3:0.1,0.4; 5:0,0"
 PICTURES_PER_SECOND = 10.0
 #: Pixels.
 SIZE = (400, 330)
-#: Shares of the stage: training, driving; the film is the rest.
-_TRAINING, _DRIVING = 0.5, 0.3
+#: Shares of the stage: training, driving with the fault and without it; the film is the rest.
+_TRAINING, _DRIVING, _WITHOUT = 0.5, 0.2, 0.1
 
 
 def retrain(demo: Demo, tell: Tell) -> Section:
@@ -69,6 +69,7 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     training = train_on(progress, found)
     progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING * share)
     after = drive_after(progress, EmulatedRobot(own, hidden), trained_policy(progress))
+    progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING + _WITHOUT * share)
     numbers = after.numbers | {"healthy": _without_fault(progress, EmulatedRobot(own))}
     headline, verdict = outcome(numbers)
     said, not_good = won_back(numbers)
@@ -169,7 +170,7 @@ def _film(demo: Demo, hidden: Any, numbers: dict[str, Any], tell: Tell) -> str:
 
     sources = ((OLD, POLICY, "old"), (NEW, str(demo.adapted / TRAINING / "policy"), "new"))
     fault = listed([f"{plain(one.name)}, {places(one.where)}" for one in hidden.effects])
-    tell("film: the old policy beside the new one", _TRAINING + _DRIVING)
+    tell("film: the old policy beside the new one", _TRAINING + _DRIVING + _WITHOUT)
     try:
         path = film_beside(
             demo.out / "trained_on.webp",
