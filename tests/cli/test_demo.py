@@ -178,8 +178,8 @@ def test_where_the_slip_aware_policy_is_no_better_is_said():
     assert short(excess_slip=Estimate(-3.0, -8.0, 2.0)) == [
         "on ice, velocity_slip_aware is not measurably better than velocity_blind in excess slip (4.3 against 90000.0 mm/s)"
     ]
-    assert short(yaw_rate_error=Estimate(1.0, -2.0, 5.0)) == [
-        "on ice, velocity_slip_aware is not measurably better than velocity_blind in yaw rate error (90.000 against 90.000 rad/s)"
+    assert short(success=Estimate(1.0, -2.0, 5.0)) == [
+        "on ice, velocity_slip_aware is not measurably better than velocity_blind in success (90 against 90 %)"
     ]
 
 
