@@ -29,7 +29,7 @@ _WHO = {
 
 
 @dataclass(frozen=True)
-class Column:
+class ScoreColumn:
     """A column of the table: a metric of the card, in a unit of which the card's is ``scale``; ``digits`` after the point."""
 
     key: str
@@ -49,11 +49,11 @@ class Column:
 
 
 _COLUMNS = (
-    Column("tracking_error", "tracking error"),
-    Column("velocity_error", "velocity error", "mm/s", 1000.0, 1),
-    Column("yaw_rate_error", "yaw rate error", "rad/s"),
-    Column("excess_slip", "excess slip", "mm/s", 1000.0, 1),
-    Column("success", "success", "%", digits=0),
+    ScoreColumn("tracking_error", "tracking error"),
+    ScoreColumn("velocity_error", "velocity error", "mm/s", 1000.0, 1),
+    ScoreColumn("yaw_rate_error", "yaw rate error", "rad/s"),
+    ScoreColumn("excess_slip", "excess slip", "mm/s", 1000.0, 1),
+    ScoreColumn("success", "success", "%", digits=0),
 )
 #: A policy that fails in more episodes than this, %, is not good.
 _MANY = 10.0
@@ -110,7 +110,7 @@ def _table(card: Card, label: str) -> str:
     return table(("policy", "", *(column.heading for column in _COLUMNS)), rows, range(2, 2 + len(_COLUMNS)))
 
 
-def _cell(estimate: Estimate, column: Column) -> str:
+def _cell(estimate: Estimate, column: ScoreColumn) -> str:
     return f"{column.text(estimate.mean)} ± {column.text(0.5 * (estimate.high - estimate.low))}"
 
 
@@ -136,7 +136,7 @@ def falls_short(card: Card) -> list[str]:
     return said
 
 
-def _listed(card: Card, label: str, policies: tuple[str, str], columns: Iterable[Column]) -> str:
+def _listed(card: Card, label: str, policies: tuple[str, str], columns: Iterable[ScoreColumn]) -> str:
     """Return metrics with the values of two policies: ``excess slip (1.9 against 4.3 mm/s)``."""
     scores = [card.scores[label][name] for name in policies]
     values = {one: " against ".join(one.text(own[one.key].mean) for own in scores) for one in columns}
