@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, PALE, new_figure, png, tidy
+from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, PALE, new_figure, png, text_colour, tidy
 from wlr_gym.gap.analysis import (
     EQUIVALENT,
     REJECTED,
@@ -54,8 +54,6 @@ _OTHERS = 6
 #: Ends of the heat map's scale, noise units.
 _COLDEST = 0.7
 _HOTTEST = 10.0
-#: Of red, green, blue in how bright a colour looks.
-_LUMINANCE = (0.299, 0.587, 0.114)
 #: Rows by which the markers of the three models stand apart: equal errors do not hide each other.
 _APART = 0.2
 #: Relations in one figure.
@@ -148,11 +146,11 @@ def _heat_map(heat_map: HeatMap) -> Figure:
 
 def _write_values(axes: Axes, values: Array, image: AxesImage) -> None:
     """Write the numbers into the cells, in the one of black and white that stands out."""
-    luminance = np.asarray(image.to_rgba(values))[..., :3] @ _LUMINANCE
+    colours = np.asarray(image.to_rgba(values))
     for row, column in np.ndindex(*values.shape):
         value = float(values[row, column])
         if np.isfinite(value):
-            colour = "white" if luminance[row, column] < 0.5 else "black"
+            colour = text_colour(colours[row, column].tolist())
             axes.text(column, row, f"{value:.1f}" if value < 9.95 else f"{value:.0f}", ha="center", va="center", fontsize=6.5,
                       color=colour)  # fmt: skip
 
