@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import re
 import shutil
 import subprocess
@@ -29,6 +30,30 @@ def test_help_fits_80_columns(shown):
     assert max(map(len, shown.splitlines())) <= 80
 
 
+def test_help_has_no_padding(shown):
+    assert not re.search(r"[ \n]\n\Z| $", shown, re.MULTILINE)
+    assert not re.search(r"\n\n  -", shown), "a blank line between two options"
+
+
+@pytest.mark.parametrize("columns", [60, 120])
+@pytest.mark.parametrize("words", [["evaluate", "--help"], ["robot", "--help"], ["help"]], ids=" ".join)
+def test_help_is_as_wide_as_the_terminal_and_at_most_80(words, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with contextlib.suppress(SystemExit):
+        cli.main(words)
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, [usage, *lines])) <= min(columns, 80)
+    options = lines[lines.index(" options") :] if " options" in lines else []
+    assert all(line.startswith(" ") for line in options), "a rule or a text is broken"
+
+
+@pytest.mark.parametrize("name", ["evaluate", "robot", "calibrate"])
+def test_help_begins_with_the_usage(name, capsys):
+    with pytest.raises(SystemExit):
+        cli.main([name, "--help"])
+    assert capsys.readouterr().out.startswith(f"usage: wlr {name}")
+
+
 def test_help_has_no_markup_and_no_types_of_python(shown):
     assert not re.search(r"`|\*\*|:\w+:|\{None\}|None|\(\)|True|False", shown)
 
@@ -41,9 +66,10 @@ def test_a_default_is_said_once(shown):
 
 
 def test_every_option_is_described(shown):
-    for line in re.findall(r"\n  (?:--\S.*|\[?[A-Z]+\]?(?: \.\.\.\]?)?)(?=\n)", shown.partition("\n options\n")[2]):
-        following = shown.partition(line)[2]
-        assert re.match(r"\n {8,}\S", following), line
+    lines = [*shown.partition("\n options\n")[2].splitlines(), ""]
+    for line, following in itertools.pairwise(lines):
+        if re.match(r"  --\S", line) and "  " not in line.strip():  # its text is below it
+            assert re.match(r" {8,}\S", following), line
 
 
 def test_own_options_come_before_shared_ones():

@@ -188,7 +188,7 @@ def usage() -> str:
         "wlr --import MODULE COMMAND first imports what adds to the library",
         "wlr --completion bash (or zsh, fish) prints what completes commands and options",
     )
-    return "\n".join([parsing.usage("wlr", COMMANDS), "", *hints])
+    return "\n".join([parsing.usage("wlr", COMMANDS), "", *map(parsing.wrapped, hints)])
 
 
 def _say(message: str, colour: str) -> None:

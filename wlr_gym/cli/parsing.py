@@ -1,4 +1,4 @@
-"""Words behind a command to its options, a frozen dataclass: help that fits 80 columns, one line for every mistake.
+"""Words behind a command to its options, a frozen dataclass: help that fits the terminal, one line for every mistake.
 
 A field's documentation is the option's help: the string below the field, or its entry under ``Attributes:``.
 """
@@ -11,18 +11,20 @@ import functools
 import inspect
 import io
 import operator
+import os
 import re
+import shutil
 import textwrap
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.base.seeds import require_seed
 
-#: Columns of a help text.
-WIDTH = 80
+#: Columns of a help text: at least (the parser knows no fewer), at most.
+WIDTHS = (40, 80)
 #: Type -> how help writes a value of it, and what a mistake is told.
 _WRITTEN = {int: "INT", float: "FLOAT", str: "STR", Path: "PATH"}
 _EXPECTED = {int: "a whole number", float: "a number", str: "a value", Path: "a path"}
@@ -43,12 +45,12 @@ def parse(kind: type, program: str, arguments: Sequence[str], description: str) 
     _check(options, program, arguments)
     shown, said = io.StringIO(), io.StringIO()
     try:
-        with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(said):
+        with _laid_out(), contextlib.redirect_stdout(shown), contextlib.redirect_stderr(said):
             found = tyro.cli(builder(kind), prog=program, description=_plain(description), args=list(arguments))
     except SystemExit as end:
         if end.code:
             raise InputError(f"{_first_words(said.getvalue(), program)}; see: {program} --help") from None
-        print(_wrapped(shown.getvalue()), end="")
+        print(_tidy(shown.getvalue()))
         raise
     for name in ("seed", "noise_seed"):
         if (seed := getattr(found, name, None)) is not None:
@@ -64,7 +66,7 @@ def chosen(program: str, commands: Mapping[str, tuple[type, str]], arguments: Se
     """
     name, *rest = arguments or ("",)
     if name in _HELP:
-        print(_wrapped(_plain(description)) + "\n\n" + usage(program, {name: text for name, (_, text) in commands.items()}))
+        print(usage(program, {name: text for name, (_, text) in commands.items()}, _plain(description)))
         raise SystemExit(0)
     if not name:
         raise InputError(f"expected one of {', '.join(commands)}; see: {program} --help")
@@ -74,13 +76,27 @@ def chosen(program: str, commands: Mapping[str, tuple[type, str]], arguments: Se
     return parse(kind, f"{program} {name}", rest, _summary(kind) or text)
 
 
-def usage(program: str, commands: Mapping[str, str]) -> str:
+def usage(program: str, commands: Mapping[str, str], description: str = "") -> str:
     """Return how a program is called, and what each of its commands does."""
     column = max(map(len, commands)) + 4
-    lines = [f"usage: {program} COMMAND [OPTIONS]", ""]
+    lines = [f"usage: {program} COMMAND [OPTIONS]", "", *([wrapped(description), ""] if description else [])]
     for name, text in commands.items():
-        lines += textwrap.wrap(text, WIDTH, initial_indent=f"  {name}".ljust(column), subsequent_indent=" " * column)
+        lines += textwrap.wrap(text, width(), initial_indent=f"  {name}".ljust(column), subsequent_indent=" " * column)
     return "\n".join(lines)
+
+
+def width() -> int:
+    """Return the columns of a help text: those of the terminal, within bounds."""
+    least, most = WIDTHS
+    return max(least, min(most, shutil.get_terminal_size().columns))
+
+
+def wrapped(text: str) -> str:
+    """Break the lines of a text that are longer than help is wide."""
+    return "\n".join(
+        textwrap.fill(line, width(), subsequent_indent=" " * 7 * line.startswith("usage:")) if len(line) > width() else line
+        for line in text.split("\n")
+    )
 
 
 def completion(shell: str, program: str, commands: Mapping[str, Any]) -> str:
@@ -295,12 +311,27 @@ def _check_value(name: str, value: Any, word: str) -> None:
             raise InputError(f"{name} {word}: expected {_EXPECTED[value]}") from None
 
 
-def _wrapped(text: str) -> str:
-    """Break lines that are too long, such as those of a description; the parser wraps its boxes only."""
-    return "\n".join(
-        textwrap.fill(line, WIDTH, subsequent_indent=" " * 7 * line.startswith("usage:")) if len(line) > WIDTH else line
-        for line in re.sub(r"\n{3,}", "\n\n", text).split("\n")
-    )
+@contextlib.contextmanager
+def _laid_out() -> Iterator[None]:
+    """Tell the parser how wide help is; it asks COLUMNS first."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(width())
+    try:
+        yield
+    finally:
+        del os.environ["COLUMNS"]
+        if before is not None:
+            os.environ["COLUMNS"] = before
+
+
+def _tidy(text: str) -> str:
+    """Break the parser's usage and description, which it leaves as they are; take out its padding.
+
+    A blank line before an indented one comes from a text that fills its last line.
+    """
+    text = "\n".join(map(str.rstrip, text.split("\n")))
+    text = re.sub(r"\n{2,}(?=  )", "\n", text)
+    return wrapped(re.sub(r"\n{3,}", "\n\n", text)).rstrip()
 
 
 def _first_words(box: str, program: str) -> str:

@@ -57,9 +57,20 @@ def print_table(
         console.print(title, style="bold", markup=False, highlight=False)
     while columns:
         count, gap = _fitting(columns, console.width)
-        console.print(_drawn(columns[:count], gap, console.width, styles))
+        _print_lines(console, _drawn(columns[:count], gap, console.width, styles))
         console.print()
         columns = [columns[0], *columns[count:]] if count < len(columns) else []
+
+
+def _print_lines(console: Console, table: Table) -> None:
+    """Print a table without the spaces that fill its last column."""
+    from rich.text import Text
+
+    with console.capture() as drawn:
+        console.print(table)
+    for line in Text.from_ansi(drawn.get()).split():
+        line.rstrip()
+        console.print(line, soft_wrap=True)
 
 
 def _fitting(columns: Sequence[Sequence[str]], width: int) -> tuple[int, int]:
