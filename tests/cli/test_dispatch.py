@@ -1,5 +1,7 @@
 """The ``wlr`` command: exit codes and messages."""
 
+import os
+import subprocess
 import sys
 import types
 from dataclasses import dataclass
@@ -84,6 +86,20 @@ def test_bad_option_exits_with_2(command, capsys):
     command(0)
     assert cli.main(["probe", "--nonsense"]) == 2
     assert capsys.readouterr().err == "wlr: unknown option '--nonsense'; see: wlr probe --help\n"
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", [["help"], ["train", "--help"], ["effects", "--json"]], ids=" ".join)
+def test_ends_silently_when_nobody_reads(words, unbuffered):
+    ours, theirs = os.pipe()
+    os.close(ours)
+    program = "import sys; from wlr_gym.cli import main; sys.exit(main())"
+    with os.fdopen(theirs, "wb") as pipe:
+        ended = subprocess.run(
+            [sys.executable, "-c", program, *words],
+            stdout=pipe, stderr=subprocess.PIPE, env=os.environ | {"PYTHONUNBUFFERED": unbuffered}, timeout=60, check=False,
+        )  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (cli.FAILED, b"")
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)

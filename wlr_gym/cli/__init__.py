@@ -63,6 +63,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     _prepare_compilation()
     try:
+        try:
+            return _answered(words)
+        finally:
+            print(end="", flush=True)  # here, where it can be caught; at its end Python could only complain
+    except BrokenPipeError:
+        if not _output_is_closed():
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+
+
+def _answered(words: list[str]) -> int:
+    """Do what the words say, and tell mistakes and interruption in one line."""
+    try:
         return _dispatch(words)
     except (InputError, MissingPackageError) as error:
         _say(str(error), "red")
@@ -70,11 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         _say(str(interruption) or "interrupted", "yellow")
         return INTERRUPTED
-    except BrokenPipeError:
-        if not _output_is_closed():
-            raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
 
 
 def _prepare_compilation() -> None:
@@ -84,9 +93,9 @@ def _prepare_compilation() -> None:
 
 
 def _output_is_closed() -> bool:
-    """Whether nobody reads the output any more: ``wlr ... | head``."""
+    """Whether nobody reads the output any more: ``wlr ... | head``. Only writing tells, where nothing is left to be flushed."""
     try:
-        sys.stdout.flush()
+        print(flush=True)
     except BrokenPipeError:
         return True
     return False
