@@ -71,6 +71,7 @@ def test_only_results_reach_the_standard_output(capsys):
         ["robot", "show"],
         ["robot", "check"],
         ["record", "--list"],
+        ["commission", "--list"],
         ["doctor", "--emulated"],
         ["evaluate", "do_nothing", "--baselines", "--episodes", "2", "--randomization", "none"],
     ],

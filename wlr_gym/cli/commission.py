@@ -76,7 +76,7 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     console = Console(soft_wrap=True, highlight=False, stderr=options.json)
     tests = choose(options.tests)
     if options.list:
-        _list(tests, console)
+        _list(tests, console, options.json)
         return OK
     if options.out is None:
         raise InputError("--out: expected a folder for runs and results")
@@ -208,11 +208,14 @@ def _write(target: Path, source: Path, findings: Iterable[StandFinding], earlier
 # ---- the report ------------------------------------------------------------------------------------------------------
 
 
-def _list(tests: Sequence[StandTest], console: Console) -> None:
+def _list(tests: Sequence[StandTest], console: Console, as_json: bool) -> None:
     from wlr_gym.cli.tables import print_table
 
-    rows = [(test.name, test.title, test.asks or "off", test.moves) for test in tests]
-    print_table(console, ("test", "what", "hands", "what moves"), rows)
+    rows = [{"test": one.name, "what": one.title, "hands": one.asks or "off", "moves": one.moves} for one in tests]
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(console, ("test", "what", "hands", "what moves"), [tuple(row.values()) for row in rows])
 
 
 def _print_table(findings: Sequence[StandFinding], console: Console) -> None:
