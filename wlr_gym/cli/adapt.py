@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.progress import progress
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption, PatchOption, SensorsOption
-from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 

@@ -13,10 +13,10 @@ from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import refuse_existing, write_json
+from wlr_gym.base.progress import progress
 from wlr_gym.base.text import tally
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, ray_address
-from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.studies.bench.measure import Measurement, Size, machine

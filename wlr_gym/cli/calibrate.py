@@ -143,7 +143,7 @@ def _camera(options: CameraOptions) -> int:
 def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[Camera, Readout]:
     from rich.console import Console
 
-    from wlr_gym.cli.progress import progress
+    from wlr_gym.base.progress import progress
     from wlr_gym.perception.markers.calibration import calibrate, calibrate_film
     from wlr_gym.perception.markers.shutter import Readout
 

@@ -149,7 +149,7 @@ def _compare_all(
     patches: Sequence[Patch],
     console: Console,
 ) -> Iterator[Comparison]:
-    from wlr_gym.cli.progress import progress
+    from wlr_gym.base.progress import progress
     from wlr_gym.data.comparison import compare
 
     with progress(console) as tell:

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import CONFIG_FILE, record_provenance
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
-from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ from typing import Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn, track
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, settings_of
@@ -164,7 +164,7 @@ def _accept(options: EvaluateOptions) -> int:
     if options.out is not None:
         refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
         make_output_folder(options.out)
-    with progress(options.progress) as tell:
+    with _progress(options.progress) as tell:
         result = accept(
             options.policy[0],
             options.env,
@@ -242,7 +242,7 @@ def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
         if not first:
             first.append(rollout)
 
-    with progress(options.progress) as tell:
+    with _progress(options.progress) as tell:
         card = evaluate(
             options.policy,
             options.env,
@@ -266,12 +266,17 @@ def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
 
 
 @contextmanager
-def progress(shown: bool) -> Iterator[Callable[[str, float], None]]:
+def _progress(shown: bool) -> Iterator[Callable[[str, float], None]]:
     """Show a bar with the time left; yields a function that is told what is going on and the share that was done since."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True, disable=not shown) as bar:
-        task = bar.add_task("evaluating", total=1.0)
-        yield lambda text, share: bar.update(task, description=f"evaluating {text}", advance=share)
+    done = 0.0
+    with progress(Console(), shown=shown) as tell:
+
+        def told(text: str, share: float) -> None:
+            nonlocal done
+            done += share
+            tell("", f"evaluating: {text}", done)
+
+        yield told
 
 
 def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
@@ -304,7 +309,7 @@ def _film(options: EvaluateOptions, subjects: Sequence[Subject], path: Path, key
         options.seed,
         options.video_seconds,
         keywords,
-        watch=lambda pictures, count: track(pictures, "drawing", count, transient=True, disable=not options.progress),
+        watch=lambda pictures, count: tracked(pictures, count, "drawing", Console(), options.progress),
     )
     print(f"written: {path}")
 

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.progress import progress
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.gap_decide import DecideOptions, print_rounds, recorder_of
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
-from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:

@@ -97,7 +97,7 @@ def _check(options: ImportOptions) -> None:
 @contextmanager
 def _reading(console: Console, log: Path) -> Iterator[Callable[[float], None]]:
     """Show a bar of how much of a log has been read; yields a function that is told the share."""
-    from wlr_gym.cli.progress import progress
+    from wlr_gym.base.progress import progress
 
     with progress(console) as tell:
         yield partial(tell, "", f"reading {log.name}")

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.progress import Tell, progress
 from wlr_gym.cli.options import ForceOption, JsonOption, settings_of
-from wlr_gym.cli.progress import Tell, progress
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import HardwareOption, confirm
 

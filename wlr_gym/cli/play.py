@@ -161,8 +161,9 @@ def _check_commands(script: Script, ranges: Ranges, robot: Robot) -> None:
 
 
 def _film(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None) -> None:
-    from rich.progress import track
+    from rich.console import Console
 
+    from wlr_gym.base.progress import tracked
     from wlr_gym.learning.evaluation.film import film, film_length
     from wlr_gym.render import write_video
 
@@ -171,13 +172,14 @@ def _film(options: PlayOptions, core: Core, policy: Policy, driver: Driver | Non
     count, _, fps = film_length(core, seconds, options.fps)
     title = f"{options.agent} on {core.plant.capabilities.name}"
     pictures = film(core, policy, options.seed, seconds, view=_view(options), driver=driver, title=title, fps=options.fps)
-    write_video(options.video, track(pictures, total=count, description="drawing", transient=True), fps, count)
+    write_video(options.video, tracked(pictures, count, "drawing", Console()), fps, count)
     print(f"written: {options.video} ({count} pictures, {count / fps:g} s)")
 
 
 def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
-    from rich.progress import track
+    from rich.console import Console
 
+    from wlr_gym.base.progress import tracked
     from wlr_gym.learning.evaluation import read_subjects
     from wlr_gym.learning.evaluation.film import film_beside
 
@@ -193,7 +195,7 @@ def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
         view=_view(options),
         schedule=options.command,
         fps=options.fps,
-        watch=lambda pictures, count: track(pictures, total=count, description="drawing", transient=True),
+        watch=lambda pictures, count: tracked(pictures, count, "drawing", Console()),
     )
     print(f"written: {options.video}")
 

@@ -121,8 +121,7 @@ def _films(options: ReplayOptions, names: Sequence[str]) -> list[Path]:
 
 
 def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
-    from rich.progress import track
-
+    from wlr_gym.base.progress import tracked
     from wlr_gym.data.film import FPS, film_length, replay_film
     from wlr_gym.data.replay import prepare
     from wlr_gym.render import write_video
@@ -131,17 +130,15 @@ def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch,
         _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment)
         count = film_length(result.run)
         pictures = replay_film(result, parameters, options.backend)
-        described = f"drawing {result.run.name}"
-        write_video(target, track(pictures, described, count, console=console, transient=True), FPS, count)
+        write_video(target, tracked(pictures, count, f"drawing {result.run.name}", console), FPS, count)
         console.print(f"video: {target}")
 
 
 def _replay_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
-    from rich.progress import track
-
+    from wlr_gym.base.progress import tracked
     from wlr_gym.data.replay import replay
 
-    for measured in track(runs, description=f"replaying on {options.backend}", console=console):
+    for measured in tracked(runs, len(runs), f"replaying on {options.backend}", console):
         yield replay(measured, options.backend, options.robot, effects=patch, segment=options.segment)
 
 

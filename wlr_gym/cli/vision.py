@@ -16,9 +16,9 @@ import numpy as np
 import tyro
 
 from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.progress import progress
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, settings_of
-from wlr_gym.cli.progress import progress
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:

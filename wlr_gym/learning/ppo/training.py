@@ -18,11 +18,12 @@ from types import FrameType
 import numpy as np
 import torch
 from gymnasium import spaces
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.console import Console
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
 from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.envs.core import Core
@@ -301,22 +302,15 @@ class StopRequest:
 
 @contextmanager
 def _progress(training: Training, config: PpoConfig, first: int) -> Iterator[Callable[[TrainingProgress], None]]:
-    """Show a progress bar over the steps; yields a function that is told how far the training is."""
-    columns = (
-        TextColumn("training"),
-        BarColumn(bar_width=16),  # all fits in 80 columns
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[said]}"),
-    )
-    with Progress(*columns, disable=not training.progress) as bar:
-        task = bar.add_task("", total=config.total_steps, completed=first, said="")
+    """Show a progress bar over the steps from the first on; yields a function that is told how far the training is."""
+    with progress(Console(), shown=training.progress) as tell:
 
         def show(progress: TrainingProgress) -> None:
             row, held_out = progress.metrics, progress.held_out
             score = f"reward {row['reward_per_second']:.3f}/s"
             if "tracking_error" in held_out:
                 score = f"held-out error {held_out['tracking_error']:.3f}"
-            bar.update(task, completed=progress.steps, said=f"{row['steps_per_second']:,.0f} steps/s, {score}")
+            share = (progress.steps - first) / (config.total_steps - first)
+            tell("", f"training: {score}, {row['steps_per_second']:,.0f} steps/s", share)
 
         yield show
