@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.learning.evaluation import make_core, roll_out, score
+from wlr_gym.learning.evaluation import make_core, roll_out, score, tuning
 from wlr_gym.learning.evaluation.tuning import tracking_score
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
+from wlr_gym.policy.control import PidConfig, task_settings
 from wlr_gym.robot import load_robot
 from wlr_gym.studies.paper import corrected
 from wlr_gym.studies.paper.quantities import PaperConstants, State
@@ -223,11 +224,42 @@ def test_what_cannot_be_searched_is_refused_before_anything_is_written(tmp_path,
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("given", [{"init": "velocity_blind"}, {"max_seconds": 60.0}])
-def test_what_a_search_does_not_know_is_refused(tmp_path, given):
-    with pytest.raises(InputError, match=f"leave out '{next(iter(given))}'"):
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [({"init": "velocity_blind"}, r"'init' \(--init\)"), ({"max_seconds": 60.0}, r"'max_seconds' \(--max-minutes\)")],
+)
+def test_what_a_search_does_not_know_is_refused(tmp_path, given, named):
+    with pytest.raises(InputError, match=f"leave out {named}"):
         load_agent("pid").train(Training(ENVIRONMENT, tmp_path / "run", {}, **given))
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_an_interrupted_search_leaves_nothing_and_is_begun_anew(tmp_path, monkeypatch, is_there):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tuning, "tracking_score", interrupted)
+    folder = tmp_path / "run"
+    if is_there:
+        folder.mkdir()
+    with pytest.raises(KeyboardInterrupt):
+        load_agent("pid").train(Training(ENVIRONMENT, folder, {"search": {"episodes": 1}}, progress=False))
+    assert folder.exists() == is_there
+    assert list(tmp_path.rglob("*.yaml")) == []
+
+
+def test_a_search_tells_how_far_it_is():
+    core = make_core(ENVIRONMENT, 2, {"episode_length": 0.2})
+    settings = {"search": {"rounds": 2, "episodes": 2, "steps": {"steering": 0.4, "yaw_rate_p": 1.0}}}
+    told = []
+    start = task_settings(PidConfig, core.contract(), settings, "pid")
+    tuning.search(core, load_agent("pid").make_policy, start, lambda *one: told.append(one))
+    core.close()
+    texts, shares = zip(*told, strict=True)
+    assert shares == (0.0, 0.0, 0.25, 0.5, 0.75)
+    assert texts[0] == "searching"
+    assert texts[-1].endswith("now yaw_rate_p")
 
 
 def test_search_is_not_resumed(tmp_path):

@@ -8,7 +8,9 @@ much of each limit of the task's success is reached; a fall counts like errors o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.envs.infos import Infos
 from wlr_gym.learning.evaluation.metrics import has_limits
@@ -27,21 +30,28 @@ if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
 
 MakePolicy = Callable[[Mapping[str, Any], Mapping[str, Any]], Policy]
-Say = Callable[[str], object]
+#: Called with what is going on, and the share of the search that is done.
+TellSearch = Callable[[str, float], None]
+#: What a search has not: of a training, and how ``wlr train`` calls it.
+_OF_TRAINING = {"init": "--init", "max_seconds": "--max-minutes"}
 
 
 def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[PidConfig]) -> Path:
     """Search from the settings of ``training``, and return the folder of the policy with the best ones.
 
+    A search that is interrupted leaves nothing in the folder.
+
     Raises:
         InputError: bad settings, a task without limits to score by, or what a search has not: ``resume``, ``init``, a limit of
             time.
     """
+    from rich.console import Console
+
     if training.resume:
         raise InputError(f"agent '{agent}' is tuned by a search of a few minutes, which cannot be resumed: start it anew")
-    for name in ("init", "max_seconds"):
+    for name, option in _OF_TRAINING.items():
         if getattr(training, name) is not None:
-            raise InputError(f"agent '{agent}' is tuned by a search of a few minutes: leave out '{name}', which is of training")
+            raise InputError(f"agent '{agent}' is tuned by a search of a few minutes: leave out '{name}' ({option})")
     config = dict(training.config)
     general = task_settings(model, {"task": ""}, config, agent)
     _check_steps(general, agent)
@@ -52,19 +62,30 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
         if not has_limits(measures_of(core)):
             raise InputError(f"agent '{agent}' is tuned by the limits of a task's success, and '{contract['task']}' has none")
         start = task_settings(model, contract, config, agent)
-        make_output_folder(training.folder)
-        record_provenance(
-            training.folder, {"environment": training.environment, "agent": agent, "settings": config}, start.seed
-        )
-        say: Say = print if training.progress else lambda _: None
-        best, score = search(core, make_policy, start, say)
+        with _folder(training.folder), progress(Console(), shown=training.progress) as tell:
+            best, score = search(core, make_policy, start, partial(tell, ""))
     finally:
         core.close()
+    settings = {"environment": training.environment, "agent": agent, "settings": config}
+    record_provenance(training.folder, settings, start.seed)
     folder = training.folder / "policy"
     folder.mkdir(exist_ok=True)
     origin = {"environment": training.environment, "score": score, "episodes": episodes, "seed": start.seed}
     write_contract(folder, agent, best, contract, origin)
     return folder
+
+
+@contextmanager
+def _folder(folder: Path) -> Iterator[None]:
+    """Make a folder before the work, so that one that cannot be made costs no minutes; take it away where the work fails."""
+    is_new = not folder.exists()
+    make_output_folder(folder)
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            folder.rmdir()
+        raise
 
 
 def _check_steps(settings: PidConfig, agent: str) -> None:
@@ -74,7 +95,7 @@ def _check_steps(settings: PidConfig, agent: str) -> None:
             raise unknown_name("setting", name, tunable, f"agent '{agent}': search.steps")
 
 
-def search(core: Core, make_policy: MakePolicy, start: PidConfig, say: Say) -> tuple[dict[str, Any], float]:
+def search(core: Core, make_policy: MakePolicy, start: PidConfig, tell: TellSearch) -> tuple[dict[str, Any], float]:
     """Return the best settings found from ``start`` on, without those of other tasks, and their score."""
     contract = core.contract()
     best = start.model_dump(mode="json") | {"tasks": {}}
@@ -82,16 +103,18 @@ def search(core: Core, make_policy: MakePolicy, start: PidConfig, say: Say) -> t
     def tried(settings: Mapping[str, Any]) -> float:
         return tracking_score(core, make_policy(contract, settings), start.seed)
 
+    tell("searching", 0.0)
     score = tried(best)
-    steps = dict(start.search.steps)
-    for _ in range(start.search.rounds):
-        for name, step in list(steps.items()):
+    steps, rounds = dict(start.search.steps), start.search.rounds
+    for done in range(rounds):
+        present = list(steps.items())
+        for index, (name, step) in enumerate(present):
+            tell(f"searching: error {score:.4f}, now {name}", (done + index / len(present)) / rounds)
             candidates = [_changed(best, name, move, type(start)) for move in (step, -step)]
             values = [np.inf if candidate is None else tried(candidate) for candidate in candidates]
             better = int(np.argmin(values))
             if values[better] < score:
                 best, score = candidates[better] or best, values[better]
-                say(f"{name} = {best[name]:.4g}: {score:.4f}")
             elif values[0] == values[1]:
                 del steps[name]  # plays no part in this task
             else:
