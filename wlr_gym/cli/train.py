@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +17,7 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
-from wlr_gym.policy import Training
+from wlr_gym.policy import Training, TrainingProgress
 
 if TYPE_CHECKING:
     from wlr_gym.physics.effects import Patch
@@ -56,10 +58,15 @@ def run(options: TrainOptions) -> int:
     if options.max_minutes is not None and not options.max_minutes > 0:
         raise InputError(f"--max-minutes {options.max_minutes:g}: expected more than 0")
     seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
+    updates: deque[TrainingProgress] = deque(maxlen=1)
     if options.resume is not None:
         _require_own_settings(options)
         policy = resume_training(
-            options.resume, total_steps=options.total_steps, max_seconds=seconds, progress=options.progress
+            options.resume,
+            total_steps=options.total_steps,
+            on_update=updates.append,
+            max_seconds=seconds,
+            progress=options.progress,
         )
         environment = read_yaml(options.resume / CONFIG_FILE)["environment"]
     elif options.total_steps is not None:
@@ -68,8 +75,9 @@ def run(options: TrainOptions) -> int:
         environment = options.env or "WLR-Velocity-v0" if options.init is None else environment_of(options.env, options.init)
         config = _config(options, environment)
         folder = unused(options.out or default_folder(options, environment, config))
-        training = Training(environment, folder, config, False, seconds, options.progress, options.init)
+        training = Training(environment, folder, config, False, seconds, options.progress, options.init, updates.append)
         policy = run_training(options.agent, training)
+    _print_end(updates, options)
     best = policy.with_name("best")
     if options.json:
         print_json({"environment": environment, "policy": policy, "best": best if best.is_dir() else None})
@@ -78,6 +86,16 @@ def run(options: TrainOptions) -> int:
     if best.is_dir():
         print(f"best on held-out episodes: {best}")
     return OK
+
+
+def _print_end(updates: Iterable[TrainingProgress], options: TrainOptions) -> None:
+    """Say at which update the limit of time stopped a training, which looks finished otherwise."""
+    for one in updates:
+        if one.steps < one.total_steps:
+            print(
+                f"stopped after {options.max_minutes:g} min at step {one.steps:,} of {one.total_steps:,}; "
+                f"go on with: wlr train --resume {one.folder}"
+            )
 
 
 def default_folder(options: TrainOptions, environment: str, config: dict[str, Any]) -> Path:

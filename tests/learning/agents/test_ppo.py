@@ -244,6 +244,15 @@ def test_time_limit_ends_in_good_order(tmp_path):
     assert [place.name for place in (tmp_path / "short" / "checkpoints").iterdir()] == ["step_000000000000"]  # to go on from
 
 
+def test_a_training_that_ran_out_of_time_says_how_to_go_on(tmp_path, capsys):
+    settings = [f"{name}={value}" for name, value in SETTINGS.items() if name not in ("total_steps", "environment")]
+    words = ["train", ENVIRONMENT, "--out", str(tmp_path / "run"), "--max-minutes", "0.001", "--set", *settings]
+    assert main([*words, "total_steps=1000000", "environment.episode_length=0.2"]) == 0
+    printed = capsys.readouterr().out
+    assert "stopped after 0.001 min at step " in printed
+    assert f" of 1,000,000; go on with: wlr train --resume {tmp_path / 'run'}\n" in printed
+
+
 def test_broken_model_file_is_refused(run, tmp_path):
     shutil.copytree(run / "policy", tmp_path / "policy")
     (tmp_path / "policy" / "model.zip").write_bytes(b"not a zip")
