@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,12 +120,12 @@ def run(options: BenchOptions) -> int:
         return _gap_speed(options) if options.speed else _blind_test(options)
     if options.out is not None:
         return _lab_films(options, asked)
-    console, size = Console(), Size(options.rounds, options.quick)
+    console = Console()
     report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
     console.print(_machine_line(report["machine"]))
     names = asked or tuple(name for name in MEASUREMENTS if name not in _ON_REQUEST)
-    for name, rows in _measured(names, size, console):
+    for name, rows in _measured(names, Size(options.rounds, options.quick), console):
         if name == "engine":
             rows = _engine_pairs(rows, report, console, options.save)
         report[name if name in _OWN_ROWS else "measurements"] += [row.as_dict() for row in rows]
@@ -142,8 +142,12 @@ def _measured(names: Sequence[str], size: Size, console: Console) -> Iterator[tu
     """Yield each measurement and what came of it, under a bar with the remaining time."""
     with progress(console) as tell:
         for done, name in enumerate(names):
-            tell("", f"measuring {name}", done / len(names))
-            yield name, _measure(name, size)
+
+            def told(share: float, done: int = done, name: str = name) -> None:
+                tell("", f"measuring {name}", (done + share) / len(names))
+
+            told(0.0)
+            yield name, _measure(name, replace(size, tell=told))
 
 
 def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:

@@ -49,9 +49,11 @@ def test_measurement_runs_and_reports(name, tmp_path, capsys):
 def test_rounds_are_interleaved():
     calls: list[str] = []
     contenders = {name: lambda name=name: float(calls.append(name) or len(calls)) for name in "AB"}
-    values = interleave(contenders, 2)
+    told = []
+    values = interleave(contenders, 2, tell=told.append)
     assert "".join(calls) == "ABABAB"  # the first pair is not measured
     assert values == {"A": (3.0, 5.0), "B": (4.0, 6.0)}
+    assert told == [1 / 3, 1 / 2, 2 / 3, 5 / 6]
 
 
 def test_ratio_is_pair_by_pair_against_the_fastest_peer():

@@ -177,7 +177,14 @@ def measure_engine(size: Size) -> EngineReport:
     reference = make_reference(chosen, *(((2e-3, 1e-3),) * 2 if size.quick else (ENGINE_LIMIT, MUJOCO_LIMIT)))
     runs = {setting: prepare(setting, chosen, size(COPIES, 1)) for setting in settings(quick=size.quick)}
     poses = {setting: run()[0] for setting, run in runs.items()}
-    speeds = interleave({setting: lambda run=run: run()[1] for setting, run in runs.items()}, size.rounds, warm_up=False)
+    first = 1.0 / (1 + size.rounds)  # share of the work up to here: about a round
+    size.tell(first)
+    speeds = interleave(
+        {setting: lambda run=run: run()[1] for setting, run in runs.items()},
+        size.rounds,
+        warm_up=False,
+        tell=lambda share: size.tell(first + (1.0 - first) * share),
+    )
     return EngineReport(reference, [_result(setting, poses[setting], reference, speeds[setting]) for setting in runs])
 
 

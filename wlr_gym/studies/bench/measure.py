@@ -18,14 +18,21 @@ from wlr_gym.base.provenance import git_commit, versions
 #: Runs some work and returns its rate (1/s) or its time (s).
 Contender = Callable[[], float]
 Name = TypeVar("Name", bound=Hashable)
+#: Called with the share of a measurement that is done.
+TellShare = Callable[[float], None]
+
+
+def _untold(share: float) -> None:
+    """Nobody wants to know."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much work: ``rounds`` per contender; ``quick`` shrinks everything to see that it runs."""
+    """How much work: ``rounds`` per contender; ``quick`` shrinks everything to see that it runs; ``tell``: how far it is."""
 
     rounds: int = 5
     quick: bool = False
+    tell: TellShare = _untold
 
     def __call__(self, full: int, quick: int) -> int:
         """Return the amount of work to do."""
@@ -88,14 +95,18 @@ def summary(values: Sequence[float]) -> dict[str, Any]:
     return {"median": statistics.median(values), "min": min(values), "max": max(values), "values": list(values)}
 
 
-def interleave(contenders: Mapping[Name, Contender], rounds: int, *, warm_up: bool = True) -> dict[Name, tuple[float, ...]]:
+def interleave(
+    contenders: Mapping[Name, Contender], rounds: int, *, warm_up: bool = True, tell: TellShare = _untold
+) -> dict[Name, tuple[float, ...]]:
     """Run every contender once unmeasured (compilation, caches), then ``rounds`` times in turn; return their values."""
+    unmeasured = len(contenders) if warm_up else 0
+    turns = [*contenders.items()] * rounds
     for contender in contenders.values() if warm_up else ():
         contender()
     values: dict[Name, list[float]] = {name: [] for name in contenders}
-    for _ in range(rounds):
-        for name, contender in contenders.items():
-            values[name].append(contender())
+    for done, (name, contender) in enumerate(turns):
+        tell((unmeasured + done) / (unmeasured + len(turns)))
+        values[name].append(contender())
     return {name: tuple(series) for name, series in values.items()}
 
 

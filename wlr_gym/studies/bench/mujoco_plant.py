@@ -34,7 +34,7 @@ def measure_mujoco(size: Size) -> list[Measurement]:
         "servos": _servos(count, ticks),
         "engine": _plant("gibbs_appell", count, ticks),
     }
-    values = interleave(contenders, size.rounds)
+    values = interleave(contenders, size.rounds, tell=size.tell)
     what = f"substeps of 1 ms, {count} robots, 1 thread"
     return [
         Measurement(

@@ -63,7 +63,7 @@ def measure_env_step(size: Size) -> list[Measurement]:
     ours = gym.make(ENVIRONMENT, randomization="none")
     peer = gym.make(ENVIRONMENT, randomization="none", backend=BACKEND)
     steps = size(400, 5)
-    values = interleave({"ours": _stepping(ours, steps), "MuJoCo loop": _stepping(peer, steps)}, size.rounds)
+    values = interleave({"ours": _stepping(ours, steps), "MuJoCo loop": _stepping(peer, steps)}, size.rounds, tell=size.tell)
     ours.close()
     peer.close()
     peers = {"same env on mj_step(nstep=20)": values["MuJoCo loop"]}
@@ -101,20 +101,20 @@ def measure_batch(size: Size) -> list[Measurement]:
         f"{count} robots, {precision}, {threads} thread{'s' * (threads > 1)}": _engine(count, ticks[count], precision, threads)
         for count, precision, threads in cases
     }
-    values = interleave(contenders, min(size.rounds, 3))
+    values = interleave(contenders, min(size.rounds, 3), tell=size.tell)
     return [Measurement("batch", name, "1/s", series) for name, series in values.items()]
 
 
 def measure_import(size: Size) -> list[Measurement]:
     """Time of ``import wlr_gym`` beyond that of Python itself."""
-    values = interleave({"import": _process("import wlr_gym"), "bare": _process("pass")}, size.rounds)
+    values = interleave({"import": _process("import wlr_gym"), "bare": _process("pass")}, size.rounds, tell=size.tell)
     extra = tuple(a - b for a, b in zip(values["import"], values["bare"], strict=True))
     return [Measurement("import", "import wlr_gym, beyond bare Python", "s", extra, bar=0.3)]
 
 
 def measure_start(size: Size) -> list[Measurement]:
     """Whole process: Python, imports, ``gym.make``, reset, first step, exit; compiled code is cached by the first run."""
-    values = interleave({"start": _process(START.format(ENVIRONMENT))}, size.rounds)
+    values = interleave({"start": _process(START.format(ENVIRONMENT))}, size.rounds, tell=size.tell)
     return [Measurement("start", "second start: process, imports, gym.make, reset, first step", "s", values["start"], bar=2.0)]
 
 

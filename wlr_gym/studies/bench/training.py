@@ -66,7 +66,7 @@ def measure_ppo(size: Size) -> list[Measurement]:
     robots, workers = size(512, 16), (2,) if size.quick else (2, 8)
     with _vectors(robots, workers) as vectors:
         contenders = {name: _updates(vector, size, ours=name == "ours") for name, vector in vectors.items()}
-        values = interleave(contenders, size.rounds)
+        values = interleave(contenders, size.rounds, tell=size.tell)
     return [_against_peers("ppo", f"PPO frames, {robots} robots, float32", "1/s", values, 7.0)]
 
 
