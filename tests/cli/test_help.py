@@ -47,6 +47,14 @@ def test_help_is_as_wide_as_the_terminal_and_at_most_80(words, columns, monkeypa
     assert all(line.startswith(" ") for line in options), "a rule or a text is broken"
 
 
+def test_words_behind_a_command_are_in_its_help(capsys):
+    for name, word in cli.NESTED:
+        with pytest.raises(SystemExit):
+            cli.main([name, "--help"])
+        assert f"wlr {name} {word}" in capsys.readouterr().out
+        assert word in cli.COMMANDS[name]
+
+
 @pytest.mark.parametrize("name", ["evaluate", "robot", "calibrate"])
 def test_help_begins_with_the_usage(name, capsys):
     with pytest.raises(SystemExit):
@@ -100,7 +108,11 @@ def test_bash_completes_commands_and_options(capsys, tmp_path):
     cli.main(["--completion", "bash"])
     (tmp_path / "wlr").write_text(capsys.readouterr().out)
     ask = 'source "$0"; {}; COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _tyro_wlr; printf "%s\\n" "${{COMPREPLY[@]}}"'
-    for words, expected in (("wlr ev", "evaluate"), ("wlr evaluate --epi", "--episodes"), ("wlr calibrate jo", "joints")):
+    cases = (
+        *(("wlr ev", "evaluate"), ("wlr evaluate --epi", "--episodes"), ("wlr calibrate jo", "joints")),
+        *(("wlr vision che", "check"), ("wlr vision --anno", "--annotate"), ("wlr vision check --on", "--only")),
+    )
+    for words, expected in cases:
         script = ask.format(f"COMP_WORDS=({words})")
         answer = subprocess.run(
             ["bash", "-c", script, str(tmp_path / "wlr")], capture_output=True, text=True, check=True, timeout=60

@@ -44,7 +44,7 @@ COMMANDS = {
     "compare": "drive two simulators with the same setpoints; where do they diverge?",
     "gap": "find what the model lacks: name the missing effect, validate it on held-out runs",
     "adapt": "adapt a policy to a robot: drive, find what the model lacks, train on, test",
-    "vision": "measure pose and slip from a video of the robot with ring markers",
+    "vision": "measure pose and slip from a video of the robot with ring markers; check: look at the sheets",
     "calibrate": "calibrate joints, IMU, flow sensor or camera; write the marker sheets",
     "doctor": "look at a robot before it drives; names the first fault and its remedy",
     "commission": "test a robot on a stand, compare each result with the emulator",
@@ -124,7 +124,8 @@ def _completion(words: list[str]) -> str:
 
     if len(words) != 1 or words[0] not in parsing.SHELLS:
         raise InputError(f"--completion: expected one of {', '.join(parsing.SHELLS)}, such as: wlr --completion bash")
-    return parsing.completion(words[0], "wlr", {name: options_of(name) for name in COMMANDS})
+    nested = {(name, word): options_of(f"{name}_{word}") for name, word in NESTED}
+    return parsing.completion(words[0], "wlr", {name: options_of(name) for name in COMMANDS}, nested)
 
 
 def _import_modules(words: list[str]) -> list[str]:

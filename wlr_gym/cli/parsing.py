@@ -99,36 +99,53 @@ def wrapped(text: str) -> str:
     )
 
 
-def completion(shell: str, program: str, commands: Mapping[str, Any]) -> str:
+def completion(shell: str, program: str, commands: Mapping[str, Any], nested: Mapping[tuple[str, str], type]) -> str:
     """Return a shell's script that completes commands and options.
 
     Args:
         shell: bash, zsh or fish.
         program: what is completed.
         commands: name -> options, or the same of a command with commands of its own.
+        nested: command and a word behind it, which may follow instead of the command's own options -> options.
     """
     import tyro
 
     script = io.StringIO()
     words = ["--tyro-print-completion", shell]
     with contextlib.redirect_stdout(script), contextlib.suppress(SystemExit):
-        tyro.cli(_one_of(commands), prog=program, args=words)
+        tyro.cli(_one_of(commands, nested), prog=program, args=words)
     return script.getvalue()
 
 
-def _one_of(commands: Mapping[str, Any]) -> Any:
+def _one_of(commands: Mapping[str, Any], nested: Mapping[tuple[str, str], type] | None = None) -> Any:
     """Return what the parser takes for several commands, some of them with commands of their own."""
     import tyro
 
     members = []
     for name, kind in commands.items():
+        words = {word: one for (outer, word), one in (nested or {}).items() if outer == name}
         if isinstance(kind, Mapping):
             own = _one_of({word: one for word, (one, _) in kind.items()})
             member = dataclasses.make_dataclass(name.capitalize(), [("command", tyro.conf.OmitSubcommandPrefixes[own])])
         else:
-            member = builder(kind)
+            member = _with_words(kind, words) if words else builder(kind)
         members.append(Annotated[Any, tyro.conf.subcommand(name, constructor=member)])
     return functools.reduce(operator.or_, members)
+
+
+def _with_words(kind: type, words: Mapping[str, type]) -> Callable[..., Any]:
+    """Return what the parser takes for a command with options, or one of some words and the options of that."""
+    import tyro
+
+    build = builder(kind)
+    nothing = Annotated[None, tyro.conf.subcommand("--help")]  # no word; completion offers its name, so one that fits
+    annotation = tyro.conf.OmitSubcommandPrefixes[_one_of(words) | nothing]
+    word = inspect.Parameter("word", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+    build.__annotations__["word"] = annotation
+    build.__signature__ = inspect.Signature(  # pyright: ignore[reportFunctionMemberAccess]
+        [*inspect.signature(build).parameters.values(), word]
+    )
+    return build
 
 
 # ---- what options there are ------------------------------------------------------------------------------------------

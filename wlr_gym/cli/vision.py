@@ -2,6 +2,8 @@
 
 Writes the run with cam_* columns, slip.csv (per row), frames.csv (per frame), summary.json, pose.png, slip.png, annotated.mp4.
 A live camera (its number) is filmed first, to film.avi and film.csv, until Ctrl-C; the run is read after that.
+
+wlr vision check PHOTO looks at the marker sheets in one photograph; see: wlr vision check --help.
 """
 
 from __future__ import annotations
