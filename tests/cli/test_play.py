@@ -3,6 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo fills its namespace when it is imported.)
 import contextlib
+import json
 from typing import Any
 
 import mujoco
@@ -56,8 +57,10 @@ def test_evaluate_writes_policy_and_baseline_side_by_side(tmp_path, capsys, grap
 def test_two_policies_side_by_side_with_their_paths(tmp_path, capsys, graphics, headless):
     path = tmp_path / "film.webp"
     arguments = ["--agent", "pid", "--beside", "do_nothing", "--seconds", "0.4", "--fps", "10", "--command", "0.1,0", "--path"]
-    assert main(["play", "--video", str(path), *arguments, "--size", "96", "64"]) == 0
-    assert f"written: {path}" in capsys.readouterr().out
+    assert main(["play", "--video", str(path), *arguments, "--size", "96", "64", "--json"]) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out) == {"video": str(path), "pictures": 4, "seconds": 0.4}
+    assert f"written: {path} (4 pictures, 0.4 s)" in shown.err
     with Image.open(path) as image:
         assert (image.n_frames, image.size[0]) == (4, 2 * 96 + 4)
 
@@ -118,6 +121,7 @@ def test_a_commanded_path_is_drawn_on_the_floor_it_was_commanded_on(shape):
         (["--agent", "pidd"], "did you mean 'pid'?"),
         (["--agent", "pid", "--command", "1"], "--command '1': expected linear_velocity_x,yaw_rate"),
         (["WLR-Pth-v0"], "did you mean 'WLR-Path-v0'?"),
+        (["--json"], "--json: says what was written: add --video"),
         (["--beside", "pid"], "--beside: two robots are shown in a video only"),
         (["--video", "film.webp", "--fps", "0"], "--fps 0: expected 1 to 1000"),
         (["--video", "film.avi"], "--video film.avi: expected a file that ends in"),

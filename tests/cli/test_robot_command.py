@@ -38,6 +38,17 @@ def test_new_without_questions(big):
     assert "# [derived] uniform box" in text
 
 
+def test_new_prints_what_a_check_finds_as_json(tmp_path, capsys):
+    path = tmp_path / "weak.yaml"
+    words = ["--yes", "--json", "--set", "servo.wheel.stall_torque=0.05", "body.mass=40"]
+    assert main(["robot", "new", "--out", str(path), *words]) == FAILED
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)
+    assert (found["robot"], found["out"]) == ("weak", str(path))
+    assert "fault" in [finding["level"] for finding in found["findings"]]
+    assert shown.err == f"written: {path}\n"
+
+
 def test_new_asks_with_defaults_and_asks_again(tmp_path, capsys):
     """Enter takes the default; what cannot be read is said and asked again."""
     asked = []

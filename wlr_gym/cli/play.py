@@ -14,7 +14,8 @@ import tyro
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import ForceOption, PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.results import print_json
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import View
 from wlr_gym.render.web.page import HOST, PORT
@@ -37,7 +38,7 @@ FPS = 25.0
 
 
 @dataclass(frozen=True)
-class PlayOptions(ForceOption, PatchOption, SensorsOption):
+class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     agent: str = "pid"
@@ -100,6 +101,8 @@ def run(options: PlayOptions) -> int:
             _film(options, core, policy, driver)
         else:
             show(options, core, policy, driver, _web_viewer if options.web else _window_viewer)
+        if options.video is not None:
+            _print_film(options, core)
     return OK
 
 
@@ -118,6 +121,8 @@ def _check(options: PlayOptions) -> None:
     _view(options)
     if options.beside is not None and options.video is None:
         raise InputError("--beside: two robots are shown in a video only: add --video")
+    if options.json and options.video is None:
+        raise InputError("--json: says what was written: add --video")
     if options.web and options.video is not None:
         raise InputError("--web and --video: one or the other")
     if options.video is not None:
@@ -168,12 +173,24 @@ def _film(options: PlayOptions, core: Core, policy: Policy, driver: Driver | Non
     from wlr_gym.render import write_video
 
     assert options.video is not None
-    seconds = SECONDS if options.seconds is None else options.seconds
+    seconds = _seconds(options)
     count, _, fps = film_length(core, seconds, options.fps)
     title = f"{options.agent} on {core.plant.capabilities.name}"
     pictures = film(core, policy, options.seed, seconds, view=_view(options), driver=driver, title=title, fps=options.fps)
     write_video(options.video, tracked(pictures, count, "drawing", Console()), fps, count)
+
+
+def _seconds(options: PlayOptions) -> float:
+    return SECONDS if options.seconds is None else options.seconds
+
+
+def _print_film(options: PlayOptions, core: Core) -> None:
+    from wlr_gym.learning.evaluation.film import film_length
+
+    count, _, fps = film_length(core, _seconds(options), options.fps)
     print(f"written: {options.video} ({count} pictures, {count / fps:g} s)")
+    if options.json:
+        print_json({"video": options.video, "pictures": count, "seconds": count / fps})
 
 
 def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
@@ -190,14 +207,13 @@ def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
         environment_of(options.env, options.agent),
         read_subjects([options.agent, options.beside]),
         options.seed,
-        SECONDS if options.seconds is None else options.seconds,
+        _seconds(options),
         keywords,
         view=_view(options),
         schedule=options.command,
         fps=options.fps,
         watch=lambda pictures, count: tracked(pictures, count, "drawing", Console()),
     )
-    print(f"written: {options.video}")
 
 
 def _window_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> Viewer:

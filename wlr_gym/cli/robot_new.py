@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption
+from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import ask_terminal
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class NewOptions(ForceOption):
+class NewOptions(JsonOption, ForceOption):
     """Write a robot file over a base. Asks for what --set does not give; Enter takes the default.
 
     Attributes:
@@ -78,7 +79,10 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     write_text(options.out, text)
     print(f"written: {options.out}")
     findings = examine_robot(robot)
-    print_findings(robot, findings)
+    if options.json:
+        print_json({"robot": robot.name, "out": options.out, "findings": findings})
+    else:
+        print_findings(robot, findings)
     return FAILED if any(finding.level == "fault" for finding in findings) else OK
 
 
