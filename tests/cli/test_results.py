@@ -12,13 +12,8 @@ from wlr_gym import cli
 from wlr_gym.cli import main, parsing
 from wlr_gym.cli.results import only_results, plain, print_json
 
-#: Commands that end in no results: they run until they are ended, or ask their way through.
-WITHOUT_RESULTS = {
-    "play",
-    "view",
-    "emulate",
-    "robot new",
-}
+#: Commands that end in no results: they run until they are ended.
+WITHOUT_RESULTS = {"emulate", "view"}
 
 
 def all_options():
