@@ -46,6 +46,15 @@ def test_refusals(changes, words):
         emulate.run(options(**changes))
 
 
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [({"seconds": -3.0}, "--seconds -3: expected 0 or more"), ({"tick": 0.0}, "--tick 0: expected more than 0")],
+)
+def test_a_time_that_is_none_is_refused(option, message):
+    with pytest.raises(InputError, match=message):
+        emulate.run(options(**option))
+
+
 def test_effects_are_taken_by_name_and_refused_when_unknown():
     assert emulate.run(options(stepped=True, effects=("tired_battery",))) == 0
     with pytest.raises(InputError, match="did you mean 'tired_battery'"):

@@ -73,6 +73,10 @@ def test_a_default_is_said_once(shown):
         assert described.count("(default:") <= 1, described
 
 
+def test_a_default_is_written_in_one_way(shown):
+    assert not re.search(r"[;,.] default(?! ?:)|\(\d+[:)]", " ".join(shown.split()))
+
+
 def test_every_option_is_described(shown):
     lines = [*shown.partition("\n options\n")[2].splitlines(), ""]
     for line, following in itertools.pairwise(lines):

@@ -1,6 +1,7 @@
 """``wlr robot``: files are written whole or not at all, and say what they are."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -118,7 +119,10 @@ def test_a_new_robot_that_cannot_stand_is_written_and_fails(tmp_path, capsys):
 
 def test_show_as_text_and_json(big, capsys):
     assert main(["robot", "show", str(big)]) == OK
-    assert "top_speed" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "top_speed" in printed
+    assert max(map(len, printed.splitlines())) <= 80
+    assert not re.search(r"e-1\d", printed), "rounding, which is 0"
     assert main(["robot", "show", str(big), "--json"]) == OK
     shown = json.loads(capsys.readouterr().out)
     assert shown["numbers"]["total_mass"] == {"value": 18.0, "unit": "kg", "meaning": "body, legs and wheels"}

@@ -75,13 +75,13 @@ class BenchOptions(JsonOption, ForceOption):
     """gap, adapt, decide: folder for results; an interrupted test resumes from it.
     vision: instead of the table, film a lab that is not perfect and keep every film's result here; resumes likewise."""
     cases: tuple[str, ...] = ()
-    """adapt: names of cases, or how many of them; default: all. decide: how many (31)."""
+    """adapt: names of cases, or how many of them; default: all. decide: how many; default: 31."""
     contenders: tuple[str, ...] = ()
     """adapt: none, truth, wide, ours, calibrated; default: all. decide: chosen, random, eight."""
     sets: int | None = None
-    """gap: data sets (400: 240 of all kinds, 160 more without an effect). vision with --out: films (60)."""
+    """gap: data sets; default: 400, 240 of all kinds and 160 more without an effect. vision with --out: films; default: 60."""
     seed: int | None = None
-    """vision: with --out, of the films (28); another one gives other films."""
+    """vision: with --out, of the films; default: 28; another one gives other films."""
     processes: int = 2
     """gap: data sets at a time; decide: contenders."""
     ray: tuple[str, ...] | None = None

@@ -101,9 +101,11 @@ def machine_of(options: EmulateOptions) -> Machine:
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters
 
-    for name in ("tick", "usb_latency", "seconds"):
-        if getattr(options, name) < 0 or (name == "tick" and options.tick == 0):
-            raise InputError(f"--{name.replace('_', '-')} {getattr(options, name):g}: expected more than 0")
+    if not options.tick > 0:
+        raise InputError(f"--tick {options.tick:g}: expected more than 0")
+    for name in ("usb_latency", "seconds"):
+        if not getattr(options, name) >= 0:
+            raise InputError(f"--{name.replace('_', '-')} {getattr(options, name):g}: expected 0 or more")
     if not 0 <= options.firmware <= 255:
         raise InputError(f"--firmware {options.firmware}: expected 0 to 255")
     timing = NO_TIME if options.stepped else LineTiming(wire=options.wire_time, usb_latency=options.usb_latency)

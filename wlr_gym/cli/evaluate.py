@@ -80,9 +80,9 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     full: bool = False
     """The whole card: 5 blocks of 256 episodes, every sweep, both simulators. Minutes per policy; options below still count."""
     episodes: int | None = None
-    """Number of episodes per block; default 64, with --full 256."""
+    """Number of episodes per block; default: 64, with --full 256."""
     blocks: int | None = None
-    """Number of blocks of --episodes, each with its own seeds; default 1, with --full 5."""
+    """Number of blocks of --episodes, each with its own seeds; default: 1, with --full 5."""
     seed: int = FIRST_SEED
     """Seed of the first episode; the others count up from it, each further one of --blocks from 10000 above the last one."""
     backend: str | None = None
@@ -90,7 +90,7 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     other_episodes: int = OTHER_EPISODES
     """Episodes in the second simulator."""
     sweep: tuple[str, ...] | None = None
-    """Sweeps: friction, split, floors, slope, grip, shapes, paper, latency, payload; default none, with --full all that suit
+    """Sweeps: friction, split, floors, slope, grip, shapes, paper, latency, payload; default: none, with --full all that suit
     the task."""
     sweep_episodes: int = SWEEP_EPISODES
     """Episodes per point of a sweep."""

@@ -22,6 +22,8 @@ from wlr_gym.cli.robot_new import NewOptions, new_robot, print_findings
 if TYPE_CHECKING:
     from wlr_gym.robot import Robot
 
+#: SI; what is nearer to 0 is 0 but for rounding.
+ROUNDING = 1e-12
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -91,6 +93,9 @@ def _check(options: CheckOptions) -> int:
 
 
 def _show(options: ShowOptions) -> int:
+    from rich.console import Console
+
+    from wlr_gym.cli.tables import print_table
     from wlr_gym.robot import load_robot, robot_hash
 
     if options.picture is not None and options.picture.suffix.lower() not in PICTURES:
@@ -104,9 +109,13 @@ def _show(options: ShowOptions) -> int:
     if options.json:
         print_json({"robot": robot.name, "fingerprint": robot_hash(robot), "numbers": numbers})
     else:
-        print(f"{robot.name}, fingerprint {robot_hash(robot)}")
-        for name, number in numbers.items():
-            print(f"  {name:<26}{number['value']:>10.4g} {number['unit']:<6} {number['meaning']}")
+        rows = [(name, f"{one['value']:.4g}", one["unit"], one["meaning"]) for name, one in numbers.items()]
+        print_table(
+            Console(highlight=False),
+            ("number", "value", "unit", "meaning"),
+            rows,
+            f"{robot.name}, fingerprint {robot_hash(robot)}",
+        )
     if options.picture is not None:
         from wlr_gym.render.portrait import draw_portrait
 
@@ -119,4 +128,8 @@ def _numbers(robot: Robot) -> dict[str, dict[str, Any]]:
     from wlr_gym.physics.feasibility import ENTRIES, capability_of
 
     can = capability_of(robot)
-    return {name: {"value": getattr(can, name), "unit": unit, "meaning": doc} for name, (unit, doc) in ENTRIES.items()}
+    values = {name: getattr(can, name) for name in ENTRIES}
+    return {
+        name: {"value": 0.0 if abs(values[name]) < ROUNDING else values[name], "unit": unit, "meaning": doc}
+        for name, (unit, doc) in ENTRIES.items()
+    }

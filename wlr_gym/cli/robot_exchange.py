@@ -48,7 +48,7 @@ class RobotExportOptions(JsonOption, ForceOption):
     Attributes:
         robot: name in configs/robot/ or path.
         out: file to write; .xml or .mjcf: MJCF, .urdf: URDF.
-        format: of the file, mjcf or urdf; default: by the end of --out.
+        format: of the file; default: by the end of --out.
     """
 
     robot: Annotated[str, tyro.conf.Positional]
