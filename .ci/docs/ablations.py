@@ -95,10 +95,16 @@ def draw(path: Path) -> None:
     figure = new_figure(8.0, 3.6)
     for k, floors in enumerate(FLOORS):
         axes = figure.add_subplot(1, 2, k + 1)
-        for names, colour, label in ((AWARE, BLUE, "slip-aware"), (BLIND, ORANGE, "blind")):
+        for names, colour, label in ((AWARE, BLUE, "slip-aware; number: weight of slip"), (BLIND, ORANGE, "blind; the same")):
             points = [data["settings"][name][floors] for name in names.values()]
             error, slip = ([[1e3**j * v for v in one[key]] for one in points] for j, key in enumerate(_KEYS))
-            axes.plot([one[0] for one in error], [one[0] for one in slip], "o-", color=colour, label=label)
+            axes.plot(
+                [one[0] for one in error],
+                [one[0] for one in slip],
+                "o-",
+                color=colour,
+                label=f"{label}; number: weight of slip",
+            )
             for weight, x, y, place in zip(names, error, slip, ((4, 6), (8, 4), (4, -12)), strict=True):
                 axes.plot(x[1:], [y[0]] * 2, color=colour, linewidth=0.8)
                 axes.plot([x[0]] * 2, y[1:], color=colour, linewidth=0.8)
@@ -106,7 +112,7 @@ def draw(path: Path) -> None:
         for name, colour in CONTROLLERS.items():
             one = data["controllers"][floors][name]
             axes.plot(one["tracking_error"], 1e3 * one["slip_speed"], "s", color=colour, label=name)
-        axes.set(title=floors, xlabel="tracking error", ylabel="slip, mean over wheels (mm/s)")
+        axes.set(title=floors, xlabel="tracking error (1 = at the scales)", ylabel="slip speed, mean over wheels (mm/s)")
         tidy(axes)
     legend_below(figure)
     save(figure, path)
