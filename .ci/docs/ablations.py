@@ -1,6 +1,6 @@
 """What each part of Velocity's recipe is worth, and what weights of slip buy: docs/data/ablations.json, figure slip_weights.
 
-``python .ci/docs/ablations.py SWEEP BLIND`` scores every setting of two sweeps (docs/policies.md has their commands) as ``wlr
+``python .ci/docs/ablations.py SWEEP BLIND PLAIN`` scores every setting of three sweeps (commands: docs/policies.md) as ``wlr
 evaluate`` does, beside the whole recipe and the controllers; an interrupted scoring goes on where it stopped. Then, or without
 arguments, the picture is drawn. tables.py has the table.
 """
@@ -31,6 +31,8 @@ RECIPE, CONTROLLERS = "recipe", {"slip_compensating": GREEN, "pid": WINE}
 #: Weights of slip -> setting.
 AWARE = {0.2: "slip weighs a quarter", 0.8: RECIPE, 3.2: "slip weighs four times as much"}
 BLIND = {weight: f"blind, slip weighs {weight:g}" for weight in AWARE}
+#: From random weights, with its own recipe.
+PLAIN = "plain PPO, 4 million steps"
 HEADER = (
     "Velocity, neither camera nor flow",
     *(f"{one}: {what}" for one in FLOORS for what in ("error", "better (%)", "slip (mm/s)")),
@@ -38,10 +40,11 @@ HEADER = (
 _KEYS = ("tracking_error", "slip_speed")
 
 
-def score(sweep: str, blind: str) -> None:
+def score(sweep: str, blind: str, plain: str) -> None:
     """Score what is not scored yet; every setting is written when it is done."""
     found = {name: f"{sweep}/trials/variant={name.replace(' ', '_')},seed=*" for name in read_yaml(SWEEP)["variants"]}
     found |= {BLIND[weight]: f"{blind}/trials/*slip.weight=-{weight:g},seed=*" for weight in BLIND}
+    found |= {PLAIN: f"{plain}/trials/*"}
     data = read_data() or {"commit": git_commit(), "episodes": EPISODES, "settings": {}, "controllers": {}}
     for name in [one for one in found if expand(found[one]) and one not in data["settings"]]:
         data["settings"][name] = {floors: _numbers(data, found[name], found[RECIPE], floors) for floors in FLOORS}
