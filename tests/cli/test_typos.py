@@ -40,7 +40,14 @@ COMMANDS = {
     "an environment": (["train", "WLR-Velocty-v0"], "did you mean 'WLR-Velocity-v0'?"),
     "an agent": (["train", "--agent", "pppo"], "unknown agent 'pppo' (did you mean 'ppo'?)"),
     "a setting": (["train", "--set", "learning_rat=1"], "did you mean 'learning_rate'?"),
-    "a setting's number": (["train", "--set", "total_steps=-5"], "total_steps = -5: expected greater than 0"),
+    "a setting's number": (["train", "--set", "total_steps=-5"], "total_steps = -5: expected more than 0"),
+    "a setting of the environment": (
+        ["train", "--set", "environment.randomisation=wide"],
+        "unknown setting 'environment.randomisation' (did you mean 'randomization'?); valid: backend,",
+    ),
+    "no seeds": (["sweep", "WLR-Velocity-v0", "--seeds", "0"], "wlr: --seeds 0: expected 1 or more\n"),
+    "no steps": (["adapt", "velocity_blind", "--emulated", "--steps", "0"], "wlr: --steps 0: expected 1 or more\n"),
+    "one drive": (["adapt", "velocity_blind", "--emulated", "--drives", "1"], "wlr: --drives 1: expected 2 or more\n"),
     "a setting given twice": (
         ["train", "--set", "learning_rate=1", "learning_rate=2"],
         "setting: 'learning_rate' is given twice, 1 and 2: expected once",

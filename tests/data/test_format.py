@@ -311,7 +311,7 @@ def test_missing_values(table):
         ("marker_offset: [0, 0]", ["marker_offset"]),
         ("marker_offset: [0, 0, 85]", ["marker_offset", "millimetres"]),
         ("robot: [", ["broken YAML", "line 1"]),
-        ("just text", ["expected a mapping"]),
+        ("just text", ["expected keys and values"]),
     ],
 )
 def test_bad_meta_is_refused(tmp_path, text, words):

@@ -60,8 +60,8 @@ def edited(tmp_path, edit):
         ),
         (lambda d: d["safety"].update(warm=70), r"yaml: safety.warm = 70 degC: expected below hot = 68 degC$"),
         (lambda d: d["safety"].update(leg_error=0.6), r"yaml: safety.leg_error = 0.6 rad: expected below leg_lead = 0.45 rad"),
-        (lambda d: d["safety"].update(leg_margin=3), r"yaml: safety.leg_margin = 3: expected .* equal to 0.5 \(rad\)$"),
-        (lambda d: d["safety"].update(load_time="long"), r"load_time = 'long': expected a valid number.* \(s\)$"),
+        (lambda d: d["safety"].update(leg_margin=3), r"yaml: safety.leg_margin = 3: expected 0.5 or less \(rad\)$"),
+        (lambda d: d["safety"].update(load_time="long"), r"load_time = 'long': expected a number \(s\)$"),
     ],
 )
 def test_refusals(tmp_path, edit, words):
@@ -79,7 +79,7 @@ def test_other_ports():
 
 @pytest.mark.parametrize("name", SafetyLimits.model_fields)
 def test_no_limit_is_without_upper_bound(tmp_path, name):
-    words = rf"safety\.{name} = 100000: expected less than or equal to [0-9.]+ \({unit_of(name)}\)$"
+    words = rf"safety\.{name} = 100000: expected [0-9.]+ or less \({unit_of(name)}\)$"
     assert unit_of(name)
     with pytest.raises(InputError, match=words):
         load_hardware(edited(tmp_path, lambda data: data["safety"].update({name: 100000})))
@@ -93,7 +93,7 @@ def test_no_limit_is_without_upper_bound(tmp_path, name):
     ],
 )  # fmt: skip
 def test_limits_in_another_unit_are_refused(tmp_path, name, value):
-    with pytest.raises(InputError, match=rf"safety\.{name} = {value}: expected less than"):
+    with pytest.raises(InputError, match=rf"safety\.{name} = {value}: expected [0-9.]+ or less"):
         load_hardware(edited(tmp_path, lambda data: data["safety"].update({name: value})))
 
 

@@ -6,13 +6,14 @@ import copy
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import find_config, named_in
+from wlr_gym.base.refusals import refusal, refused_option, shown
 
 ModelType = TypeVar("ModelType", bound=BaseModel)
 #: What a file says, and its path as messages name it.
@@ -147,36 +148,29 @@ def parse_config(model: type[ModelType], data: object, where: str) -> ModelType:
     Raises:
         InputError: naming file, field, value, what was expected and, for an unknown key, the nearest valid name.
     """
-    if not isinstance(data, dict):
-        raise InputError(f"{where}: expected a mapping of {', '.join(model.model_fields)}, got {type(data).__name__}")
+    require_keys(model, data, where)
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise InputError("; ".join(_explain(model, problem, where) for problem in error.errors())) from None
+        raise refusal(model, data, error, where) from None
 
 
-def _explain(model: type[BaseModel], problem: Any, where: str) -> str:
-    location = [str(part) for part in problem["loc"]]
-    field = ".".join(location)
-    if problem["type"] == "extra_forbidden":
-        valid = _fields_at(model, location[:-1])
-        return f"{where}: unknown key '{field}'{nearest(location[-1], valid)}; valid: {', '.join(valid)}"
-    if problem["type"] == "missing":
-        return f"{where}: '{field}' is missing"
-    if isinstance(refused := problem.get("ctx", {}).get("error"), InputError):
-        return f"{where}: {refused}"
-    value = f"{field} = {problem['input']!r}: " if field else ""  # what is about the whole file does not repeat it
-    return f"{where}: {value}{problem['msg'].replace('Input should be', 'expected')}"
+def require_keys(model: type[BaseModel], data: object, where: str) -> None:
+    """Raise :class:`InputError` where the content of a file is not keys and values."""
+    keys = ", ".join(model.model_fields)
+    if data is None:
+        raise InputError(f"{where}: the file is empty; expected the keys {keys}")
+    if not isinstance(data, dict):
+        raise InputError(f"{where}: {shown(data)}: expected keys and values; keys: {keys}")
 
 
-def _fields_at(model: Any, path: list[str]) -> list[str]:
-    for part in path:
-        if get_origin(model) is dict:
-            model = get_args(model)[1]
-            continue
-        field = getattr(model, "model_fields", {}).get(part)
-        if field is None:
-            return []
-        options = get_args(field.annotation)
-        model = options[0] if type(None) in options else field.annotation  # X | None
-    return list(getattr(model, "model_fields", {}))
+def parse_options(model: type[ModelType], given: Mapping[str, Any]) -> ModelType:
+    """Validate the options of a command, which have the names of the model's fields.
+
+    Raises:
+        InputError: naming the option, its value and what was expected.
+    """
+    try:
+        return model.model_validate(given)
+    except ValidationError as error:
+        raise refused_option(error) from None

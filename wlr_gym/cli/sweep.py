@@ -77,6 +77,8 @@ def _plan(options: SweepOptions) -> SweepPlan:
     """Return the plan of a file, of the options, or of a file with options laid over it."""
     if options.what is None:
         raise InputError("expected the file of a sweep, or an environment id (see: wlr envs)")
+    if options.seeds is not None and options.seeds < 1:
+        raise InputError(f"--seeds {options.seeds}: expected 1 or more")
     changes: dict[str, Any] = {"imports": list(IMPORTED)} if IMPORTED else {}
     given = {"config": options.config, "agent": options.agent, "init": options.init, "seeds": options.seeds}
     changes |= {name: value for name, value in given.items() if value is not None}
@@ -90,7 +92,7 @@ def _plan(options: SweepOptions) -> SweepPlan:
             f"--search {options.search}: expected an environment id beside it, not {options.what}, which may have a search"
         )
     file = options.what if "environment" not in changes else options.search
-    return read_plan(Path(file), changes) if file is not None else parse_config(SweepPlan, changes, "wlr sweep")
+    return read_plan(Path(file), changes) if file is not None else parse_config(SweepPlan, changes, "sweep")
 
 
 def _settings(words: tuple[str, ...]) -> Mapping[str, Any]:

@@ -8,6 +8,7 @@ from pydantic import Field, ValidationError, ValidationInfo, ValidatorFunctionWr
 from pydantic_core import PydanticCustomError
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.refusals import expected
 from wlr_gym.base.settings import SettingsModel
 
 
@@ -100,7 +101,7 @@ class SafetyLimits(SettingsModel):
         try:
             return check(value)
         except ValidationError as error:
-            context = {"reason": error.errors()[0]["msg"], "unit": unit_of(str(info.field_name))}
+            context = {"reason": expected(error.errors()[0]), "unit": unit_of(str(info.field_name))}
             raise PydanticCustomError("limit", "{reason} ({unit})", context) from None
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
@@ -168,7 +168,23 @@ def run_training(agent: str, training: Training) -> Path:
     limit = training.max_seconds
     if limit is not None and (not isinstance(limit, int | float) or not limit > 0):
         raise InputError(f"max_seconds = {limit!r}: expected a time above 0 s")
+    check_environment_settings(training.config)
     return agent_function(agent, "train")(replace(training, config=with_robot(training.config)))
+
+
+def check_environment_settings(settings: Mapping[str, Any]) -> None:
+    """Refuse a setting of the environment that does not exist, as a setting, not as a keyword of Python.
+
+    Raises:
+        InputError: naming it, and the nearest that exists.
+    """
+    from wlr_gym.envs.settings import EnvironmentOptions
+
+    valid = EnvironmentOptions.__annotations__
+    environment = settings.get("environment")
+    for name in environment if isinstance(environment, Mapping) else ():
+        if name not in valid:
+            raise InputError(f"unknown setting 'environment.{name}'{nearest(name, valid)}; valid: {', '.join(valid)}")
 
 
 def unused(folder: Path) -> Path:

@@ -335,10 +335,12 @@ def test_errors_name_event_and_file_it_stands_in(robot, tmp_path):
     with pytest.raises(InputError, match=r"upper\.yaml over .*lower\.yaml: events 'strip' and 'other' both set body\.mass"):
         load_randomization(upper, robot)
     lower.write_text("events: {strip: {distribution: uniform, lwo: 1}}\n")
-    with pytest.raises(InputError, match=r"lower\.yaml: 'events\.strip\.parameters' is missing.*did you mean 'low'"):
+    with pytest.raises(
+        InputError, match=r"lower\.yaml: 2 faults\n  'events\.strip\.parameters' is missing\n.*did you mean 'low'"
+    ):
         load_randomization(upper, robot)
     lower.write_text("[1, 2]\n")
-    with pytest.raises(InputError, match=r"lower\.yaml: expected a mapping"):
+    with pytest.raises(InputError, match=r"lower\.yaml: .*expected keys and values"):
         load_randomization(upper, robot)
 
 

@@ -267,7 +267,7 @@ def test_broken_model_file_is_refused(run, tmp_path):
         (["train", "--agent", "pop"], "unknown agent"),
         (["train", "--agent", "do_nothing"], "has no 'train'; agents that have: pid, ppo"),
         (["train", "--set", "epochs=0"], "epochs = 0"),
-        (["train", "--set", "hidden_layers=[64,-3]"], "hidden_layers.1 = -3: expected greater than 0"),
+        (["train", "--set", "hidden_layers=[64,-3]"], "hidden_layers.1 = -3: expected more than 0"),
         (["train", "--set", "environment.precison=float32"], "did you mean 'precision'"),
         (["train", "--resume", "/nowhere"], "not a run folder"),
         (["train", "--resume", ".", "--seed", "1"], "leave out"),

@@ -7,9 +7,8 @@ from typing import Any
 
 from pydantic import Field
 
-from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import named_in
-from wlr_gym.base.settings import SettingsModel, parse_config, read_config
+from wlr_gym.base.settings import SettingsModel, parse_config, read_config, require_keys
 from wlr_gym.perception.markers.camera import Camera, load_camera
 from wlr_gym.perception.markers.targets import Target, load_target
 
@@ -85,8 +84,7 @@ def load_camera_file(source: str | Path | CameraFile) -> CameraFile:
     if isinstance(source, CameraFile):
         return source
     data, where = read_config("camera", source)
-    if not isinstance(data, dict):
-        raise InputError(f"{where}: expected a mapping of {', '.join(CameraFile.model_fields)}, got {type(data).__name__}")
+    require_keys(CameraFile, data, where)
     return parse_config(CameraFile, {**data, **_named_files(data, where)}, where)
 
 

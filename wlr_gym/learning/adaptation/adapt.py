@@ -9,7 +9,7 @@ from pathlib import Path
 from wlr_gym.base.errors import InputError, require_package, unknown_name
 from wlr_gym.base.files import alone_in
 from wlr_gym.base.provenance import record_provenance
-from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.base.settings import parse_config, parse_options, read_yaml
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import same_profile
 from wlr_gym.envs.registry import task_name_of
@@ -122,7 +122,7 @@ def adapt(
         "sensors": tuple(sensors),
         "seed": seed,
     }
-    asked = parse_config(Asked, given, "wlr adapt")
+    asked = parse_options(Asked, given)
     if robot_runs is not None and not Path(robot_runs).is_dir():
         raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
     progress = open_folder(Path(out), asked, tell, threads)

@@ -58,7 +58,7 @@ class Asked(SettingsModel):
     budget_seconds: float | None = Field(default=None, ge=0)
     drives: int = Field(default=6, ge=2)
     drive_seconds: float = Field(default=10.0, gt=0)
-    steps: int = Field(default=7_500_000, gt=0)
+    steps: int = Field(default=7_500_000, ge=1)
     learning_rate: float = Field(default=5e-4, gt=0)
     episodes: int = Field(default=256, ge=8)
     sensors: tuple[str, ...] = ()

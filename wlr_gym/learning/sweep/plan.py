@@ -15,12 +15,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.seeds import LARGEST_SEED
-from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml
+from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml, require_keys
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.settings import EnvironmentOptions
-from wlr_gym.learning.training import settings_of, with_robot
+from wlr_gym.learning.training import check_environment_settings, settings_of, with_robot
 from wlr_gym.policy.agents import agent_function, apply_changes, for_task, load_agent
 
 #: Metric of the held-out episodes -> whether less of it is better.
@@ -199,9 +198,8 @@ def read_plan(path: Path, changes: Mapping[str, Any] | None = None) -> SweepPlan
         InputError: broken, an unknown field, a bad value.
     """
     content = read_yaml(path)
-    if not isinstance(content, Mapping):
-        raise InputError(f"{path}: expected a mapping of {', '.join(SweepPlan.model_fields)}")
-    return parse_config(SweepPlan, merge_changes(dict(content), changes or {}), str(path))
+    require_keys(SweepPlan, content, str(path))
+    return parse_config(SweepPlan, merge_changes(content, changes or {}), str(path))
 
 
 def resolve(plan: SweepPlan) -> SweepPlan:
@@ -298,8 +296,8 @@ def _check(plan: SweepPlan) -> None:
     for settings in [*(known or [drawn]), *variants]:
         trial = trial_of(settings, plan.seed_list[0])
         whole = whole_settings(plan, trial)
-        _check_environment(whole.get("environment") or {}, trial.name)
         try:
+            check_environment_settings(whole)
             check_settings(plan.agent, whole)
         except InputError as error:
             raise InputError(f"trial {trial.name}: {error}") from None
@@ -316,12 +314,6 @@ def check_settings(agent: str, settings: Mapping[str, Any]) -> None:
     """
     if hasattr(load_agent(agent), "check_settings"):
         agent_function(agent, "check_settings")(settings)
-
-
-def _check_environment(keywords: Mapping[str, Any], where: str) -> None:
-    for name in keywords:
-        if name not in EnvironmentOptions.__annotations__:
-            raise unknown_name("setting of the environment", name, EnvironmentOptions.__annotations__, f"trial {where}")
 
 
 def _check_early_stopping(plan: SweepPlan) -> None:
