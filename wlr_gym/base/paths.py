@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError, nearest, unknown_name
@@ -22,14 +24,33 @@ def find_config(kind: str, name: str | Path) -> Path:
         InputError: no such file; the message lists the shipped names.
     """
     path = Path(name)
-    if path.suffix in {".yaml", ".yml"}:
-        if path.is_file():
-            return path
-        beside = [other.name for other in path.parent.glob("*.y*ml")]
-        raise InputError(f"{kind} config: no file '{path}'{nearest(path.name, beside)}")
+    if path.suffix in {".yaml", ".yml"} and path.is_file():
+        return path
     if str(name) in config_names(kind):
         return data_directory("configs") / kind / f"{name}.yaml"
+    if path.exists():
+        found = "is a folder; " if path.is_dir() else ""
+        raise InputError(
+            f"{path}: {found}expected a .yaml file, or the name of a {kind} config: {', '.join(config_names(kind))}"
+        )
+    if path.suffix in {".yaml", ".yml"}:
+        raise InputError(f"{kind} config: no file '{path}'{_nearest_file(path)}")
     raise unknown_name(f"{kind} config", str(name), config_names(kind))
+
+
+def _nearest_file(path: Path) -> str:
+    """Return ``nearest`` among the files beside ``path``; their common ending would make any two names close."""
+    hint = nearest(path.stem, [other.stem for other in path.parent.glob(f"*{path.suffix}")])
+    return hint.replace("'?", f"{path.suffix}'?")
+
+
+@contextmanager
+def named_by(file: str | Path, key: str) -> Iterator[None]:
+    """Say of bad input in here which file and key named it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{file}: {key}: {error}") from None
 
 
 def named_in(file: str | Path, name: str | Path) -> Path:

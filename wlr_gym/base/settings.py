@@ -12,7 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.paths import find_config, named_in
+from wlr_gym.base.paths import find_config, named_by, named_in
 from wlr_gym.base.refusals import refusal, refused_option, shown
 
 ModelType = TypeVar("ModelType", bound=BaseModel)
@@ -88,7 +88,8 @@ def layers_of(kind: str, top: Layer, read: Callable[[str, str | Path], Layer] = 
         if not isinstance(base, str | Path):
             raise InputError(f"{where}: base = {base!r}: expected the name or the path of a {kind} config")
         found.append((_without_base(data), where))
-        data, where = read(kind, named_in(where, base))
+        with named_by(where, "base"):
+            data, where = read(kind, named_in(where, base))
     found.append((_without_base(data), where))
     return found[::-1]
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.paths import named_in
+from wlr_gym.base.paths import find_config, named_by, named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, load_table
 from wlr_gym.hardware.limits import SafetyLimits
@@ -230,11 +230,18 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
     if isinstance(source, Hardware):
         return source
     data, where = read_config("hardware", source)
+    if isinstance(data, dict) and "hip_position" in data:
+        raise InputError(
+            f"{where}: a robot file; expected a hardware file (buses, joints, imu); a robot file goes with --robot"
+        )
     data = _with_servo_files(data, where)
     hardware = parse_config(Hardware, data, where)
     if hardware.robot is None:
         return hardware
-    return hardware.model_copy(update={"robot": str(named_in(where, hardware.robot))})
+    robot = named_in(where, hardware.robot)
+    with named_by(where, "robot"):
+        find_config("robot", robot)
+    return hardware.model_copy(update={"robot": str(robot)})
 
 
 def require_leg_range(hardware: Hardware, robot: Robot, where: object) -> None:

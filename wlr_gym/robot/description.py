@@ -299,6 +299,9 @@ def _read(source: str | Path | Mapping[str, Any]) -> Robot:
     """Read a robot's file or content, laid over its bases. The name is its own: another robot has another one."""
     top = (dict(source), "robot") if isinstance(source, Mapping) else read_config("robot", source)
     layers = layers_of("robot", top)
+    for content, where in layers:
+        if isinstance(content, Mapping) and "buses" in content:
+            raise InputError(f"{where}: a hardware file; expected a robot file; a hardware file goes with --hardware")
     data, where = layers[0]
     robot = parse_config(Robot, data, where)  # what is wrong in a base is said with its own name
     for changes, where in layers[1:]:

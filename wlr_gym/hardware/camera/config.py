@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from wlr_gym.base.paths import named_in
+from wlr_gym.base.paths import named_by, named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config, require_keys
 from wlr_gym.perception.markers.camera import Camera, load_camera
 from wlr_gym.perception.markers.targets import Target, load_target
@@ -90,8 +90,12 @@ def load_camera_file(source: str | Path | CameraFile) -> CameraFile:
 
 def _named_files(data: dict[Any, Any], where: str) -> dict[str, Any]:
     """Return the contents of the files that a camera file names."""
-    found: dict[str, Any] = {key: load_target(named_in(where, data.get(key, key))) for key in ("body", "floor")
-                             if not isinstance(data.get(key), dict)}  # fmt: skip
+    found: dict[str, Any] = {}
+    for key in ("body", "floor"):
+        if not isinstance(data.get(key), dict):
+            with named_by(where, key):
+                found[key] = load_target(named_in(where, data.get(key, key)))
     if isinstance(calibration := data.get("calibration"), str):
-        found["calibration"] = load_camera(named_in(where, calibration))
+        with named_by(where, "calibration"):
+            found["calibration"] = load_camera(named_in(where, calibration))
     return found
