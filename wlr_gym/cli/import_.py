@@ -56,7 +56,7 @@ def run(options: ImportOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.data.logs import import_log, read_map
-    from wlr_gym.data.logs.importing import MAP_FILE, is_own
+    from wlr_gym.data.logs.importing import MAP_FILE, require_own
 
     _check(options)
     console = Console(soft_wrap=True, highlight=False)
@@ -71,8 +71,7 @@ def run(options: ImportOptions) -> int:
     assert options.out is not None
     if given is None and not (options.out / MAP_FILE).is_file():
         for log in options.log:
-            if not is_own(log):
-                raise InputError(f"{log}: another program's log: give --map, or --suggest to have one proposed")
+            require_own(log)
     runs: list[ImportedRun] = []
     for log in options.log:
         with _reading(console, log) as tell:

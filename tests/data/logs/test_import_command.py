@@ -98,6 +98,25 @@ def test_our_own_runs_come_back_whole(bag, tmp_path, capsys):
     assert not (tmp_path / "back").exists()
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_what_no_map_helps_is_said_at_once(bag, tmp_path, capsys, suffix):
+    run = write_run(tmp_path / f"run_01{suffix}", rows_of(made_up(1.0)))
+    (tmp_path / "cut.parquet").write_bytes(b"PAR1" + bytes(3000))
+    (tmp_path / "cut.mcap").write_bytes(bag.read_bytes()[:3000])
+    for name in ("empty.csv", "empty.mcap"):
+        (tmp_path / name).touch()
+    for name, words in {
+        run.name: "is a measured run already",
+        "cut.parquet": "cannot be read as parquet",
+        "cut.mcap": "cut off or broken near byte",
+        "empty.csv": "empty file",
+        "empty.mcap": "empty file",
+    }.items():
+        assert main(["import", str(tmp_path / name), "--out", str(tmp_path / "out")]) == BAD_INPUT
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_is_missing_is_said_with_its_cost(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     messages = [one for one in lab_messages(made_up(6.0)) if one[1] not in ("/mocap/base", "/power")]

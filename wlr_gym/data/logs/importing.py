@@ -20,7 +20,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_table
-from wlr_gym.data.format import RunMeta
+from wlr_gym.data.format import COLUMNS, REQUIRED, RunMeta
 from wlr_gym.data.logs.exported import read_exported
 from wlr_gym.data.logs.map import NO_PROFILE, LogMap, Resolved, map_text, read_map, resolve
 from wlr_gym.data.logs.messages import RUN
@@ -28,6 +28,7 @@ from wlr_gym.data.logs.open import first_messages, quiet, read_logs, read_record
 from wlr_gym.data.logs.parts import runs_of, write_samples
 from wlr_gym.data.logs.rows import ChannelFact, MadeRun, wanted_fields
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
+from wlr_gym.data.logs.tables import TABLE
 from wlr_gym.data.logs.topic_store import TopicStore
 from wlr_gym.data.logs.topics import Log, Share
 from wlr_gym.data.logs.units import CURRENTS, check_effort, is_effort
@@ -187,6 +188,16 @@ def _robot_of(meta: RunMeta, robot: str | None) -> Robot:
 def is_own(log: Path) -> bool:
     """Whether a log holds a run that this library wrote."""
     return any(message.topic == RUN for message in itertools.islice(first_messages(log), 20))
+
+
+def require_own(log: Path) -> None:
+    """Raise :class:`InputError` for what cannot be imported without a map: as unreadable, as a measured run, or as foreign."""
+    if is_own(log):
+        return
+    table = next(read_logs(log, most=MOST)).topics.get(TABLE)
+    if table is not None and {*REQUIRED} <= {*table.known, "t"} <= {*COLUMNS}:
+        raise InputError(f"{log}: is a measured run already: every command that takes runs reads it as it is")
+    raise InputError(f"{log}: another program's log: give --map, or --suggest to have one proposed")
 
 
 def _import_own(log: Path, out: Path, suffix: str, tell: Share) -> ImportedRun:

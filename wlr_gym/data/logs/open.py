@@ -50,10 +50,7 @@ def read_recordings(
         InputError: no such file, or one that cannot be read.
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
-    if path.is_file() and path.stat().st_size == 0:
-        raise InputError(f"{path}: empty file")
+    _require_content(path)
     columns = None if wanted is None else wanted.get(TABLE, ())
     if (path / INFO).is_file():
         yield from read_lerobot(path, columns, tell)
@@ -61,6 +58,13 @@ def read_recordings(
         yield read_table(path, columns, most, tell)
     else:
         yield _gathered(path, _reader(path), wanted, most, tell)
+
+
+def _require_content(path: Path) -> None:
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
+    if path.is_file() and path.stat().st_size == 0:
+        raise InputError(f"{path}: empty file")
 
 
 def _is_table(path: Path) -> bool:
@@ -122,8 +126,7 @@ def first_messages(path: str | Path) -> Iterator[Message]:
         InputError: no such file, or one that cannot be read.
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
+    _require_content(path)
     if _is_table(path) or (path / INFO).is_file():
         return iter(())
     return _reader(path)(path, lambda topic: True, [], quiet)
