@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import output_folder, replace_file
 
 
 def write(path: Path) -> None:
@@ -42,3 +42,21 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
         replace_file(path, fail)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def _fail(folder, error, written=""):
+    with output_folder(folder):
+        if written:
+            (folder / written).touch()
+        raise error
+
+
+@pytest.mark.parametrize("error", [InputError, KeyboardInterrupt])
+def test_work_that_fails_leaves_no_empty_folder(tmp_path, error):
+    for written in ("", "kept.txt"):
+        with pytest.raises(error):
+            _fail(tmp_path / "new" / "out", error, written)
+        assert (tmp_path / "new").exists() == bool(written)
+    with pytest.raises(error):
+        _fail(tmp_path, error)
+    assert tmp_path.exists()

@@ -48,6 +48,16 @@ def test_strict_fails_when_plants_disagree(tmp_path, monkeypatch):
     assert main([*arguments, "--out", str(tmp_path / "c"), "--strict"]) == 1
 
 
+def test_an_interrupt_leaves_no_empty_folder(tmp_path, monkeypatch):
+    def interrupt(*given, **named):
+        assert (tmp_path / "out").is_dir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wlr_gym.data.comparison.compare", interrupt)
+    assert main(["compare", "--out", str(tmp_path / "out"), "--excitation", "turns"]) == 130
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -57,6 +67,7 @@ def test_strict_fails_when_plants_disagree(tmp_path, monkeypatch):
         (["--runs", "nowhere"], "no such file or folder"),
         (["--seconds", "0"], "--seconds 0"),
         (["--threshold", "-1"], "--threshold -1"),
+        (["--threads", "0"], "--threads 0: expected 1 or more"),
         (["--seed", "-1"], "--seed -1: expected 0 to"),
         (["--effects", "nothing_like_it"], "nothing_like_it"),
         (["--physics-step", "0.0007"], "does not divide"),

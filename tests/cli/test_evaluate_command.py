@@ -119,3 +119,15 @@ def test_no_sensors_and_some_are_refused_before_anything_is_written(more, tmp_pa
     assert main([*words, *more]) == 2
     assert "--sensors none camera: expected none alone, or camera, flow or both" in capsys.readouterr().err
     assert not (tmp_path / "card").exists()
+
+
+@pytest.mark.parametrize("more", [(), ("--accept",)], ids=["card", "acceptance"])
+def test_an_interrupt_leaves_no_empty_folder(more, tmp_path, monkeypatch):
+    def interrupt(*given, **named):
+        assert (tmp_path / "out").is_dir()
+        raise KeyboardInterrupt
+
+    for name in ("evaluate", "accept"):
+        monkeypatch.setattr(f"wlr_gym.cli.evaluate.{name}", interrupt)
+    assert main(["evaluate", "pid", *more, "--out", str(tmp_path / "out")]) == 130
+    assert not (tmp_path / "out").exists()

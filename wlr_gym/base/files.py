@@ -7,7 +7,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,27 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
         raise InputError(f"{option} {path}: cannot be a folder: {error.strerror}") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{option} {path}: cannot be written to")
+
+
+@contextmanager
+def output_folder(path: Path | None) -> Iterator[None]:
+    """Make the folder of ``--out``, None = there is none; work that fails or is interrupted in here leaves no empty one.
+
+    Raises:
+        InputError: see :func:`make_output_folder`.
+    """
+    if path is None:
+        yield
+        return
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    make_output_folder(path)
+    try:
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # not empty
+                folder.rmdir()
+        raise
 
 
 def refuse_existing(path: Path, force: bool, option: str = "--out") -> None:

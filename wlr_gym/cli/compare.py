@@ -76,24 +76,26 @@ def run(options: CompareOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, refuse_existing, write_json, write_text
+    from wlr_gym.base.files import output_folder, refuse_existing, write_json, write_text
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.data.compared_plants import parse_plant
     from wlr_gym.data.comparison_report import markdown, summary_table
 
+    if options.threads < 1:
+        raise InputError(f"--threads {options.threads}: expected 1 or more")
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if not options.threshold > 0.0:
         raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")
     motions, robot = _motions(options)
     patches = _patches(options, motions, robot)
     refuse_existing(options.out / "compare.json", options.force)
-    make_output_folder(options.out)
     console, comparisons = Console(), []
-    for comparison in _compare_all(options, motions, (first, second), robot, patches, console):
-        comparisons.append(comparison)
-        if len(patches) == 1 and not options.json:
-            _print_all(console, comparison)
+    with output_folder(options.out):
+        for comparison in _compare_all(options, motions, (first, second), robot, patches, console):
+            comparisons.append(comparison)
+            if len(patches) == 1 and not options.json:
+                _print_all(console, comparison)
     found = [comparison.as_dict() for comparison in comparisons]
     if options.json:
         print_json(found)

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.files import output_folder, refuse_existing
 from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
@@ -127,8 +127,8 @@ def run(options: EvaluateOptions) -> int:
     patch = options.patch()
     if options.out is not None:
         refuse_existing(options.out / "card.json", options.force)
-        make_output_folder(options.out)
-    card, samples = _play(options, patch)
+    with output_folder(options.out):
+        card, samples = _play(options, patch)
     if options.json:
         print_json(content(card))
     else:
@@ -163,8 +163,7 @@ def _accept(options: EvaluateOptions) -> int:
         raise InputError(f"--accept: {given[0]} is of the card; leave it out")
     if options.out is not None:
         refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
-        make_output_folder(options.out)
-    with _progress(options.progress) as tell:
+    with output_folder(options.out), _progress(options.progress) as tell:
         result = accept(
             options.policy[0],
             options.env,

@@ -64,7 +64,7 @@ def run(options: PaperOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, refuse_existing
+    from wlr_gym.base.files import output_folder, refuse_existing
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.hardware.loop import StoppedError
@@ -77,10 +77,8 @@ def run(options: PaperOptions) -> int:
     _check(options)
     robot = load_robot(options.robot or "nominal")
     refuse_existing(options.out / "report.md", options.force)
-    make_output_folder(options.out)
-    write_tests(options.out / "commands")
     console, records = Console(), {}
-    with progress(console, shown=options.progress) as tell:
+    with output_folder(options.out), progress(console, shown=options.progress) as tell:
         try:
             for done, model in enumerate(options.plant):
                 tell("", f"both tests: {model}", _SHARES["tests"] * done / len(options.plant))
@@ -98,6 +96,7 @@ def run(options: PaperOptions) -> int:
         if options.plots:
             tell("", "figures", _SHARES["decided"])
             report.write_figures(options.out, records, evidence, findings)
+    write_tests(options.out / "commands")
     report.write_report(options.out, robot, records, claims, findings, decisive)
     record_provenance(options.out, settings_of(options) | {"robot": robot.name}, options.seed)
     if options.json:

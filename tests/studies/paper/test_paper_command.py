@@ -43,6 +43,16 @@ def test_a_robot_is_asked_for_and_guarded(tmp_path, monkeypatch):
     assert not made
 
 
+def test_an_interrupt_leaves_no_folder(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wlr_gym.studies.paper.experiments.drive_both", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_command("paper", ["--out", str(tmp_path / "out"), "--plant", "gibbs_appell", "--draws", "0"])
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_robot_that_had_to_stop_ends_the_command(tmp_path, monkeypatch, capsys):
     def stop(*_):
         raise StoppedError("a leg is too hot")
