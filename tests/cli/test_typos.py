@@ -64,6 +64,10 @@ COMMANDS = {
     "an effect where a patch goes": (["evaluate", "pid", "--effects", "backlash"], "'backlash' is an effect"),
     "a robot": (["robot", "show", "nominall"], "did you mean 'nominal'?"),
     "a motion": (["record", "--excitation", "strait", "--out", "x"], "did you mean 'straight'?"),
+    "a policy file's name": (
+        ["export", "velocity_blind", "--out", "z.txt"],
+        "--out z.txt: expected a file name that ends in .onnx",
+    ),
     "a shell": (["--completion", "bsh"], "expected one of bash, zsh, fish"),
 }
 

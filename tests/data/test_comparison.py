@@ -216,7 +216,7 @@ def test_plants_by_name():
     ("text", "words"),
     [
         ("gibs_appell", "did you mean 'gibbs_appell'"),
-        ("dynamixel", "unknown simulator 'dynamixel'.*valid: gibbs_appell, mujoco"),
+        ("dynamixel", "unknown backend 'dynamixel'.*valid: gibbs_appell, mujoco"),
         ("gibbs_appell:step=0.1", "unknown option 'step'"),
         ("gibbs_appell:physics_step=fast", "physics_step = 'fast'"),
         ("gibbs_appell:physics_step=0.0007", "does not divide"),

@@ -110,8 +110,8 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
     ("options", "words"),
     [
         (["--rig", "pendulm"], "unknown rig 'pendulm' (did you mean 'pendulum'?)"),
-        (["--backend", "mujocco"], "--backend: unknown simulator 'mujocco' (did you mean 'mujoco'?)"),
-        (["--backend", "dynamixel"], "unknown simulator 'dynamixel'; valid: gibbs_appell, mujoco"),
+        (["--backend", "mujocco"], "--backend: unknown backend 'mujocco' (did you mean 'mujoco'?)"),
+        (["--backend", "dynamixel"], "unknown backend 'dynamixel'; valid: gibbs_appell, mujoco"),
         (["--rig", "pendulum", "--backend", "mujoco"], "the rig has a simulator of its own: leave --backend and"),
         (["--rig", "pendulum", "--robot", "paper"], "the rig has a simulator of its own: leave --backend and"),
         (["--robot", "papr"], "unknown robot config 'papr' (did you mean 'paper'?)"),
@@ -135,6 +135,13 @@ def test_bad_input_is_named_and_leaves_no_folder(data, tmp_path, answer, monkeyp
     assert main(["gap", str(data), "--out", str(out), *options]) == 2
     assert words in " ".join(capsys.readouterr().err.split())
     assert not out.exists()
+
+
+def test_a_run_to_hold_out_is_looked_for_at_once(data, tmp_path, capsys):
+    for name in ("run_01.csv", "run_02.parquet"):
+        (data / name).touch()
+    assert main(["gap", str(data), "--out", str(tmp_path / "out"), "--heldout", "run_02", "run_99"]) == 2
+    assert "--heldout: unknown run 'run_99' (did you mean" in capsys.readouterr().err
 
 
 def test_data_that_are_not_there(tmp_path, answer, capsys):

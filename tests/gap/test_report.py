@@ -588,6 +588,8 @@ def test_folders_that_cannot_be_are_refused(tmp_path):
     for place in (tmp_path / "file", tmp_path / "file" / "deeper"):
         with pytest.raises(InputError, match="file is a file; expected a folder"):
             check_folder(place)
+    with pytest.raises(InputError, match="--out /proc/x: cannot be written to"):
+        check_folder(Path("/proc/x"))
     check_folder(tmp_path / "new" / "deep")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 

@@ -90,6 +90,8 @@ def _do(options: ExportOptions) -> Any:
 def _target(options: ExportOptions) -> Path:
     """Return the file to write, whose folder is made."""
     out = options.out or Path("policy.onnx")
+    if out.suffix != ".onnx":
+        raise InputError(f"--out {out}: expected a file name that ends in .onnx")
     refuse_existing(out, options.force)
     make_output_folder(out.parent)
     return out

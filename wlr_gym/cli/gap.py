@@ -127,6 +127,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 
 def _check(options: GapOptions) -> None:
+    from wlr_gym.data.read import run_files
     from wlr_gym.gap.opened import OWN_RIG, RIGS
     from wlr_gym.gap.rig.own import load_rig
     from wlr_gym.physics.plants import SIMULATORS
@@ -136,7 +137,7 @@ def _check(options: GapOptions) -> None:
         what = "is a file" if options.data.exists() else "no such folder"
         raise InputError(f"{options.data}: {what}; expected a folder of runs")
     if options.backend not in SIMULATORS:
-        raise unknown_name("simulator", options.backend, SIMULATORS, "--backend")
+        raise unknown_name("backend", options.backend, SIMULATORS, "--backend")
     if options.rig is not None and options.rig not in RIGS and not options.rig.endswith(OWN_RIG):
         raise unknown_name("rig", options.rig, RIGS)
     if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):
@@ -153,6 +154,10 @@ def _check(options: GapOptions) -> None:
     given = [one.name for one in fields(DecideOptions) if getattr(options, one.name) != one.default]
     if given and not options.until_decided:
         raise InputError(f"--{given[0].replace('_', '-')}: it is for --until-decided")
+    runs = [path.stem for path in run_files(options.data)] if options.rig is None else []
+    for name in options.heldout:
+        if runs and name not in runs:
+            raise unknown_name("run", name, runs, "--heldout")
     if options.threads is not None and options.threads < 1:
         raise InputError(f"--threads {options.threads}: expected 1 or more")
 

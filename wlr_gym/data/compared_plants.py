@@ -58,11 +58,11 @@ def parse_plant(text: str, physics_step: float = 0.001) -> ComparedPlant:
     """Read ``BACKEND`` or ``BACKEND:option=value,...`` with the options ``physics_step`` (s) and ``precision``.
 
     Raises:
-        InputError: unknown simulator or option, a step that does not divide the control period, an unknown precision.
+        InputError: unknown backend or option, a step that does not divide the control period, an unknown precision.
     """
     backend, _, options = text.partition(":")
     if backend not in SIMULATORS:  # a real robot has no truth to compare, and none of the guards of wlr record here
-        raise unknown_name("simulator", backend, SIMULATORS, f"plant '{text}'")
+        raise unknown_name("backend", backend, SIMULATORS, f"plant '{text}'")
     plant = ComparedPlant(backend, physics_step)
     for option in filter(None, options.split(",")):
         name, _, value = option.partition("=")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file, write_text
@@ -30,8 +30,11 @@ def check_folder(folder: Path) -> None:
     nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not nearest.is_dir():
         raise InputError(f"--out {folder}: {nearest} is a file; expected a folder")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"--out {folder}: cannot be written to")
+    try:
+        with TemporaryDirectory(dir=nearest):  # rights alone do not tell: /proc has them
+            pass
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be written to: {error.strerror}") from None
 
 
 def _require_own(folder: Path) -> None:

@@ -94,7 +94,7 @@ def adapt(
     own = load_robot(robot if robot is not None else policy_environment(policy).get("robot") or "nominal")
     patch = load_patch(effects)
     if backend not in SIMULATORS:
-        raise unknown_name("simulator", backend, SIMULATORS, "--backend")
+        raise unknown_name("backend", backend, SIMULATORS, "--backend")
     if robot_runs is not None and patch:
         raise InputError("--effects: measured runs have what their robot has; they are for --emulated")
     if driven is None and robot_runs is None:
