@@ -224,7 +224,8 @@ def test_an_emulated_robot_may_hide_something(tmp_path):
 
 def words(folder, *more):
     seconds = [] if "--seconds" in more else ["--seconds", "1"]
-    return ["pid", "--emulated", "--stepped", *seconds, "--out", str(folder), *more]
+    out = [] if "--out" in more else ["--out", str(folder)]
+    return ["pid", "--emulated", "--stepped", *seconds, *out, *more]
 
 
 def test_command_line_in_emulated_time(tmp_path, capsys):
@@ -235,6 +236,16 @@ def test_command_line_in_emulated_time(tmp_path, capsys):
     assert "track_linear_velocity" in said
     log = read_policy_log(tmp_path / "run_01.csv")
     assert (log["command_linear_velocity_x"] == 0.05).all()
+
+
+def test_the_results_say_which_steps_they_count_and_their_units(tmp_path, capsys):
+    assert run_command("deploy", words(tmp_path, "--json")) == OK
+    found = json.loads(capsys.readouterr().out)
+    assert found["steps"] == 50
+    assert found["steps_with_ramp"] > 50
+    assert found["statistics"]["missed"] == 0
+    assert set(found["statistics"]["read_ms"]) == {"p50", "p95", "p99", "max"}
+    assert "ticks" not in json.dumps(found)
 
 
 def test_the_live_status_shows_what_supervision_sees(tmp_path):
@@ -298,12 +309,17 @@ def test_command_line_dry_run(tmp_path):
         (["--command", "yaw_rate=fast"], "expected name=number"),
         (["--command", "yaw=1"], "unknown command 'yaw'"),
         (["--port", "legs=/dev/x"], "brings its own ports"),
-        (["--fault", "dorp"], "unknown fault 'dorp'"),
+        (["--fault", "dorp"], r"--fault: unknown fault 'dorp' \(did you mean 'drop'\?\)"),
+        (["--fault", "drop lges"], r"--fault: fault 'drop lges': unknown place 'lges' \(did you mean 'legs'\?\)"),
+        (["--realtime", "200"], "--realtime 200: expected 1 to 99"),
+        (["--out", __file__], "--out .*: .*test_deploy.py is a file; expected a folder"),
+        (["--mcap", __file__], "--mcap .*test_deploy.py: is there already"),
         (["--hardware", "nominl"], "nominal"),
         (["--effects", "tired_batery"], "did you mean 'tired_battery'"),
     ],
 )
-def test_command_line_bad_options(tmp_path, more, message):
+def test_command_line_bad_options(tmp_path, monkeypatch, more, message):
+    monkeypatch.setattr("wlr_gym.cli.deploy.driven_robot", lambda options: None)  # the first that is done after the checks
     with pytest.raises(InputError, match=message):
         run_command("deploy", words(tmp_path, *more))
 

@@ -7,7 +7,6 @@ off the ground the first time; see docs/robot.md.
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,11 +17,11 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
+from wlr_gym.cli.deploy_checks import checked_command
 from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
 from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import port_pairs, read_camera, wait_for_enter
+from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
 if TYPE_CHECKING:
     from wlr_gym.data.logs.stream import McapStream
@@ -61,7 +60,7 @@ class DeployOptions(JsonOption, PatchOption):
     stepped: bool = False
     """With --emulated: in emulated time, without ports: faster, and the same bits each time."""
     camera: str | None = None
-    """Camera above the floor: file or name in configs/camera/; over an emulated robot (emulated) its frames are rendered."""
+    """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
     dry_run: bool = False
     """Do everything but write to the servos: nothing moves."""
     fault: tuple[str, ...] = ()
@@ -100,7 +99,7 @@ def run(options: DeployOptions) -> int:
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import environment_for
 
-    command = _check(options)
+    command = checked_command(options)
     environment = environment_of(options.env, options.policy)
     robot = driven_robot(options)
     policy = _make_policy(options, environment, robot, command)
@@ -129,8 +128,7 @@ def run(options: DeployOptions) -> int:
         stack.enter_context(_serving(loop, core, [keys, *pads], options.status and console.is_terminal, console))
         result = deploy(core, policy, options.seed, command, pads[0].command if pads else None)
     if options.json:
-        found = {name: getattr(result, name) for name in ("reason", "well", "ticks", "run", "statistics")}
-        print_json(found | {"limited": dict(loop.interventions)})
+        print_json(_results(result, loop))
     else:
         _report(result, loop, console)
     if stream is not None:
@@ -139,32 +137,17 @@ def run(options: DeployOptions) -> int:
     return OK if result.well else FAILED
 
 
-def _check(options: DeployOptions) -> dict[str, float]:
-    """Return the held command, from options that make sense."""
-    from wlr_gym.hardware.limits import require_deadman
+def _results(result: Deployment, loop: ControlLoop) -> dict[str, Any]:
+    """Return what ``--json`` prints; ``statistics`` count the steps of the ramp to the start pose too."""
+    found = {name: getattr(result, name) for name in ("reason", "well", "run")}
+    statistics = {f"{name}_ms" if _is_time(value) else name: value for name, value in result.statistics.items()}
+    steps = {"steps": result.ticks, "steps_with_ramp": statistics.pop("ticks")}
+    return found | steps | {"statistics": statistics, "limited": dict(loop.interventions)}
 
-    if not 0.0 < options.seconds < float("inf"):
-        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
-    if options.deadman is not None:
-        require_deadman("--deadman", options.deadman)
-    if not options.emulated and (options.stepped or options.fault):
-        raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
-    if options.stepped and options.realtime is not None:
-        raise InputError("--realtime: emulated time is not real time; leave out --stepped")
-    if options.effects and not options.emulated:
-        raise InputError("--effects: a real robot has its own; add --emulated")
-    read_camera(options.camera, options.emulated)
-    options.patch()  # a bad one is refused before a robot is started for it
-    if options.emulated and options.port:
-        raise InputError("--port: the emulated robot brings its own ports")
-    commands = pairs("--command", options.command, "yaw_rate=0.1")
-    try:
-        numbers = {name: float(text) for name, text in commands.items()}
-    except ValueError:
-        numbers = {"": float("nan")}
-    if not all(map(math.isfinite, numbers.values())):
-        raise InputError(f"--command {' '.join(options.command)}: expected name=number")
-    return numbers
+
+def _is_time(value: object) -> bool:
+    """Whether a statistic is of a time, in percentiles."""
+    return isinstance(value, Mapping) and "p50" in value
 
 
 def busy_note(options: DeployOptions, reason: str) -> str:
@@ -384,13 +367,13 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     colour = "green" if result.well else "red"
     console.print(Text.assemble(("ended: ", "bold"), (result.reason, colour)))
     statistics = result.statistics
-    times = {name: values for name, values in statistics.items() if isinstance(values, dict) and "p50" in values}
+    times = {name: values for name, values in statistics.items() if _is_time(values)}
+    steps = f"{result.ticks} steps, {statistics['ticks']} with the ramp"
     if any(values["max"] for name, values in times.items() if name not in ("period", "slack")):
         rows = [(name, *(f"{value:.2f}" for value in values.values())) for name, values in times.items()]
-        title = f"{statistics['ticks']} steps, {statistics['missed']} missed; ms"
-        print_table(console, ("", "p50", "p95", "p99", "max"), rows, title)
+        print_table(console, ("", "p50", "p95", "p99", "max"), rows, f"{steps}, {statistics['missed']} missed; ms")
     else:  # in emulated time nothing takes any
-        console.print(f"{statistics['ticks']} steps")
+        console.print(steps)
     limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
     console.print(f"command limiter, steps: {limited}")
     if camera := statistics.get("camera"):

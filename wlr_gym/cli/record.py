@@ -141,14 +141,14 @@ def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robo
             drive = drive_robot(plant, motion)
         _report(motion, drive, console)
         found.append(
-            {"motion": motion.name, "run": drive.run, "reason": drive.reason, "well": drive.well, "ticks": drive.ticks}
+            {"motion": motion.name, "run": drive.run, "reason": drive.reason, "well": drive.well, "steps": drive.ticks}
         )
         if drive.reason or not drive.well:
             code = INTERRUPTED if drive.well else FAILED
             break
     if left := [motion.name for motion in motions[len(found) :]]:
         console.print(f"not driven: {', '.join(left)}", style="red")
-    found += [{"motion": name, "run": None, "reason": "not driven", "well": False, "ticks": 0} for name in left]
+    found += [{"motion": name, "run": None, "reason": "not driven", "well": False, "steps": 0} for name in left]
     _results(options, found)
     return code
 

@@ -24,11 +24,7 @@ def real_time(priority: int) -> Iterator[None]:
     Raises:
         InputError: not on this system, a priority that there is not, or the system refuses it; says how to be granted it.
     """
-    if sys.platform != "linux":
-        raise InputError("real-time scheduling: on Linux only")
-    lowest, highest = os.sched_get_priority_min(os.SCHED_FIFO), os.sched_get_priority_max(os.SCHED_FIFO)
-    if not lowest <= priority <= highest:
-        raise InputError(f"real-time priority {priority}: expected {lowest} to {highest}")
+    require_priority("real-time priority", priority)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except PermissionError as error:
@@ -39,6 +35,15 @@ def real_time(priority: int) -> Iterator[None]:
     finally:
         ctypes.CDLL(None).munlockall()
         os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
+def require_priority(name: str, priority: int) -> None:
+    """Raise :class:`InputError` where this system has no such priority; the message begins with ``name``."""
+    if sys.platform != "linux":
+        raise InputError("real-time scheduling: on Linux only")
+    lowest, highest = os.sched_get_priority_min(os.SCHED_FIFO), os.sched_get_priority_max(os.SCHED_FIFO)
+    if not lowest <= priority <= highest:
+        raise InputError(f"{name} {priority}: expected {lowest} to {highest}")
 
 
 def _lock_memory(priority: int) -> None:
