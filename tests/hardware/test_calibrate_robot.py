@@ -14,7 +14,7 @@ from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import main
 from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
 from wlr_gym.cli.results import only_results
-from wlr_gym.cli.robot_options import RobotOption
+from wlr_gym.cli.robot_options import WiredRobotOption
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
 from wlr_gym.hardware.imu.reading import to_body
@@ -43,7 +43,7 @@ SENSOR = ImuCalibration(
 
 def make_machine(hardware, monkeypatch):
     machine = Machine(ROBOT, hardware, MachineOptions(timing=NO_TIME))
-    monkeypatch.setattr(RobotOption, "link", lambda self, changed=None: emulated_link(machine))
+    monkeypatch.setattr(WiredRobotOption, "link", lambda self, changed=None: emulated_link(machine))
     return machine
 
 
@@ -253,7 +253,7 @@ def sensor(monkeypatch):
         made.imu = memory_imu(made.clock, changed.imu)
         return made
 
-    monkeypatch.setattr(RobotOption, "link", link)
+    monkeypatch.setattr(WiredRobotOption, "link", link)
     return machine
 
 
@@ -330,10 +330,20 @@ def test_joints_that_are_none():
         calibrate_joints(JointsOptions(out=Path("a.yaml"), only=("leg_fl",)), lambda text: "")
 
 
+@pytest.mark.parametrize("what", ["joints", "servo leg_lf", "flow run_01.csv"])
+def test_an_emulated_robot_is_not_offered_where_it_cannot_serve(what, tmp_path, capsys):
+    assert main(["calibrate", *what.split(), "--out", str(tmp_path / "a.yaml"), "--emulated"]) == 2
+    assert "unknown option '--" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["calibrate", what.split()[0], "--help"])
+    assert "--emulated" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("text", "code", "words"), [("s\nn\n", 1, "nothing was written"), ("", 2, "is a dialogue")])
 def test_answers_can_be_piped_and_their_end_ends_it(tmp_path, monkeypatch, capsys, text, code, words):
     monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    assert main(["calibrate", "joints", "--emulated", "--out", str(tmp_path / "a.yaml"), "--only", "leg_lf"]) == code
+    make_machine(load_hardware(), monkeypatch)
+    assert main(["calibrate", "joints", "--out", str(tmp_path / "a.yaml"), "--only", "leg_lf"]) == code
     said = capsys.readouterr()
     assert words in said.out + said.err
     assert list(tmp_path.iterdir()) == []
@@ -402,7 +412,5 @@ def test_servos_that_cannot_be_set_up(bench):
         set_up_servo(ServoOptions(joint="wheel_lf", port=ports), lambda text: "y")
     assert set_up_servo(ServoOptions(joint="wheel_lf", port=ports), lambda text: "n") == 1
     assert machine.servos["wheel_lf"]["id"] == 1
-    with pytest.raises(InputError, match="name those of wlr emulate --factory"):
-        set_up_servo(ServoOptions(joint="wheel_lf", emulated=True), lambda text: "y")
     with pytest.raises(InputError, match="no_such_port: cannot be opened"):
         set_up_servo(ServoOptions(joint="wheel_lf", port=("wheels=/dev/no_such_port",)), lambda text: "y")

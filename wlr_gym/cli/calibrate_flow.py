@@ -13,17 +13,19 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.calibrate_robot import save_calibration, source_of, today
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import RobotOption, ask_terminal
+from wlr_gym.cli.robot_options import ask_terminal
 
 
 @dataclass(frozen=True)
-class FlowOptions(JsonOption, RobotOption):
+class FlowOptions(JsonOption):
     """Find scale and mounting of the optical-flow sensor from a straight run on a floor that grips, driven or pushed.
 
     Record it with: wlr record --excitation straight
 
     Attributes:
         run: the run.
+        hardware: hardware file (wiring, mounting, safety limits), or name in configs/hardware/.
+        robot: robot file, or name in configs/robot/; default: the one that the hardware file names.
         out: hardware file to write; may be the one of --hardware.
         distance: way straight ahead by a tape measure, m (negative: back); default: what the wheels rolled.
         yes: do not ask before the file is written.
@@ -31,6 +33,8 @@ class FlowOptions(JsonOption, RobotOption):
 
     run: Annotated[Path, tyro.conf.Positional]
     out: Path
+    hardware: str = "nominal"
+    robot: str | None = None
     distance: float | None = None
     yes: bool = False
 
@@ -45,8 +49,10 @@ def calibrate_flow(options: FlowOptions) -> int:
     from wlr_gym.hardware.calibration import with_flow_calibration
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.flow.calibration import calibrate_flow as find
+    from wlr_gym.robot import load_robot
 
-    robot, hardware = options.load()[0], load_hardware(options.hardware)
+    hardware = load_hardware(options.hardware)
+    robot = load_robot(options.robot or hardware.robot or "nominal")
     if hardware.flow is None:
         raise InputError(
             f"--hardware {options.hardware}: names no flow sensor; expected a section flow, such as flow: {{port: ...}}"

@@ -17,7 +17,7 @@ from wlr_gym.base.text import tally
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import NobodyThereError, RobotOption, ask_terminal
+from wlr_gym.cli.robot_options import NobodyThereError, RobotOption, WiredRobotOption, ask_terminal
 from wlr_gym.robot import JOINTS, LEGS, full_name
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ _READS = 20
 
 
 @dataclass(frozen=True)
-class JointsOptions(JsonOption, RobotOption):
+class JointsOptions(JsonOption, WiredRobotOption):
     """Find sign and zero of each servo by moving the robot by hand, torque off. Put it on a stand, wheels off the ground.
 
     Attributes:
@@ -70,7 +70,7 @@ class ImuOptions(JsonOption, RobotOption):
 
 
 @dataclass(frozen=True)
-class ServoOptions(JsonOption, RobotOption):
+class ServoOptions(JsonOption, WiredRobotOption):
     """Give a new servo its id, registers and baud rate. Connect it alone, with power, to the adapter of its bus.
 
     Attributes:
@@ -95,8 +95,6 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
 
     if options.joint not in JOINTS:
         raise unknown_name("joint", options.joint, JOINTS)
-    if options.emulated:
-        raise InputError("--emulated: the emulated robot of this process has no ports; name those of wlr emulate --factory")
     robot, hardware = options.load()
     name, bus = next((name, bus) for name, bus in hardware.buses.items() if options.joint in bus.joints)
     id = robot.dynamixel_ids[options.joint]

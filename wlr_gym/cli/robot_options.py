@@ -36,15 +36,14 @@ def noise_seed(folder: Path, seed: int | None) -> int:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HardwareOption:
-    """How the robot is wired, and whether it is a real one."""
+class WiringOption:
+    """How a real robot is wired."""
 
     hardware: str = "nominal"
-    """Wiring and mounting: file or config name."""
+    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
     port: tuple[str, ...] = ()
-    """Another port than the hardware file's, such as legs=/dev/ttyUSB1 or imu=/dev/ttyACM0."""
-    emulated: bool = False
-    """An emulated robot in this process and in emulated time, instead of the ports."""
+    """Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0."""
+    emulated = False  # an option of HardwareOption: some work is done at a real robot only
 
     def load_hardware(self) -> Hardware:
         """Return the hardware, with the ports of ``--port``.
@@ -105,11 +104,19 @@ class HardwareOption:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotOption(HardwareOption):
-    """Which robot, how it is wired, and whether it is a real one."""
+class HardwareOption(WiringOption):
+    """How the robot is wired, and whether it is a real one."""
+
+    emulated: bool = False
+    """An emulated robot in this process and in emulated time, instead of the ports."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WiredRobotOption(WiringOption):
+    """Which real robot, and how it is wired."""
 
     robot: str | None = None
-    """Robot file or config name; default: the one that the hardware file names."""
+    """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
 
     def load(self) -> tuple[Robot, Hardware]:
         """Return the robot and its hardware, with the ports of ``--port``; see :meth:`load_hardware`."""
@@ -136,6 +143,11 @@ class RobotOption(HardwareOption):
         link = self.link_to(robot, changed or hardware)
         link.servos.set_patience(CALM_PATIENCE)
         return link
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotOption(WiredRobotOption, HardwareOption):
+    """Which robot, how it is wired, and whether it is a real one."""
 
 
 @dataclass(frozen=True, kw_only=True)
