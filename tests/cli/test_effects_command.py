@@ -61,6 +61,7 @@ def test_check_prints_what_changes(tmp_path, capsys, monkeypatch):
         (["backlsh"], ["unknown effect 'backlsh'", "did you mean 'backlash'"]),
         (["icy_patch"], ["'icy_patch' is a patch, not an effect: wlr effects check icy_patch"]),
         (["mine.yaml"], ["wlr effects check mine.yaml"]),
+        (["chek", "mine.yaml"], ["unknown word 'chek' (did you mean 'check'?); see: wlr effects --help"]),
         (["check"], ["give the patch files"]),
         (["check", "backlash"], ["'backlash' is an effect, not a patch", "wlr effects backlash"]),
         (["check", "unknown_effect"], ["'unknown_effect' is an effect, not a patch"]),

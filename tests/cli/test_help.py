@@ -84,6 +84,20 @@ def test_every_option_is_described(shown):
             assert re.match(r" {8,}\S", following), line
 
 
+@pytest.mark.parametrize(
+    ("option", "wording"),
+    [
+        ("--hardware STR", "ardware file (wiring, mounting, safety limits), or name in configs/hardware/"),
+        ("--robot STR", "obot file, or name in configs/robot/"),
+        ("--port [STR ...]", "Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0"),
+    ],
+)
+def test_an_option_of_many_commands_has_one_wording(shown, option, wording):
+    text = " ".join(shown.split())
+    if option in text:
+        assert wording in text.rpartition(option)[2][:300]
+
+
 def test_own_options_come_before_shared_ones():
     names = list(parsing.options_of(cli.options_of("evaluate")))
     assert names[0] == "policy"

@@ -141,6 +141,10 @@ def test_what_cannot_be_replayed_is_refused_before_a_page_opens():
         (["view"], "expected runs (CSV or Parquet)"),
         (["view", str(RUN), "--segment", "0"], "--segment 0: expected more than 0 s"),
         (["view", str(RUN), "--backend", "dynamixel"], "a ghost needs a simulator"),
+        (
+            ["view", str(RUN), "--backend", "mujoko"],
+            "unknown backend 'mujoko' (did you mean 'mujoco'?); valid: gibbs_appell, mujoco\n",
+        ),
         (["view", "nowhere.parquet"], "nowhere.parquet"),
         (["view", str(RUN), "--seconds", "-1"], "--seconds -1"),
     ],

@@ -73,7 +73,7 @@ def test_other_ports():
     hardware = with_ports(load_hardware(), {"legs": "/dev/here", "imu": "/dev/there"})
     assert (hardware.buses["legs"].port, hardware.imu.port) == ("/dev/here", "/dev/there")
     assert hardware.buses["wheels"] == load_hardware().buses["wheels"]
-    with pytest.raises(InputError, match="no bus 'leg'"):
+    with pytest.raises(InputError, match=r"no bus 'leg' \(did you mean 'legs'\?\); the buses are legs"):
         with_ports(hardware, {"leg": "x"})
 
 

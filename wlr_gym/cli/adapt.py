@@ -44,20 +44,21 @@ class AdaptOptions(JsonOption, PatchOption, SensorsOption):
     emulated: bool = False
     """An emulated robot, in emulated time; --effects is what it has that its file does not say."""
     hardware: str | None = None
-    """A real robot: hardware file, or name in configs/hardware/. You are asked before every drive."""
+    """A real robot: hardware file (wiring, mounting, safety limits), or name in configs/hardware/. You are asked before every
+    drive."""
     port: tuple[str, ...] = ()
-    """Other ports than the hardware file's: legs=/dev/ttyUSB0."""
+    """Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0."""
     yes: bool = False
     """Do not ask before the robot moves."""
     env: str | None = None
     """Environment id; default: the one that the policy was trained in."""
     robot: str | None = None
-    """Robot file or config name; default: the policy's."""
+    """Robot file, or name in configs/robot/; default: the policy's."""
     backend: str = "gibbs_appell"
     """Simulator behind the emulated robot: gibbs_appell or mujoco."""
     out: Path = Path("out/adapt")
     """Folder for all steps, the page and its numbers."""
-    excitations: tuple[str, ...] = ("straight", "turns", "stop_and_go", "posture")
+    excitation: tuple[str, ...] = ("straight", "turns", "stop_and_go", "posture")
     """First runs, see: wlr record --list."""
     budget_runs: int = 2
     """Most further runs, until it is decided."""
@@ -102,7 +103,7 @@ def run(options: AdaptOptions) -> int:
             backend=options.backend,
             environment=options.env,
             robot=options.robot,
-            excitations=options.excitations,
+            excitations=options.excitation,
             budget_runs=options.budget_runs,
             budget_seconds=options.budget_seconds,
             drives=options.drives,

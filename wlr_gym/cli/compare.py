@@ -50,7 +50,7 @@ class CompareOptions(JsonOption, ForceOption, PatchOption):
     seconds: float | None = None
     """Cut every motion off after this long."""
     robot: str | None = None
-    """Robot file or config name; default: the one the runs' meta.yaml names, else the nominal one."""
+    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     physics_step: float = 0.001
     """Substep of both plants, s."""
     halve: bool = False

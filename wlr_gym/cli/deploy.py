@@ -9,17 +9,15 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.deploy_checks import checked_command
-from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
+from wlr_gym.cli.deploy_options import DeployOptions, checked_command
+from wlr_gym.cli.options import environment_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
@@ -41,50 +39,6 @@ _PAD_DEADMAN = 0.2
 _POSES = "poses"
 #: Steps between two looks of the live status.
 _STATUS_TICKS = 10
-
-
-@dataclass(frozen=True)
-class DeployOptions(JsonOption, PatchOption):
-    policy: tyro.conf.Positional[str]
-    """Policy file or folder, run folder, or name of an agent or shipped policy."""
-    env: str | None = None
-    """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
-    robot: str | None = None
-    """Name in configs/robot/ or path; default: that of the hardware file, or the one that the policy was trained with."""
-    hardware: str = "nominal"
-    """Hardware file, or name in configs/hardware/: ports, mounting, safety limits."""
-    port: tuple[str, ...] = ()
-    """Other ports than the file's: legs=/dev/ttyUSB0 wheels=/dev/ttyUSB1 imu=/dev/ttyACM0."""
-    emulated: bool = False
-    """Drive an emulated robot, which is started for the purpose."""
-    stepped: bool = False
-    """With --emulated: in emulated time, without ports: faster, and the same bits each time."""
-    camera: str | None = None
-    """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
-    dry_run: bool = False
-    """Do everything but write to the servos: nothing moves."""
-    fault: tuple[str, ...] = ()
-    """With --emulated: what goes wrong, as in wlr emulate: "drop legs after=3"."""
-    seconds: float = 10.0
-    """How long to drive."""
-    command: tuple[str, ...] = ()
-    """What to follow: linear_velocity_x=0.1 yaw_rate=0; default: drawn anew every few seconds, as in training."""
-    seed: int = 0
-    """Seed of the drawn commands, and of an emulated robot's noise."""
-    deadman: float | None = None
-    """Stop the wheels when no key was pressed for so many seconds (10 at most); with --gamepad: its dead-man button (0.2)."""
-    gamepad: str | None = None
-    """Steer with a gamepad, such as /dev/input/js0, while its dead-man button is held; buttons: the hardware file's gamepad."""
-    realtime: int | None = None
-    """Run at this real-time priority (1 to 99, SCHED_FIFO) with all memory locked; Linux."""
-    out: Path = Path("robot_runs")
-    """Folder for the logs."""
-    mcap: Path | None = None
-    """Write the run into this new MCAP file, too, while it goes on, for Foxglove and PlotJuggler."""
-    yes: bool = False
-    """Do not ask before the robot moves."""
-    status: bool = True
-    """Show a live status."""
 
 
 def run(options: DeployOptions) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.base.paths import config_names
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
@@ -32,7 +32,7 @@ class EffectsOptions(JsonOption):
     words: tyro.conf.Positional[tuple[str, ...]] = ()
     """Names of effects, or: check FILE ..."""
     robot: str = "nominal"
-    """Robot that check applies the patches to: name in configs/robot/ or path."""
+    """Robot that check applies the patches to: robot file, or name in configs/robot/."""
 
 
 def run(options: EffectsOptions) -> int:
@@ -48,6 +48,8 @@ def run(options: EffectsOptions) -> int:
             raise InputError("wlr effects check: give the patch files to check")
         case ("check", *files):
             _check([load_patch(file) for file in files], load_patch(list(files)), options)
+        case (word, *_) if word not in EFFECTS and (hint := nearest(word, ["check"])):
+            raise InputError(f"unknown word '{word}'{hint}; see: wlr effects --help")
         case names if options.json:
             print_json([_content(_effect(name)) for name in names])
         case names:

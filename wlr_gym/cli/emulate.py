@@ -25,8 +25,8 @@ class EmulateOptions(PatchOption):
 
     Attributes:
         backend: simulator behind the servos.
-        robot: robot file or config name; default: the one that the hardware file names.
-        hardware: wiring and mounting: file or config name.
+        robot: robot file, or name in configs/robot/; default: the one that the hardware file names.
+        hardware: hardware file (wiring, mounting, safety limits), or name in configs/hardware/.
         links: folder for links to the ports with fixed names (one per bus, imu, and flow); made if it is not there.
         control: path of a Unix socket that takes command lines.
         fault: faults to start with, each in quotes.

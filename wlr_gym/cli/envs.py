@@ -29,7 +29,7 @@ class EnvsOptions(JsonOption, ForceOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id to describe; without one all are listed."""
     robot: str | None = None
-    """Robot that the numbers are for: name in configs/robot/ or path; default: the task's."""
+    """Robot that the numbers are for: robot file, or name in configs/robot/; default: the task's."""
     randomization: str | None = None
     """What to draw: name in configs/randomization/, path, or a gap result (.json); default: the task's."""
     picture: Path | None = None

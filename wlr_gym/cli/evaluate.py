@@ -97,7 +97,7 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     randomization: str | None = None
     """Name in configs/randomization/, path, or a gap result (.json); default: the task's."""
     robot: str | None = None
-    """Name in configs/robot/ or path; default: the robot that the policy was trained with, else the task's."""
+    """Robot file, or name in configs/robot/; default: the robot that the policy was trained with, else the task's."""
     threads: int = 1
     """Threads of the simulator; results do not depend on it."""
     accept: bool = False

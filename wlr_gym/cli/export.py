@@ -54,8 +54,8 @@ class ExportOptions(JsonOption, ForceOption):
     reseal: bool = False
     """Instead, rewrite the contracts of policies in the present form, where the robot is the same, and say what changed."""
     robot: str | None = None
-    """Of an archive, and with --reseal: name or path of the robot of the training; default: the task's, or the contract's.
-    Other policies carry their robot."""
+    """Of an archive, and with --reseal: robot of the training: robot file, or name in configs/robot/; default: the task's, or
+    the contract's. Other policies carry their robot."""
 
 
 def run(options: ExportOptions) -> int:

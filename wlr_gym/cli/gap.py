@@ -42,7 +42,7 @@ class GapOptions(DecideOptions, JsonOption, ForceOption, PatchOption):
     """Runs of something else than the robot: pendulum (one servo that swings a weight), or a Python file that describes a
     system of your own (docs/own_rig.md)."""
     robot: str | None = None
-    """Robot file or config name; default: the one meta.yaml names, else the nominal one."""
+    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     backend: str = "gibbs_appell"
     """Simulator of the robot: gibbs_appell or mujoco."""
     heldout: tuple[str, ...] = ()

@@ -42,7 +42,7 @@ class ImportOptions(JsonOption):
     """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those of more than 600 s,
     or of 2 million numbers."""
     robot: str | None = None
-    """Robot file or config name; default: the one that the map's meta names, else the nominal one."""
+    """Robot file, or name in configs/robot/; default: the one that the map's meta names, else the nominal one."""
     format: Literal["parquet", "csv"] = "parquet"
     """Format of the runs."""
 

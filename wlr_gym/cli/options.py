@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 
 if TYPE_CHECKING:
     from wlr_gym.physics.effects import Patch
@@ -63,6 +63,16 @@ class SensorsOption:
         if self.sensors and len(self.sensors) > 1 and "none" in self.sensors:
             raise InputError(f"--sensors {' '.join(self.sensors)}: expected none alone, or camera, flow or both")
         return None if self.sensors is None else tuple(name for name in self.sensors if name != "none")
+
+
+def require_simulator(backend: str, robot: str) -> None:
+    """Raise :class:`InputError` where ``--backend`` is no simulator; ``robot`` says what a real robot is for."""
+    from wlr_gym.physics.plants import REAL, SIMULATORS
+
+    if backend in REAL:
+        raise InputError(f"--backend {backend}: {robot}")
+    if backend not in SIMULATORS:
+        raise unknown_name("backend", backend, SIMULATORS, "--backend")
 
 
 def settings_of(options: Any) -> dict[str, Any]:

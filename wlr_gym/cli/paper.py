@@ -41,7 +41,7 @@ class PaperOptions(JsonOption, ForceOption, HardwareOption):
     yes: bool = False
     """Do not ask before the robot moves."""
     robot: str | None = None
-    """Robot file or config name; default: the nominal one."""
+    """Robot file, or name in configs/robot/; default: the nominal one."""
     draws: int = 8
     """Search for what could explain the paper's slip: draws per combination at first; 0 = no search."""
     levels: int = 2

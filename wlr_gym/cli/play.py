@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, require_simulator
 from wlr_gym.cli.results import print_json
+from wlr_gym.render.camera import CAMERAS
 from wlr_gym.render.display import require_display
-from wlr_gym.render.view import View
+from wlr_gym.render.view import LARGEST, SMALLEST, View, fits
 from wlr_gym.render.web.page import HOST, PORT
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     randomization: str | None = None
     """Name in configs/randomization/ or path; default: the task's."""
     robot: str | None = None
-    """Name in configs/robot/ or path; default: the robot that the policy was trained with, else the task's."""
+    """Robot file, or name in configs/robot/; default: the robot that the policy was trained with, else the task's."""
     seed: int = 0
     """Seed of the first episode."""
     command: str | None = None
@@ -107,18 +108,16 @@ def run(options: PlayOptions) -> int:
 
 
 def _check(options: PlayOptions) -> None:
-    from wlr_gym.physics.plants import REAL
     from wlr_gym.render.video import check_video
 
-    if options.backend in REAL:
-        raise InputError(f"--backend {options.backend}: a real robot is driven with wlr deploy; wlr play takes a simulator")
+    require_simulator(options.backend, "a real robot is driven with wlr deploy; wlr play takes a simulator")
     if options.seconds is not None and not 0 < options.seconds < float("inf"):
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     if not 1 <= options.fps <= 1000:
         raise InputError(f"--fps {options.fps:g}: expected 1 to 1000")
     if options.gamepad and (options.command is not None or options.video is not None):
         raise InputError("--gamepad drives in the window: leave out --command and --video")
-    _view(options)
+    _check_view(options)
     if options.beside is not None and options.video is None:
         raise InputError("--beside: two robots are shown in a video only: add --video")
     if options.json and options.video is None:
@@ -128,6 +127,16 @@ def _check(options: PlayOptions) -> None:
     if options.video is not None:
         check_video(options.video)
         refuse_existing(options.video, options.force, "--video")
+
+
+def _check_view(options: PlayOptions) -> None:
+    if options.camera not in CAMERAS:
+        raise unknown_name("view", options.camera, CAMERAS, "--camera")
+    size = f"--size {options.size[0]} {options.size[1]}"
+    if not all(map(fits, options.size)):
+        raise InputError(f"{size}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
+    if options.video is not None and options.video.suffix.lower() == ".mp4" and any(pixels % 2 for pixels in options.size):
+        raise InputError(f"{size}: expected even numbers: .mp4 has no others")
 
 
 def _view(options: PlayOptions) -> View:

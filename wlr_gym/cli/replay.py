@@ -41,8 +41,8 @@ class ReplayOptions(JsonOption, ForceOption, HardwareOption, PatchOption):
         runs: a run (CSV or Parquet) or a folder of runs.
         out: folder for errors.json, plots and provenance; made if it is not there.
         backend: simulator, or dynamixel for the robot.
-        robot: robot file or config name; default: the one meta.yaml names, else the nominal one; of a real robot the one
-            that its hardware file names.
+        robot: robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one; of a real
+            robot the one that its hardware file names.
         segment: time between the points at which a segment starts anew from the measured state, s.
         plots: write overlay plots.
         video: file (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each,

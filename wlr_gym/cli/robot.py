@@ -32,7 +32,7 @@ class CheckOptions(JsonOption):
     """Look for what is wrong or odd about a robot: units, masses, inertias, and what it cannot do, with numbers.
 
     Attributes:
-        robot: name in configs/robot/ or path.
+        robot: robot file, or name in configs/robot/.
         strict: warnings too give exit code 1.
     """
 
@@ -45,7 +45,7 @@ class ShowOptions(JsonOption, ForceOption):
     """Show what a robot is and what it can do.
 
     Attributes:
-        robot: name in configs/robot/ or path.
+        robot: robot file, or name in configs/robot/.
         picture: picture to write (.png, .jpg, .webp): standing, and with its legs at their limits.
     """
 

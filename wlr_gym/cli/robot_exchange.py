@@ -46,7 +46,7 @@ class RobotExportOptions(JsonOption, ForceOption):
     """Write a robot as MJCF (the MuJoCo plant's own model) or URDF.
 
     Attributes:
-        robot: name in configs/robot/ or path.
+        robot: robot file, or name in configs/robot/.
         out: file to write; .xml or .mjcf: MJCF, .urdf: URDF.
         format: of the file; default: by the end of --out.
     """

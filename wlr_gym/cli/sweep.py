@@ -33,7 +33,7 @@ class SweepOptions(JsonOption):
     init: str | None = None
     """Trained policy that every trial starts from."""
     robot: str | None = None
-    """Robot of all trials: name in configs/robot/ or path; default: that of the settings, else the task's."""
+    """Robot of all trials: robot file, or name in configs/robot/; default: that of the settings, else the task's."""
     set: tuple[str, ...] = ()
     """Settings, as key=value; several values make a grid: --set learning_rate=1e-3,2e-3 total_steps=500_000"""
     search: Path | None = None

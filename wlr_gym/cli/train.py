@@ -36,7 +36,7 @@ class TrainOptions(JsonOption, PatchOption):
     backend: str | None = None
     """Simulator: gibbs_appell or mujoco (with --set environment.precision=float64); default: that of the settings."""
     robot: str | None = None
-    """Name in configs/robot/ or path; default: that of the settings, else the task's. The run folder has it by content."""
+    """Robot file, or name in configs/robot/; default: that of the settings, else the task's. The run folder has its content."""
     seed: int | None = None
     """Seed of everything random; default: that of the settings."""
     out: Path | None = None

@@ -14,7 +14,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.options import PatchOption, require_simulator
 from wlr_gym.render.web.page import HOST, PORT
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class ViewOptions(PatchOption):
     Attributes:
         runs: runs (CSV or Parquet), or folders of runs.
         backend: simulator of the ghost.
-        robot: robot file or config name; default: the one meta.yaml names, else the nominal one.
+        robot: robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one.
         ghost: replay the run, and show that robot, too.
         segment: time between the points at which the ghost starts anew from the measured robot, s; inf = never.
         host: name or address to listen on; localhost = this machine, and ssh to it, only.
@@ -58,12 +58,9 @@ def run(options: ViewOptions) -> int:
     import time
 
     from wlr_gym.data.watch import open_recordings
-    from wlr_gym.physics.plants import REAL, check_backend
     from wlr_gym.render.web.player import Player
 
-    check_backend(options.backend)
-    if options.backend in REAL:
-        raise InputError(f"--backend {options.backend}: a ghost needs a simulator; a real robot repeats a run with wlr replay")
+    require_simulator(options.backend, "a ghost needs a simulator; a real robot repeats a run with wlr replay")
     if not options.segment > 0.0:
         raise InputError(f"--segment {options.segment:g}: expected more than 0 s")
     if options.seconds is not None and not options.seconds > 0.0:

@@ -44,7 +44,7 @@ class VisionOptions(JsonOption, ForceOption):
         camera: calibration file; make one with: wlr calibrate camera.
         markers: markers on the robot: name in configs/vision/ or path.
         floor: markers on the floor: name in configs/vision/ or path.
-        robot: robot file or config name; default: the one meta.yaml names, else the nominal one.
+        robot: robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one.
         offset: servo time minus camera time, s; default: found from the motion.
         around: where the offset is looked for: servo time minus camera time to within 1 s, s.
         origin: frame of cam_*: start (0, 0, 0 at the start, as in simulated runs) or floor.

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.base.paths import find_config, named_by, named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, load_table
@@ -275,7 +275,8 @@ def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
         InputError: a name that is no bus.
     """
     if unknown := set(ports) - {*hardware.port_names}:
-        raise InputError(f"no bus '{sorted(unknown)[0]}'; the buses are {', '.join(hardware.port_names)}")
+        name = sorted(unknown)[0]
+        raise InputError(f"no bus '{name}'{nearest(name, hardware.port_names)}; the buses are {', '.join(hardware.port_names)}")
     buses = {name: bus.model_copy(update={"port": ports.get(name, bus.port)}) for name, bus in hardware.buses.items()}
     imu = hardware.imu.model_copy(update={"port": ports.get("imu", hardware.imu.port)})
     flow = None if hardware.flow is None else hardware.flow.model_copy(update={"port": ports.get("flow", hardware.flow.port)})

@@ -42,7 +42,7 @@ class View:
         if self.camera not in CAMERAS:
             raise unknown_name("camera", str(self.camera), CAMERAS, "view")
         size = self.size
-        if not (isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and _fits(int(n)) for n in size)):
+        if not (isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and fits(int(n)) for n in size)):
             raise InputError(f"view: size = {size!r}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
         object.__setattr__(self, "size", (int(size[0]), int(size[1])))
         for name in ("friction", "slip", "forces", "path", "text"):
@@ -50,7 +50,8 @@ class View:
                 raise InputError(f"view: {name} = {getattr(self, name)!r}: expected True or False")
 
 
-def _fits(pixels: int) -> bool:
+def fits(pixels: int) -> bool:
+    """Whether a picture may be so wide or high."""
     return SMALLEST <= pixels <= LARGEST
 
 

@@ -127,7 +127,7 @@ def test_the_whole_loop_at_a_tiny_size(tmp_path, capsys):
     path = tmp_path / "hidden.yaml"
     path.write_text("effects: [{name: joint_zero_offset, where: [leg_rr], parameters: {angle: -0.08}}]")
     words = [POLICY, "--emulated", "--effects", str(path), "--out", str(tmp_path / "out"), "--drives", "2", "--drive-seconds"]
-    words += ["1", "--excitations", "straight", "turns", "posture", "--budget-runs", "0", "--steps", "16384", "--episodes", "8"]
+    words += ["1", "--excitation", "straight", "turns", "posture", "--budget-runs", "0", "--steps", "16384", "--episodes", "8"]
     assert run_command("adapt", [*words, "--json"]) == OK
     first = json.loads(capsys.readouterr().out)
     assert [one["outcome"] for one in first["steps"].values()].count("done") >= 6

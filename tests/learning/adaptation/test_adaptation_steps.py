@@ -363,7 +363,7 @@ def test_a_folder_of_another_command_is_refused(tmp_path):
         (("--emulated", "--drives", "0"), "drives"),
         (("--emulated", "--sensors", "camera"), "driven without a camera"),
         (("--emulated", "--backend", "mujco"), "did you mean 'mujoco'"),
-        (("--emulated", "--excitations", "strait"), "did you mean 'straight'"),
+        (("--emulated", "--excitation", "strait"), "did you mean 'straight'"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_made(tmp_path, capsys, words, said):

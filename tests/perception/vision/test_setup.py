@@ -118,6 +118,8 @@ def test_camera_file_round_trip_and_faults(tmp_path):
         load_camera(path)
     with pytest.raises(InputError, match="no such camera file; make one with"):
         load_camera(tmp_path / "none.yaml")
+    with pytest.raises(InputError, match=r"emulated: no such camera file; make one with: .* --out camera\.yaml"):
+        load_camera("emulated")
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,8 @@ def load_camera(path: str | Path) -> Camera:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such camera file; make one with: wlr calibrate camera IMAGES --out {path}")
+        new = path if path.suffix in {".yaml", ".yml"} else "camera.yaml"
+        raise InputError(f"{path}: no such camera file; make one with: wlr calibrate camera IMAGES --out {new}")
     camera = parse_config(Camera, read_yaml(path), str(path))
     if min(camera.focal) < _SHORTEST_FOCAL * max(camera.width, camera.height):
         raise InputError(f"{path}: focal = {list(camera.focal)}: expected pixels; these look like millimetres")
