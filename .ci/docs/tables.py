@@ -133,6 +133,18 @@ def result_table(task: str) -> list[str]:
     return _table(learning.HEADER, learning.table(task))
 
 
+def simulator_table() -> list[str]:
+    """Return the shipped policies' tracking errors on both simulators: what ``wlr evaluate --backend both --json`` printed."""
+    rows = []
+    for card in json.loads((DATA / "both_simulators.json").read_text(encoding="utf-8")):
+        said, sensors = card["conditions"], card["conditions"]["sensors that not every robot has"]
+        for policy in card["policies"]:
+            scores = [found["policies"][policy]["tracking_error"] for found in (card, card["other_plant"])]
+            errors = [f"{one['mean']:.3f} [{one['low']:.3f}, {one['high']:.3f}]" for one in scores]
+            rows.append((said["environment"], f"`{policy}`", "neither" if sensors == "none" else sensors, *errors))
+    return _table(("task", "policy", "robot has", "tracking error, engine", "on MuJoCo"), rows)
+
+
 def ablation_table() -> list[str]:
     """Return what each part of Velocity's recipe is worth."""
     return _table(ablations.HEADER, ablations.rows())
@@ -310,6 +322,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "adapt": adapt_table,
     "decide": decide_table,
     **{f"results_{task}": partial(result_table, task) for task in learning.ROWS},
+    "both_simulators": simulator_table,
     "ablations": ablation_table,
     "scripts": script_table,
     "blind_test": blind_test_table,
