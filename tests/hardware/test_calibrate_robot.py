@@ -400,7 +400,7 @@ def test_an_adapter_that_goes_while_servos_are_searched_is_told(bench, monkeypat
     assert main(["calibrate", "servo", "wheel_lf", *ports]) == 2
     assert "port is gone: Input/output error; see wlr doctor" in capsys.readouterr().err
     code = main(["doctor", "--scan", *ports])
-    assert (code, "First: robot, bus: port is gone" in capsys.readouterr().out) == (1, True)
+    assert (code, "robot      bus: port is gone" in capsys.readouterr().out) == (1, True)
 
 
 @pytest.mark.slow

@@ -192,8 +192,7 @@ def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) ->
     counts = f"{counted(faults, 'fault')}, {counted(len(wrong) - faults, 'warning')} in {len(checks)} checks."
     console.print(Text(counts, "bold red" if faults else "bold yellow"))
     first = wrong[0]
-    summary = f"First: {first.where}, {first.what}: {first.found}, expected {first.expected}."
-    console.print(Text(f"{summary}\n{first.remedy}", "bold"))
+    console.print(Text(f"Begin with: {first.where}, {first.what}.", "bold"))
     if registers := mendable(checks):
         repair = f"{counted(len(registers), 'register')} can be written, after a question: {_mend_command(options)}"
         console.print(Text(repair, "bold"))

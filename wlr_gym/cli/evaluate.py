@@ -119,6 +119,8 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
 
 def run(options: EvaluateOptions) -> int:
     """Play, print the card, write it."""
+    if not options.policy:
+        raise InputError("no policy given; see: wlr evaluate --help")
     options.present()  # what cannot be is refused before anything is written
     if options.accept:
         return _accept(options)

@@ -356,4 +356,5 @@ def _first_words(box: str, program: str) -> str:
     _, body, *_ = [*re.split(r"^[ │├]*[-─]{3,}.*$", box, flags=re.MULTILINE), "", ""]
     text = " ".join(body.replace("│", "").split())
     text = text.replace(f"Missing from {program}:", "expected").replace(" (required)", "")
+    text = re.sub(r"^(expected [A-Z]+) ([A-Z])(?=[a-z ])", lambda found: f"{found[1]}: {found[2].lower()}", text)
     return text.replace("Unrecognized options:", "more words than it takes:").rstrip(". ")

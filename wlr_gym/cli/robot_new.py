@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.text import pairs
+from wlr_gym.base.text import counted, pairs
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
@@ -114,4 +114,4 @@ def print_findings(robot: Robot, findings: Sequence[RobotFinding]) -> None:
     if not findings:
         print(f"robot '{robot.name}': nothing odd")
     else:
-        print(f"robot '{robot.name}': {faults} faults, {len(findings) - faults} warnings")
+        print(f"robot '{robot.name}': {counted(faults, 'fault')}, {counted(len(findings) - faults, 'warning')}")

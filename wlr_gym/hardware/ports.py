@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,7 +51,14 @@ def open_serial(path: str, baud_rate: int, name: str = "port") -> serial.Serial:
     except FAILURES as error:
         if getattr(error, "errno", None) in _TAKEN:
             raise _in_use(path, name) from None
-        raise InputError(f"{name} {path}: cannot be opened: {error}") from None
+        hint = "" if Path(path).exists() else "; see wlr doctor"
+        raise InputError(f"{name} {path}: cannot be opened: {_reason(error)}{hint}") from None
+
+
+def _reason(error: Exception) -> str:
+    """Return what the system says; pyserial says it twice, and the path with it."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number else str(error)
 
 
 def lock(descriptor: int, path: str, name: str = "port") -> None:

@@ -21,6 +21,7 @@ from wlr_gym.learning.sweep.plan import (
     trials_of,
     whole_settings,
 )
+from wlr_gym.learning.sweep.running import _Book
 
 ENVIRONMENT = "WLR-Velocity-v0"
 ROOT = Path(__file__).resolve().parents[3]
@@ -199,7 +200,12 @@ def test_bad_options_exit_with_2_and_leave_nothing(arguments, message, capsys, t
     assert not list(tmp_path.rglob("trials/*"))
 
 
+def test_one_is_one(tmp_path):
+    book = _Book(parse_config(SweepPlan, {"environment": ENVIRONMENT, "seeds": 1}, "sweep"), tmp_path, print)
+    assert book.size == "1 trial: 1 setting x 1 seed"
+
+
 def test_a_used_folder_is_refused(tmp_path):
     (tmp_path / "something").touch()
-    with pytest.raises(InputError, match=r"in use.*--resume"):
+    with pytest.raises(InputError, match=r"not empty.*--resume"):
         wlr_gym.sweep(ENVIRONMENT, tmp_path)

@@ -42,7 +42,7 @@ def check_camera(camera: CameraReader, file: CameraFile, clock: Clock) -> list[C
             Check(where, "frames", False, str(error), "a camera that gives frames", "Check its plug, number and user group.")
         ]
     readings = _listen(camera, clock)
-    checks = [Check(where, "frames", bool(readings), f"{len(readings)} in {_TIME:g} s", "some", "Check its plug.")]
+    checks = [Check(where, "frames", bool(readings), f"{len(readings)} in {_TIME:g} s", "frames", "Check its plug.")]
     if not readings:
         return checks
     rate = len(readings) / _TIME

@@ -301,7 +301,7 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
         before = imu.statistics.readings, imu.statistics.lost, imu.statistics.errors
         samples = sample_imu(imu, clock)
     except ImuGoneError as error:
-        return [Check("imu", "readings", False, str(error), "some", "Plug it in again, check its cable.")]
+        return [Check("imu", "readings", False, str(error), "readings", "Plug it in again, check its cable.")]
     if not len(samples.gyro):
         remedy = "Check its supply, its port and baud rate; a microcontroller must run the firmware that sends the frames."
         return [Check("imu", "readings", False, "none", f"{port.rate:g} a second", remedy)]

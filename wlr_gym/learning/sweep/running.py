@@ -105,7 +105,7 @@ def sweep(
         What was found. Trials that failed are in it; the others went on.
 
     Raises:
-        InputError: an unknown name or setting, two trials of one name, a folder that is in use, a cluster that does not answer.
+        InputError: an unknown name or setting, two trials of one name, a folder with contents, a cluster that does not answer.
         MissingPackageError: Ray or Optuna is needed and not installed.
         KeyboardInterrupt: Ctrl-C or SIGTERM, after the trials saved checkpoints; :func:`resume_sweep` continues.
     """
@@ -129,7 +129,7 @@ def start_sweep(
     """Run a plan in a new folder; arguments, result and errors as of :func:`sweep`."""
     folder = Path(out)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: in use; give another folder, or resume what is there: wlr sweep --resume {folder}")
+        raise InputError(f"{folder}: not empty; give another folder, or resume what is there: wlr sweep --resume {folder}")
     whole = resolve(plan)
     _check_machines(whole, ray, workers)
     make_output_folder(folder)
@@ -278,7 +278,7 @@ class _Book:
         steps = plan.settings.get("total_steps")
         each = f" of {steps:,} environment steps" if isinstance(steps, int) and "total_steps" not in plan.space else ""
         if plan.search is None:
-            return f"{counted(count * seeds, 'trial')}: {count} settings x {counted(seeds, 'seed')}{each}"
+            return f"{counted(count * seeds, 'trial')}: {counted(count, 'setting')} x {counted(seeds, 'seed')}{each}"
         best = min(plan.search.repeat_best, count)
         return f"{counted(count, 'trial')}{each}, then the best {best} with {counted(seeds, 'seed')}"
 
