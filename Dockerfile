@@ -3,9 +3,9 @@
 #
 #   docker build -t wlr_gym .
 #   docker run --rm -v "$PWD/results:/results/out" wlr_gym demo --quick
-FROM python:3.11-slim
+FROM python:3.11-slim-bookworm
 
-# What MuJoCo draws pictures with, on a GPU's driver (EGL) or on the processor (OSMesa).
+# What MuJoCo draws pictures with, on a GPU's driver (EGL) or on the processor (OSMesa): Debian 12 has all of it.
 # hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libosmesa6 \

@@ -32,7 +32,7 @@ def test_it_runs_without_root():
 def test_its_python_and_extras_are_those_of_the_project():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     (image,) = values("FROM")
-    version = re.fullmatch(r"python:(\d\.\d+)-slim", image)
+    version = re.fullmatch(r"python:(\d\.\d+)-slim-bookworm", image)
     assert version is not None
     assert f"Programming Language :: Python :: {version[1]}" in project["classifiers"]
     (extras,) = re.findall(r'"\.\[([\w,]+)\]"', TEXT)
