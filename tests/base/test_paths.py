@@ -16,9 +16,9 @@ HARDWARE = find_config("hardware", "nominal").read_text(encoding="utf-8")
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("folder", "folder: is a folder; expected a .yaml file, or the name of a robot config: emanual, flow, nominal, paper"),
+        ("folder", "folder: is a folder; expected a .yaml file, or a name in configs/robot/: emanual, flow, nominal, paper"),
         ("folder.yaml", "folder.yaml: is a folder; expected a .yaml file"),
-        ("run_01.parquet", "run_01.parquet: expected a .yaml file, or the name of a robot config"),
+        ("run_01.parquet", "run_01.parquet: expected a .yaml file, or a name in configs/robot/"),
         ("/dev/null", "/dev/null: expected a .yaml file"),
         ("mine.yml", "robot config: no file 'mine.yml'"),
         ("thiner.yaml", "robot config: no file 'thiner.yaml' (did you mean 'thinner.yaml'?)"),

@@ -30,9 +30,7 @@ def find_config(kind: str, name: str | Path) -> Path:
         return data_directory("configs") / kind / f"{name}.yaml"
     if path.exists():
         found = "is a folder; " if path.is_dir() else ""
-        raise InputError(
-            f"{path}: {found}expected a .yaml file, or the name of a {kind} config: {', '.join(config_names(kind))}"
-        )
+        raise InputError(f"{path}: {found}expected a .yaml file, or a name in configs/{kind}/: {', '.join(config_names(kind))}")
     if path.suffix in {".yaml", ".yml"}:
         raise InputError(f"{kind} config: no file '{path}'{_nearest_file(path)}")
     raise unknown_name(f"{kind} config", str(name), config_names(kind))
