@@ -101,13 +101,7 @@ def draw(path: Path) -> None:
         for names, colour, label in ((AWARE, BLUE, "slip-aware; number: weight of slip"), (BLIND, ORANGE, "blind; the same")):
             points = [data["settings"][name][floors] for name in names.values()]
             error, slip = ([[1e3**j * v for v in one[key]] for one in points] for j, key in enumerate(_KEYS))
-            axes.plot(
-                [one[0] for one in error],
-                [one[0] for one in slip],
-                "o-",
-                color=colour,
-                label=f"{label}; number: weight of slip",
-            )
+            axes.plot([one[0] for one in error], [one[0] for one in slip], "o-", color=colour, label=label)
             for weight, x, y, place in zip(names, error, slip, ((4, 6), (8, 4), (4, -12)), strict=True):
                 axes.plot(x[1:], [y[0]] * 2, color=colour, linewidth=0.8)
                 axes.plot([x[0]] * 2, y[1:], color=colour, linewidth=0.8)

@@ -31,6 +31,22 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
         raise InputError(f"{option} {path}: cannot be written to")
 
 
+def require_output_place(path: Path, option: str = "--out") -> None:
+    """Refuse, before the work, a place where no folder for results can be made; nothing is.
+
+    Raises:
+        InputError: it is or lies in a file, or in a folder that cannot be written to.
+    """
+    nearest = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+    if not nearest.is_dir():
+        raise InputError(f"{option} {path}: {nearest} is a file; expected a folder")
+    try:
+        with tempfile.TemporaryDirectory(dir=nearest):  # rights alone do not tell: /proc has them
+            pass
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot be written to: {error.strerror}") from None
+
+
 @contextmanager
 def output_folder(path: Path | None) -> Iterator[None]:
     """Make the folder of ``--out``, None = there is none; work that fails or is interrupted in here leaves no empty one.

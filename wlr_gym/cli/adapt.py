@@ -21,7 +21,7 @@ import tyro
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption, PatchOption, SensorsOption
+from wlr_gym.cli.options import JsonOption, PatchOption, SensorsOption, require_threads
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
@@ -143,8 +143,7 @@ def _check(options: AdaptOptions) -> None:
         raise InputError("--effects: a real robot has its own; they are for --emulated")
     if options.port and options.hardware is None:
         raise InputError("--port: it goes with --hardware")
-    if options.threads is not None and options.threads < 1:
-        raise InputError(f"--threads {options.threads}: expected 1 or more")
+    require_threads(options.threads)
 
 
 def _real(options: AdaptOptions, console: Console) -> RealRobot:

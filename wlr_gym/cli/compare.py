@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_threads, settings_of
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ def run(options: CompareOptions) -> int:
     from wlr_gym.data.compared_plants import parse_plant
     from wlr_gym.data.comparison_report import markdown, summary_table
 
-    if options.threads < 1:
-        raise InputError(f"--threads {options.threads}: expected 1 or more")
+    require_threads(options.threads)
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if not options.threshold > 0.0:
         raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")

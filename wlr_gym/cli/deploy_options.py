@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import require_output_place
 from wlr_gym.base.text import pairs
 from wlr_gym.cli.options import JsonOption, PatchOption
 from wlr_gym.cli.robot_options import read_camera
@@ -77,7 +78,9 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
     read_camera(options.camera, options.emulated)
     options.patch()  # a bad one is refused before a robot is started for it
     _check_faults(options)
-    _check_places(options.out, options.mcap)
+    require_output_place(options.out)
+    if options.mcap is not None and options.mcap.exists():
+        raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
     return _command(options)
 
 
@@ -105,14 +108,6 @@ def _check_faults(options: DeployOptions) -> None:
             parse_fault(fault, places)
         except InputError as error:
             raise InputError(f"--fault: {error}") from None
-
-
-def _check_places(out: Path, mcap: Path | None) -> None:
-    place = next(parent for parent in (out, *out.absolute().parents) if parent.exists())
-    if not place.is_dir():
-        raise InputError(f"--out {out}: {place} is a file; expected a folder")
-    if mcap is not None and mcap.exists():
-        raise InputError(f"--mcap {mcap}: is there already; a stream goes into a new file")
 
 
 def _command(options: DeployOptions) -> dict[str, float]:

@@ -22,7 +22,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.progress import progress
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.gap_decide import DecideOptions, print_rounds, recorder_of
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_threads, settings_of
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
@@ -158,8 +158,7 @@ def _check(options: GapOptions) -> None:
     for name in options.heldout:
         if runs and name not in runs:
             raise unknown_name("run", name, runs, "--heldout")
-    if options.threads is not None and options.threads < 1:
-        raise InputError(f"--threads {options.threads}: expected 1 or more")
+    require_threads(options.threads)
 
 
 def _known(options: GapOptions) -> Patch:

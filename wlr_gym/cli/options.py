@@ -75,6 +75,12 @@ def require_simulator(backend: str, robot: str) -> None:
         raise unknown_name("backend", backend, SIMULATORS, "--backend")
 
 
+def require_threads(threads: int | None) -> None:
+    """Raise :class:`InputError` where ``--threads`` is below 1; None = all cores."""
+    if threads is not None and threads < 1:
+        raise InputError(f"--threads {threads}: expected 1 or more")
+
+
 def settings_of(options: Any) -> dict[str, Any]:
     """Return the options of a command as ``config.yaml`` has them."""
     return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file, write_text
+from wlr_gym.base.files import make_output_folder, replace_file, require_output_place, write_text
 from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
 from wlr_gym.gap.analysis import Analysis
 from wlr_gym.gap.report.page import CAPTIONS, report
@@ -27,14 +26,7 @@ def check_folder(folder: Path) -> None:
     """
     if folder.is_dir():
         _require_own(folder)
-    nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    if not nearest.is_dir():
-        raise InputError(f"--out {folder}: {nearest} is a file; expected a folder")
-    try:
-        with TemporaryDirectory(dir=nearest):  # rights alone do not tell: /proc has them
-            pass
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written to: {error.strerror}") from None
+    require_output_place(folder)
 
 
 def _require_own(folder: Path) -> None:

@@ -16,7 +16,7 @@ from wlr_gym.base.files import write_json
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.read import read_dataset, read_run, run_files
 from wlr_gym.data.replay import robot_of
-from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
+from wlr_gym.learning.adaptation.plan import AdaptStep, Asked, Progress
 from wlr_gym.learning.adaptation.robots import AdaptedRobot, excite_robot, interrupted
 from wlr_gym.learning.evaluation.robot_episodes import RobotEpisode, drive_episode
 from wlr_gym.learning.evaluation.scoring import evaluate
@@ -38,7 +38,7 @@ def drive_before(progress: Progress, robot: AdaptedRobot | None) -> AdaptStep:
     asked = progress.asked
     if robot is None:
         return AdaptStep(outcome="left out", said=(_NO_ROBOT,))
-    seeds = [BEFORE + 1000 * asked.seed + k for k in range(asked.drives)]
+    seeds = seeds_of(BEFORE, asked)
     driven = episodes_of(progress, "before", {"old": asked.policy}, robot, seeds)["old"]
     model = on_the_model(progress, seeds)
     errors = errors_of(driven)
@@ -60,7 +60,7 @@ def drive_after(progress: Progress, robot: AdaptedRobot | None, kept: str) -> Ad
         return AdaptStep(outcome="left out", said=(_NO_ROBOT, f"To drive it: wlr deploy {kept}"))
     if kept == asked.policy:
         return AdaptStep(outcome="left out", said=("The old policy is kept: there is nothing new to drive.",))
-    seeds = [AFTER + 1000 * asked.seed + k for k in range(asked.drives)]
+    seeds = seeds_of(AFTER, asked)
     driven = episodes_of(progress, "after", {"old": asked.policy, "new": kept}, robot, seeds)
     old, new = errors_of(driven["old"]), errors_of(driven["new"])
     model, gain = on_the_model(progress, seeds), paired(new, old)
@@ -138,6 +138,11 @@ def _seconds(run: Path) -> float:
 # ---- episodes --------------------------------------------------------------------------------------------------------
 
 
+def seeds_of(first: int, asked: Asked) -> list[int]:
+    """Return the seeds of the episodes that are driven, from ``BEFORE`` or ``AFTER`` on."""
+    return [first + 1000 * asked.seed + k for k in range(asked.drives)]
+
+
 def episodes_of(
     progress: Progress, step: str, policies: Mapping[str, str], robot: AdaptedRobot, seeds: Sequence[int]
 ) -> dict[str, list[RobotEpisode]]:
@@ -185,8 +190,17 @@ def errors_of(episodes: Sequence[RobotEpisode]) -> Array:
 
 def paired(ours: Array, theirs: Array) -> Estimate:
     """Return by how much ours is better, % of theirs, with its interval over the episodes."""
-    one, other = (np.stack([values, np.ones(len(values))], axis=1)[None] for values in (ours, theirs))
-    return Bootstrap(1, len(ours)).reduction(one, other)
+    return Bootstrap(1, len(ours)).reduction(_pairs(ours), _pairs(theirs))
+
+
+def share_regained(old: Array, new: Array, best: Array) -> Estimate:
+    """Return (old - new) / (old - best), %, with its interval over the episodes."""
+    pairs = [_pairs(errors) for errors in (old, old, new, best)]
+    return Bootstrap(1, len(old)).share(*pairs, subjects=(0, 0, 1, 2))
+
+
+def _pairs(errors: Array) -> Array:
+    return np.stack([errors, np.ones(len(errors))], axis=1)[None]
 
 
 def stops(episodes: Sequence[RobotEpisode]) -> tuple[str, ...]:

@@ -8,8 +8,7 @@ much of each limit of the task's success is reached; a fall counts like errors o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.files import output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.envs.infos import Infos
@@ -62,7 +61,7 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
         if not has_limits(measures_of(core)):
             raise InputError(f"agent '{agent}' is tuned by the limits of a task's success, and '{contract['task']}' has none")
         start = task_settings(model, contract, config, agent)
-        with _folder(training.folder), progress(Console(), shown=training.progress) as tell:
+        with output_folder(training.folder), progress(Console(), shown=training.progress) as tell:
             best, score = search(core, make_policy, start, partial(tell, ""))
     finally:
         core.close()
@@ -73,19 +72,6 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
     origin = {"environment": training.environment, "score": score, "episodes": episodes, "seed": start.seed}
     write_contract(folder, agent, best, contract, origin)
     return folder
-
-
-@contextmanager
-def _folder(folder: Path) -> Iterator[None]:
-    """Make a folder before the work, so that one that cannot be made costs no minutes; take it away where the work fails."""
-    is_new = not folder.exists()
-    make_output_folder(folder)
-    try:
-        yield
-    except BaseException:
-        if is_new:
-            folder.rmdir()
-        raise
 
 
 def _check_steps(settings: PidConfig, agent: str) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import quantile_test
 
 from wlr_gym.base.text import tally
-from wlr_gym.learning.adaptation.driving import paired
+from wlr_gym.learning.adaptation.driving import paired, share_regained
 from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
 from wlr_gym.studies.bench.adapt_study import CONTENDERS, HELPS
 
@@ -38,8 +38,7 @@ def helps(case: Mapping[str, Line]) -> bool | None:
 
 def regained(case: Mapping[str, Line], contender: str = "ours") -> Estimate:
     """Return (old - contender) / (old - truth), %, paired over the episodes."""
-    pairs = [_pairs(case[name]) for name in ("none", "none", contender, "truth")]
-    return Bootstrap(1, len(_errors(case["none"]))).share(*pairs, subjects=(0, 0, 1, 2))
+    return share_regained(*(_errors(case[name]) for name in ("none", contender, "truth")))
 
 
 def better(case: Mapping[str, Line], ours: str, theirs: str) -> Estimate:
@@ -126,8 +125,3 @@ def _interval(found: Estimate) -> str:
 
 def _errors(line: Line) -> Array:
     return np.array(line["errors"], np.float64)
-
-
-def _pairs(line: Line) -> Array:
-    errors = _errors(line)
-    return np.stack([errors, np.ones(len(errors))], axis=1)[None]

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import commands, table
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.gap.report.text import listed, places, plain
-from wlr_gym.learning.evaluation import FIRST_SEED, Estimate, Subject
-from wlr_gym.learning.evaluation.statistics import Bootstrap
+from wlr_gym.learning.evaluation import FIRST_SEED, Subject
 from wlr_gym.studies.demo.hidden_fault import POLICY
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell, paragraph, picture
@@ -20,8 +18,6 @@ from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell,
 if TYPE_CHECKING:
     from wlr_gym.learning.adaptation.plan import Progress
     from wlr_gym.learning.adaptation.robots import EmulatedRobot
-
-Array = NDArray[np.float64]
 
 TITLE = "6. What training on wins back"
 OLD, NEW = "old policy", "trained on"
@@ -90,11 +86,11 @@ def retrain(demo: Demo, tell: Tell) -> Section:
 
 def _without_fault(progress: Progress, robot: EmulatedRobot) -> list[float]:
     """Return the old policy's tracking errors on the same robot without the fault, in the episodes that both have driven."""
-    from wlr_gym.learning.adaptation.driving import AFTER, episodes_of, errors_of
+    from wlr_gym.learning.adaptation.driving import AFTER, episodes_of, errors_of, seeds_of
 
     asked = progress.asked
-    seeds = [AFTER + 1000 * asked.seed + k for k in range(asked.drives)]
-    return errors_of(episodes_of(progress, "without_fault", {"old": asked.policy}, robot, seeds)["old"]).tolist()
+    driven = episodes_of(progress, "without_fault", {"old": asked.policy}, robot, seeds_of(AFTER, asked))
+    return errors_of(driven["old"]).tolist()
 
 
 def won_back(numbers: dict[str, Any]) -> tuple[str, list[str]]:
@@ -103,6 +99,8 @@ def won_back(numbers: dict[str, Any]) -> tuple[str, list[str]]:
     Args:
         numbers: tracking errors ``old``, ``new`` and ``healthy`` (old policy, no fault) of the same episodes, ``better_ci95``.
     """
+    from wlr_gym.learning.adaptation.driving import share_regained
+
     old, new, healthy = (np.array(numbers[name]) for name in ("old", "new", "healthy"))
     said = f"On the same robot without the fault, the old policy's tracking error is {healthy.mean():.3f} in these episodes"
     low, high = numbers["better_ci95"]
@@ -111,18 +109,12 @@ def won_back(numbers: dict[str, Any]) -> tuple[str, list[str]]:
         not_good.append(f"in {worse} of {len(old)} episodes the policy that was trained on is worse")
     if old.mean() <= healthy.mean():
         return f"{said}: the fault costs it nothing.", [*not_good, "the fault costs the old policy nothing in these episodes"]
-    share = _share(old, new, healthy)
+    share = share_regained(old, new, healthy)
     won = f"{share.mean:.0f} % (95 % interval {share.low:.0f} to {share.high:.0f}) of what the fault costs"
     if share.mean < 100.0:
         left = f"{old.mean():.3f} to {new.mean():.3f}, {healthy.mean():.3f} without the fault"
         not_good.append(f"training on wins back {won}, the rest is left ({left})")
     return f"{said}: training on wins back {won}.", not_good
-
-
-def _share(old: Array, new: Array, healthy: Array) -> Estimate:
-    """Return what is won back of what was lost, %, with its interval over the episodes."""
-    errors = [np.stack([values, np.ones(len(values))], axis=1)[None] for values in (old, new, healthy)]
-    return Bootstrap(1, len(old)).estimate(lambda a, b, c: 100.0 * (a - b) / (a - c), *errors)
 
 
 def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
