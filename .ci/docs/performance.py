@@ -23,7 +23,7 @@ PICTURE = ROOT / "docs" / "figures" / "accuracy_speed.png"
 README_RATIOS = (level_name(LEVELS[0]), AT_DEFAULTS)
 TIMES = "\N{MULTIPLICATION SIGN}"
 #: Measurements with a table of their own, or none.
-APART = ("batch",)
+APART = ("batch", "camera")
 BATCH = re.compile(r"(\d+) robots, (\w+), (\d+) threads?")
 
 Row = dict[str, Any]

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import ablations
 import learning
+import measured
 import performance
 
 from wlr_gym.data.excitations import EXCITATIONS
@@ -143,6 +144,12 @@ def simulator_table() -> list[str]:
             errors = [f"{one['mean']:.3f} [{one['low']:.3f}, {one['high']:.3f}]" for one in scores]
             rows.append((said["environment"], f"`{policy}`", "neither" if sensors == "none" else sensors, *errors))
     return _table(("task", "policy", "robot has", "tracking error, engine", "on MuJoCo"), rows)
+
+
+def measured_table(name: str) -> list[str]:
+    """Return a table of what was measured once."""
+    header, rows = measured.TABLES[name]
+    return _table(header, list(rows()))
 
 
 def ablation_table() -> list[str]:
@@ -323,6 +330,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "decide": decide_table,
     **{f"results_{task}": partial(result_table, task) for task in learning.ROWS},
     "both_simulators": simulator_table,
+    **{name: partial(measured_table, name) for name in measured.TABLES},
     "ablations": ablation_table,
     "scripts": script_table,
     "blind_test": blind_test_table,

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rig_bench import Bench, write
+from rig_fits import best_fit, nominal, position_errors
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.model import FittedModel, nominal_model
+from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import RIG_EFFECTS, RigProblem, read_recordings
 from wlr_gym.gap.rig.candidates import rig_candidates
@@ -28,15 +29,6 @@ def loaded(tmp_path_factory):
 
 def split(problem):
     return named_split(problem.runs, problem.held_out)
-
-
-def position_errors(problem, setting, runs):
-    """Mean absolute error of the angle over whole runs, rad."""
-    return np.array([float(np.abs(r[0, :, 0]).mean()) * ENCODER_NOISE for r in problem.residuals([setting], runs)])
-
-
-def nominal(problem):
-    return nominal_model(problem).quantities
 
 
 def true_quantities(problem, bench):
@@ -233,24 +225,6 @@ def test_a_model_without_friction_is_told_that_it_lacks_friction(tmp_path):
 @pytest.fixture(scope="module")
 def real():
     return RigProblem(read_recordings(REAL))
-
-
-def best_fit(problem, runs, effects, autocorrelation_time=None):
-    """The better of two fits: from the data sheet, and from a stronger motor with less friction."""
-    candidates = {
-        c.name: c for present in (("coulomb_friction",), ("load_dependent_friction",)) for c in rig_candidates(present)[1]
-    }
-    stronger = nominal(problem).copy()
-    names = [quantity.name for quantity in problem.quantities]
-    for name, value in {"stall_torque": 0.735, "armature": 0.0018, "coulomb_friction": 0.02}.items():
-        stronger[names.index(name)] = value
-    fits = []
-    for quantities in (nominal(problem), stronger):
-        model = FittedModel(quantities)
-        for name, values in effects.items():
-            model = model.with_effect(candidates[name], values)
-        fits.append(fit(problem, runs, model, autocorrelation_time=autocorrelation_time, steps=25))
-    return min(fits, key=lambda found: found.cost)
 
 
 @pytest.mark.slow

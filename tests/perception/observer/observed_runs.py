@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -152,6 +153,18 @@ def play(policy: str, floor: str, count: int, seconds: float, seed: int = 0, bac
         truth.append(core.plant.truth().values.copy())
     core.close()
     return Runs(load_robot("nominal"), np.array(sensors), np.array(truth))
+
+
+def changed(runs: Runs, change: Callable[[Array], None]) -> Runs:
+    """The same runs with other readings."""
+    sensors = runs.sensors.copy()
+    change(sensors)
+    return Runs(runs.robot, sensors, runs.truth)
+
+
+def without_flow(runs: Runs) -> Runs:
+    """The same runs of robots without a flow sensor."""
+    return changed(runs, lambda s: s.__setitem__((..., SENSOR_LAYOUT.slices["flow_is_new"]), 0.0))
 
 
 def observe(runs: Runs, camera: bool, kind: Any = SlipObserver) -> Array:

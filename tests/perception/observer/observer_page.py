@@ -1,4 +1,7 @@
-"""Print the table of docs/slip_observer.md, and draw its figure: ``python observer_page.py [FIGURE.png]``."""
+"""Measure what docs/slip_observer.md says, and draw its figure: ``python observer_page.py [DATA.json [FIGURE.png]]``.
+
+DATA.json is docs/data/observer.json; .ci/docs/tables.py makes the page's table of it.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from observed_runs import PERIOD, Runs, channel, observe, play, simulate, slip_in_truth_order
+from observed_runs import PERIOD, Runs, channel, observe, play, simulate, slip_in_truth_order, without_flow
 
+from wlr_gym.base.files import write_json
 from wlr_gym.base.plots import COLOURS, legend_below, new_figure, save, tidy
+from wlr_gym.base.provenance import git_commit
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
+from wlr_gym.robot import load_robot
 
 SEED = 5
 START = 25  # ticks: robots of a simulation are dropped, which is not what is measured here
@@ -20,12 +26,15 @@ CASES += [("gibbs_appell", "slope", "climb", 64), ("gibbs_appell", "slippery", "
 CASES += [("gibbs_appell", "changing", "commands", 64)]
 CASES += [("mujoco", floor, drive, 32) for floor in FLOORS for drive in ("commands", "excitation")]
 CASES += [("mujoco", floor, "commands", 32) for floor in ("slippery", "changing")]
+#: How far off the optical-flow sensor is, in the rows that have one.
+FLOW = {"flow__scale": 1.05, "flow__mount_yaw": 0.02, "flow__dropout": 0.02}
+FLOW_DRIVE = "commands, robot with optical flow"
 POLICIES = ("velocity_blind", "velocity_slip_aware")
 PLAYED = [(policy, floor, 64) for policy in POLICIES for floor in ("slippery", "ice", "split")]
 
 
-def measures(runs: Runs, camera: bool) -> list[str]:
-    """v_x rms, median, 99 %; v_y rms; slip rms (mm/s), share inside 2 sigma (%), normalised error, NLL."""
+def measures(runs: Runs, camera: bool) -> dict[str, float]:
+    """Errors of forward speed (rms, median, 99 %), lateral speed and slip; how well the slip's sigma holds."""
     found = observe(runs, camera)
     velocity = (channel(ESTIMATE_LAYOUT, found, "linear_velocity_in_body") - runs.true("linear_velocity_in_body")[..., :2])[
         START:
@@ -33,21 +42,31 @@ def measures(runs: Runs, camera: bool) -> list[str]:
     error = (channel(ESTIMATE_LAYOUT, found, "slip_velocity") - runs.true("slip_velocity"))[START:]
     sigma = channel(ESTIMATE_LAYOUT, found, "slip_sigma")[START:]
     ahead, normalised = np.abs(velocity[..., 0]), error / sigma
-    millimetres = (
-        1e3 * value for value in (rms(ahead), np.median(ahead), np.quantile(ahead, 0.99), rms(velocity[..., 1]), rms(error))
-    )
-    inside = 100 * (np.abs(normalised) < 2).mean()
-    likelihood = (0.5 * normalised**2 + np.log(sigma)).mean()
-    return [*(f"{value:.1f}" for value in millimetres), f"{inside:.0f}", f"{rms(normalised):.2f}", f"{likelihood:.2f}"]
+    return {
+        "v_x_mm_s": 1e3 * rms(ahead),
+        "v_x_median_mm_s": 1e3 * float(np.median(ahead)),
+        "v_x_99_percent_mm_s": 1e3 * float(np.quantile(ahead, 0.99)),
+        "v_y_mm_s": 1e3 * rms(velocity[..., 1]),
+        "slip_mm_s": 1e3 * rms(error),
+        "within_2_sigma_percent": 100 * float((np.abs(normalised) < 2).mean()),
+        "error_over_sigma": rms(normalised),
+        "negative_log_likelihood": float((0.5 * normalised**2 + np.log(sigma)).mean()),
+    }
 
 
 def rms(values) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def row(runs: Runs, name: str) -> str:
-    """One line of the table: without and with the camera."""
-    return f"| {name} | {' | '.join([*measures(runs, camera=False), *measures(runs, camera=True)])} |"
+def row(runs: Runs, backend: str, floor: str, drive: str) -> dict[str, object]:
+    """One row of the data, without and with camera and, where there is one, optical flow; printed as well."""
+    plain = without_flow(runs)
+    found = {"neither": measures(plain, camera=False), "camera": measures(plain, camera=True)}
+    if runs.sensed("flow_is_new").any():
+        found |= {"flow": measures(runs, camera=False), "camera and flow": measures(runs, camera=True)}
+    cells = [f"{value:.3g}" for one in found.values() for value in one.values()]
+    print(f"| {backend}, {floor}, {drive} | {' | '.join(cells)} |", flush=True)
+    return {"backend": backend, "floor": floor, "drive": drive, "robots": runs.truth.shape[1], **found}
 
 
 def draw(path: str) -> None:
@@ -80,14 +99,19 @@ def draw(path: str) -> None:
     save(figure, Path(path))
 
 
-def main() -> None:
-    for backend, floor, drive, count in CASES:
-        print(row(simulate(backend, floor, drive, count, 10.0, seed=SEED), f"{backend}, {floor}, {drive}"), flush=True)
-    for policy, floor, count in PLAYED:
-        print(row(play(policy, floor, count, 10.0, seed=SEED), f"{policy}, {floor}"), flush=True)
-    if len(sys.argv) > 1:
-        draw(sys.argv[1])
+def main(data: str = "", figure: str = "") -> None:
+    rows = [row(simulate(*case, 10.0, seed=SEED), *case[:3]) for case in CASES]
+    robot = load_robot("flow")
+    rows += [
+        row(simulate("gibbs_appell", floor, "commands", 64, 10.0, SEED, robot, **FLOW), "gibbs_appell", floor, FLOW_DRIVE)
+        for floor in ("split", "slippery")
+    ]
+    rows += [row(play(policy, floor, count, 10.0, seed=SEED), "gibbs_appell", floor, policy) for policy, floor, count in PLAYED]
+    if data:
+        write_json(Path(data), {"commit": git_commit(), "seed": SEED, "rows": rows})
+    if figure:
+        draw(figure)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from observed_runs import PERIOD, Runs, estimated, observe, simulate
+from observed_runs import PERIOD, Runs, changed, estimated, observe, simulate, without_flow
 
 from wlr_gym.perception.observer import SlipObserver, trust
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
@@ -27,16 +27,6 @@ def runs() -> Runs:
 def error_of(runs: Runs, found: np.ndarray) -> np.ndarray:
     """Error of the velocity (T + 1, N, 2), m/s."""
     return estimated(found, "linear_velocity_in_body") - runs.true("linear_velocity_in_body")[..., :2]
-
-
-def changed(runs: Runs, change) -> Runs:
-    sensors = runs.sensors.copy()
-    change(sensors)
-    return Runs(runs.robot, sensors, runs.truth)
-
-
-def without_flow(runs: Runs) -> Runs:
-    return changed(runs, lambda s: s.__setitem__((..., FLOW_IS_NEW), 0.0))
 
 
 def test_what_is_there_differs_from_robot_to_robot_and_changes_on_the_way(runs):

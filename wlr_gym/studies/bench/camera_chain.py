@@ -115,21 +115,25 @@ def measure_camera(size: Size) -> list[Measurement]:
     seeds, seconds = range(_FIRST_SEED, _FIRST_SEED + size(6, 1)), float(size(8, 2))
     at = 0.625 * seconds
     camera, covered = _quick(chain_camera()), (f"camera_covered after={at:g}",)
-    rows = []
-    for floor in ("slippery", "ice", "split"):
+    rows, floors = [], ("slippery", "ice", "split")
+    for done, floor in enumerate(floors):
+        size.tell(done / len(floors))
         setting = ChainSetting("velocity_slip_aware", floor, camera, seconds)
         simulated, chain = simulated_errors(setting, seeds), chain_errors(setting, seeds)
         without = replace(setting, camera=None, extra={"task": {"sensors": {"camera": 0.0, "flow": 0.0}}})
         blind, imagined = chain_errors(without, seeds), simulated_errors(without, seeds)
         hidden = chain_errors(replace(setting, faults=covered), seeds)
         what = f"{floor}, {len(seeds)} episodes of {seconds:g} s: tracking error"
-        ratios = (chain.mean() / simulated.mean(), blind.mean() / imagined.mean(), hidden.mean() / blind.mean())
-        rows += [
-            Measurement("camera", f"{what} of the chain over the simulator's", "-", (float(ratios[0]),), bar=1.1),
-            Measurement("camera", f"{what} without a camera, chain over simulator", "-", (float(ratios[1]),), bar=1.1),
-            Measurement("camera", f"{what}, lens covered from {at:g} s on, over a policy without a camera", "-",
-                        (float(ratios[2]),), bar=1.0),
-        ]  # fmt: skip
+        late = f"lens covered from {at:g} s on"
+        of_each = {"with a camera": chain, late: hidden, "without a camera": blind}
+        of_each |= {"with a camera, in the simulator": simulated, "without a camera, in the simulator": imagined}
+        rows += [Measurement("camera", f"{what} {name}", "-", tuple(map(float, found))) for name, found in of_each.items()]
+        for name, ours, other, bar in (
+            ("with a camera, over the simulator's", chain, simulated, 1.1),
+            ("without a camera, over the simulator's", blind, imagined, 1.1),
+            (f"{late}, over that without a camera", hidden, blind, 1.0),
+        ):
+            rows.append(Measurement("camera", f"{what} {name}", "-", (float(ours.mean() / other.mean()),), bar=bar))
     return rows
 
 

@@ -85,7 +85,11 @@ def measure_vision(size: Size) -> list[VisionResult]:
         parts: Sequence[Callable[[Size], list[VisionResult]]] = (
             measure_centres, measure_poses, measure_recall, measure_false_poses, measure_rate, measure_drives,
         )  # fmt: skip
-        return [result for part in parts for result in part(size)]
+        results: list[VisionResult] = []
+        for done, part in enumerate(parts):
+            size.tell(done / len(parts))
+            results += part(size)
+        return results
     finally:
         cv2.setNumThreads(threads)
 

@@ -1,0 +1,140 @@
+"""Sentences with numbers that were measured once have those of docs/data."""
+
+from __future__ import annotations
+
+import json
+import re
+
+from blocks import ROOT, site_script
+
+from wlr_gym.studies.bench.adapt_study import CONTENDERS, read_lines
+from wlr_gym.studies.bench.adapt_table import by_case, summary
+from wlr_gym.studies.bench.gap import score_answers
+
+ablations, learning = site_script("ablations"), site_script("learning")
+UNITS = {"1/A": " /A", "-": ""}
+
+
+def page(name: str) -> str:
+    return " ".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").split())
+
+
+def readme_text() -> str:
+    return " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+
+
+def data(name: str) -> dict:
+    return json.loads((ROOT / "docs" / "data" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def test_the_real_servo_lacks_what_the_page_says():
+    found = data("xl330_pendulum")["workflow"]
+    text, gap = page("gap_rig"), found["gap"]
+    for effect in found["effects"]:
+        (number,) = effect["parameters"].values()
+        value, unit, (low, high) = number["value"], UNITS[number["unit"]], number["ci95"]
+        assert f"{value:.2f}{unit} ({low:.2f} to {high:.2f})" in text, effect["name"]
+    low, high = (100 * share for share in gap["reduction_ci95"])
+    assert f"from {gap['heldout_calibrated']:.1f} to {gap['heldout_after']:.1f} encoder counts" in text
+    assert f"{100 * gap['reduction']:.0f} % ({low:.0f} to {high:.0f}) of what can be avoided" in text
+    assert len(found["runs"]["heldout"]) == 4
+
+
+def test_the_observer_on_mujoco_is_as_the_page_says():
+    rows = data("observer")["rows"]
+    ours = {(row["floor"], row["drive"]): row for row in rows if row["backend"] == "gibbs_appell"}
+    ratios = [
+        row[sensors]["slip_mm_s"] / ours[row["floor"], row["drive"]][sensors]["slip_mm_s"]
+        for row in rows
+        if row["backend"] == "mujoco"
+        for sensors in ("neither", "camera")
+    ]
+    assert f"slip errors are {min(ratios):.1f} to {max(ratios):.1f} times these" in page("slip_observer")
+
+
+def test_a_covered_lens_costs_what_the_page_says():
+    rows = [row for row in data("bench")["rows"] if row["name"] == "camera" and "over that without a camera" in row["what"]]
+    ratios = [row["ours"]["median"] for row in rows]
+    assert f"{min(ratios):.2f} to {max(ratios):.2f} times that of a robot without a camera" in page("camera")
+
+
+def test_films_of_a_lab_have_the_numbers():
+    film, text = data("lab_films"), page("vision")
+    score, count = film["score"], len(film["films"])
+    share, printed, held = (100 * score[name] for name in ("within_1_mm_all", "within_1_mm", "within_2.5_sigma"))
+    assert f"{share:.0f} % ({share * count / 100:.0f} of {count}; target 95 %, missed;" in text
+    assert f"body target on one sheet: {printed:.0f} %) and within 2.5 sigma in {held:.0f} % (95 %)" in text
+    assert "No film is refused, and none beyond 4 sigma lacks a finding" in text
+    assert score["refused"] == score["silently_wrong"] == 0
+
+
+def test_the_pages_have_the_numbers_of_adaptation():
+    readme, said = readme_text(), " ".join(summary(by_case(read_lines(ROOT / "docs" / "data" / "adapt.jsonl"))))
+    (error,) = re.findall(r"after adaptation: (\d+ \[\d+, \d+\]) % smaller", said)
+    shares = dict(re.findall(r"Regained by '([^']+)' in \d+ of these, %: median (\d+ \[-?\d+, \d+\])", said))
+    ours, calibrated = (shares[CONTENDERS[name]] for name in ("ours", "calibrated"))
+    assert f"tracking error {error.replace(' ', ' % ', 1)} smaller (median)" in readme
+    assert f"{ours.replace(' ', ' % ', 1)} of what training with the true model wins" in readme
+    assert f"calibration alone {calibrated.split()[0]} %" in readme
+
+
+def test_the_pages_have_the_numbers_of_the_blind_test():
+    found, readme = score_answers(ROOT / "docs" / "data" / "gap_answers.json"), readme_text()
+    named, alarms, sets = found["single"]["top1"], found["false_alarms"]["all"], found["sets"]
+    said = f"right name first in {named['hits']} of {named['count']} (at least {100 * named['bound95']:.0f} %), "
+    said += f"no false alarm in {alarms['count']} (at most {100 * alarms['bound95']:.0f} %)"
+    assert alarms["hits"] == 0
+    assert said + (f"; {sets} of 400 sets so far" if sets < 400 else "") in readme
+    one, refused = found["single"]["top1_at_one"], found["false_alarms"]["refused_good_data"]
+    assert f"names {one['hits']} of {one['count']} effects of severity 1 (target 80 %)" in readme
+    assert f"calls {refused['hits']} of {refused['count']} good data sets not exciting enough" in readme
+
+
+def test_the_policies_page_has_the_numbers_of_velocity():
+    rows = {(row["sensors"], row["floors"]): row for row in learning.read_data()["velocity"]["rows"]}
+    text, readme = page("policies"), readme_text()
+    late, plain = (rows["camera", floors]["tracking_error"][0] for floors in ("slippery, 40 ms late", "slippery"))
+    assert f"increase the error by {100 * (late / plain - 1):.0f} %: {late:.3f} instead of {plain:.3f}" in text
+    assert f"40 ms late raise the tracking error by {100 * (late / plain - 1):.0f} %" in readme
+    blind, controller, pid = (
+        rows["none", "slippery"]["others"][name]["tracking_error"] for name in (learning.BLIND, *learning.CONTROLLERS)
+    )
+    said = f"blind policy (three seeds) {blind:.3f}, hand-written controller {controller:.3f}, tuned PID {pid:.3f}"
+    assert said in readme
+    of_one_friction = ("ice", "nominal", "wide", "ribbed")
+    gains = {floors: [] for floors in (True, False)}
+    for (_, floors), row in rows.items():
+        if floors != "slippery, 40 ms late":
+            gains[floors in of_one_friction].append(row["others"]["slip_compensating"]["better"])
+    alike, mixed = ([one[0] for one in gains[key]] for key in (True, False))
+    assert f"the policy is {-min(alike):.0f} % worse to {max(alike):.0f} % better, and every interval contains 0" in text
+    assert all(low < 0.0 < high for _, low, high in gains[True])
+    assert f"On mixed floors it is {min(mixed):.0f} to {max(mixed):.0f} % better" in text
+    slips = [row["others"]["blind"]["slips_less"] for row in rows.values()]
+    more, less = -min(one[0] for one in slips), max(one[0] for one in slips)
+    widest = max(abs(edge) for _, *edges in slips for edge in edges)
+    assert f"({more:.0f} % more to {less:.0f} % less, intervals within {widest:.0f} %" in text
+    errors = [row["others"]["blind"]["better"][0] for row in rows.values()]
+    assert f"its error is {min(errors):.0f} to {max(errors):.0f} % smaller" in text
+
+
+def test_the_policies_page_has_the_numbers_of_the_ablations():
+    settings, text = ablations.read_data()["settings"], page("policies")
+    for name, said in (
+        ("plain PPO, 4 million steps", "has an error {} % larger [{}, {}]"),
+        ("controller of pid", "the error is {} % larger [{}, {}]"),
+        ("estimates to the controller only", "it is {} % larger [{}, {}]"),
+        ("large minibatches", "may cost {} % [{}, {}]"),
+    ):
+        mean, low, high = (f"{-value:.0f}".replace("-", "\N{MINUS SIGN}") for value in settings[name]["slippery"]["better"])
+        assert said.format(mean, high, low) in text, name
+
+
+def test_filmed_drives_have_the_numbers():
+    rows, text = data("vision")["vision"], page("vision")
+    along, across, clock = (
+        max(row["value"] for row in rows if word in row["what"])
+        for word in ("longitudinal slip", "lateral slip", "clock offset")
+    )
+    assert f"at most {along:.2f} mm longitudinally and {across:.2f} mm laterally, the clock offset by {clock:.1f} ms" in text
+    assert all(row["met"] is not False for row in rows)
