@@ -11,7 +11,7 @@ import pytest
 from wlr_gym import cli
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Simulation, read_run, simulate_again
-from wlr_gym.data.ghost import GHOST_CHANNELS
+from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.odometry import rolled_poses
 from wlr_gym.data.replay import replay
 from wlr_gym.data.run_states import start_state
@@ -79,7 +79,7 @@ def test_the_ghost_is_the_replay():
     assert recording.ghost.done == len(run["t"])
     full = replay(run).full
     for name, bound in (("pos_leg_lf", 0.01), ("vel_wheel_rr", 0.15), ("cam_x", 0.01), ("cam_yaw", 0.02)):
-        ghost = recording.ghost.channels[:, GHOST_CHANNELS.index(name)]
+        ghost = recording.ghost.channels[:, CHANNELS.index(name)]
         moved = max(np.nanmax(full[name]) - np.nanmin(full[name]), 1e-9)
         assert np.sqrt(np.mean((ghost - full[name])[25:] ** 2)) < bound, (name, moved)
     labels = [curve.label for curve in recording.curves("vel_wheel")]

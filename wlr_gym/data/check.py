@@ -220,10 +220,14 @@ def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
 
 def increments(t: Array, angle: Array, rate: Array) -> tuple[Array, Array]:
     """Return how far ``angle`` and the integral of ``rate`` went over every window of :data:`_WINDOW` seconds."""
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
     starts = t[t <= t[-1] - _WINDOW]
-    turned = np.interp(starts + _WINDOW, t, angle) - np.interp(starts, t, angle)
-    return turned, np.interp(starts + _WINDOW, t, integral) - np.interp(starts, t, integral)
+    turned, measured = (np.interp(starts + _WINDOW, t, one) - np.interp(starts, t, one) for one in (angle, integral(t, rate)))
+    return turned, measured
+
+
+def integral(t: Array, rate: Array) -> Array:
+    """Return the running integral of a rate (T,), by trapezia; 0 at first."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
 
 
 # --- findings ---------------------------------------------------------------------------------------------------------

@@ -67,7 +67,10 @@ def parse_plant(text: str, physics_step: float = 0.001) -> ComparedPlant:
     for option in filter(None, options.split(",")):
         name, _, value = option.partition("=")
         if name == "physics_step":
-            plant = replace(plant, physics_step=_seconds(value, text))
+            try:
+                plant = replace(plant, physics_step=float(value))
+            except ValueError:
+                raise InputError(f"plant '{text}': physics_step = {value!r}: expected a number of seconds") from None
         elif name == "precision":
             plant = replace(plant, precision=value)
         else:
@@ -76,13 +79,6 @@ def parse_plant(text: str, physics_step: float = 0.001) -> ComparedPlant:
         raise unknown_name("precision", plant.precision, precisions, f"plant '{text}'")
     PlantOptions(control_period=CONTROL_PERIOD, physics_step=plant.physics_step)
     return plant
-
-
-def _seconds(value: str, text: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        raise InputError(f"plant '{text}': physics_step = {value!r}: expected a number of seconds") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +156,9 @@ def drive(
         tell: called with the share that is done.
     """
     patch = patch or Patch()
-    batch = _parameters(motions, robot, parameters, patch)
+    one = Parameters.nominal(robot) if parameters is None else parameters
+    rows = [apply_patch(patch, profile_parameters(one, motion.profile)).values for motion in motions]
+    batch = Parameters(np.concatenate(rows))
     setpoints, torque_on = _setpoints(motions)
     options = PlantOptions(motions[0].period, plant.physics_step, plant.precision, threads, sensor_noise=False)
     simulator = make_plant(plant.backend, robot, len(motions), options, patch.forces)
@@ -181,12 +179,6 @@ def drive(
     finally:
         simulator.close()
     return Traces(plant, robot, np.array(sensors), np.array(truth))
-
-
-def _parameters(motions: Sequence[Motion], robot: Robot, parameters: Parameters | None, patch: Patch) -> Parameters:
-    one = Parameters.nominal(robot) if parameters is None else parameters
-    rows = [apply_patch(patch, profile_parameters(one, motion.profile)).values for motion in motions]
-    return Parameters(np.concatenate(rows))
 
 
 def _setpoints(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wlr_gym.base.plots import BLUE, GREEN, ORANGE, new_figure, save, text_colour, tidy
-from wlr_gym.data.comparison import BOUNDS, HORIZON, Agreement, Comparison, MotionComparison, difference
+from wlr_gym.data.comparison import BOUNDS, HORIZON, Comparison, MotionComparison, difference
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,9 +43,9 @@ def tables(comparison: Comparison) -> list[ReportTable]:
     """Return the tables of one comparison: agreement, differences by signal, and what becomes of them at half the steps."""
     plants = " against ".join(traces.plant.label for traces in (comparison.second, comparison.first))
     note = f"{plants}; effects: {comparison.effects}"
-    found = [agreement_table(f"Agreement, {note}", [(case.motion, case) for case in comparison.cases])]
+    found = [_agreement_table(f"Agreement, {note}", comparison.cases)]
     if comparison.half:
-        found.append(agreement_table("The same at half of both steps", [(case.motion, case) for case in comparison.half]))
+        found.append(_agreement_table("The same at half of both steps", comparison.half))
     rows = [
         (
             _starred(comparison, name),
@@ -68,13 +68,19 @@ def tables(comparison: Comparison) -> list[ReportTable]:
     return found
 
 
-def agreement_table(title: str, cases: Sequence[tuple[str, MotionComparison]]) -> ReportTable:
+def _agreement_table(title: str, cases: Sequence[MotionComparison]) -> ReportTable:
     """Return the figures that :data:`wlr_gym.data.comparison.BOUNDS` bounds, one row per case; ``!`` marks a broken bound."""
     headings = (
         "motion", "travel m", f"apart after {HORIZON:g} s mm", "% of travel", "yaw deg", "leg torque %", "wheel torque %",
         "diverges first in", "at s",
     )  # fmt: skip
-    return ReportTable(title, headings, tuple((name, *_agreement(case)) for name, case in cases))
+    rows = []
+    for case in cases:
+        found, (first, time) = case.agreement, case.first or ("never", None)
+        figures = _figures({bound: getattr(found, bound) for bound in BOUNDS})
+        at = "-" if time is None else f"{time:.2f}"
+        rows.append((case.motion, f"{found.travel:.2f}", f"{1e3 * found.apart:.2f}", *figures, first, at))
+    return ReportTable(title, headings, tuple(rows))
 
 
 def summary_table(comparisons: Sequence[Comparison]) -> ReportTable:
@@ -93,13 +99,6 @@ def summary_table(comparisons: Sequence[Comparison]) -> ReportTable:
         rows.append((comparison.effects, f"{1e3 * worst['apart']:.2f}", *figures, f"{signal} {_noise(size)}", broken))
     step = " at half of both steps" if comparisons[0].half else ""
     return ReportTable(f"Worst of all motions{step}", headings, tuple(rows))
-
-
-def _agreement(case: MotionComparison) -> tuple[str, ...]:
-    found: Agreement = case.agreement
-    name, time = case.first or ("never", None)
-    values = {bound: getattr(found, bound) for bound in BOUNDS}
-    return (f"{found.travel:.2f}", f"{1e3 * found.apart:.2f}", *_figures(values), name, "-" if time is None else f"{time:.2f}")
 
 
 def _figures(values: dict[str, float]) -> tuple[str, ...]:

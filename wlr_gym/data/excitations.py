@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -241,15 +242,7 @@ def _stop_and_go(rng: np.random.Generator, robot: Robot) -> Course:
     return _holds(pieces)
 
 
-def _rear_legs(rng: np.random.Generator, robot: Robot) -> Course:
-    return _swing_over(rng, turning_front=False)
-
-
-def _all_legs(rng: np.random.Generator, robot: Robot) -> Course:
-    return _swing_over(rng, turning_front=True)
-
-
-def _swing_over(rng: np.random.Generator, *, turning_front: bool) -> Course:
+def _swing_over(rng: np.random.Generator, robot: Robot, *, turning_front: bool) -> Course:
     """Legs turn slowly from one side to the other while the front wheels pull and the rear wheels are free."""
     margin, speed = rng.uniform(0.53, 0.6), rng.uniform(1.85, 2.05)
     turned = (np.pi - 2 * margin) / rng.uniform(0.33, 0.38)
@@ -334,10 +327,14 @@ EXCITATIONS: dict[str, Excitation] = {
         "abrupt changes of speed and reversals", "delays, wheel inertia and friction, backlash of the wheels", _stop_and_go
     ),
     "rear_legs": Excitation(
-        "rear legs turn slowly from front to back, rear wheels free", "load on the legs, centre of mass", _rear_legs
+        "rear legs turn slowly from front to back, rear wheels free",
+        "load on the legs, centre of mass",
+        partial(_swing_over, turning_front=False),
     ),
     "all_legs": Excitation(
-        "all legs turn slowly to the other side, rear wheels free", "load on the legs, zero offsets, geometry", _all_legs
+        "all legs turn slowly to the other side, rear wheels free",
+        "load on the legs, zero offsets, geometry",
+        partial(_swing_over, turning_front=True),
     ),
     "random": Excitation("band-limited random setpoints of both axles and sides", "everything at once", _random),
     "chirp": Excitation(

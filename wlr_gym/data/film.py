@@ -69,15 +69,8 @@ def _pictures(
 def truth_of(state: PlantState) -> Truth:
     """Return a truth (N) that knows the motion of ``state`` and nothing else: forces and slip are 0."""
     truth = Truth(np.zeros((len(state), TRUTH_LAYOUT.width)))
-    names = (
-        "position",
-        "quaternion",
-        "linear_velocity_in_body",
-        "angular_velocity_in_body",
-        "joint_position",
-        "joint_velocity",
-    )
-    for name in names:
+    velocities = ("linear_velocity_in_body", "angular_velocity_in_body", "joint_velocity")
+    for name in ("position", "quaternion", "joint_position", *velocities):
         truth[name][:] = getattr(state, name)
     return truth
 

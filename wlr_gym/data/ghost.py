@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import CLOCK, camera_frame, readings, tick_setpoints
 from wlr_gym.data.run_states import measured_state, start_state
@@ -20,8 +19,6 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: What is replayed of a run's columns, in the order of what :func:`replayed_rows` yields.
-GHOST_CHANNELS = tuple(CHANNELS)
 #: s around an anchor whose samples are looked at.
 _AROUND = 1.0
 
@@ -29,7 +26,7 @@ _AROUND = 1.0
 def replayed_rows(
     run: Run, robot: Robot, parameters: Parameters, backend: str, patch: Patch | None, segment: float
 ) -> Iterator[tuple[Truth, Array]]:
-    """Yield the truth (1 robot) and the channels :data:`GHOST_CHANNELS` of a replay at each row of the run.
+    """Yield the truth (1 robot) and the channels :data:`wlr_gym.data.format.CHANNELS` of a replay at each row of the run.
 
     As in :func:`wlr_gym.data.replay.replay` the plant ticks on a clock of its own, and each row's setpoint acts from that row's
     time on; every ``segment`` s the plant starts anew from the measured state, at once and not as one batch.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -88,7 +87,11 @@ def robot_of_meta(meta: RunMeta, folder: Path, file: str = META_FILE) -> Robot:
     if meta.robot is None:
         return load_robot()
     if not names_file(meta.robot):
-        return load_robot(_shipped(meta.robot, folder / file))
+        shipped = shipped_robots()
+        if meta.robot not in shipped:
+            error = unknown_name("robot", meta.robot, shipped, str(folder / file))
+            raise InputError(f"{error}; a robot of your own is named by its file (a path from {file} on), or with --robot")
+        return load_robot(shipped[meta.robot])
     path = folder / meta.robot
     robot = load_robot(path)
     if meta.robot_hash not in (None, found := robot_hash(robot)):
@@ -97,11 +100,3 @@ def robot_of_meta(meta: RunMeta, folder: Path, file: str = META_FILE) -> Robot:
             "more; name the one to use with --robot"
         )
     return robot
-
-
-def _shipped(name: str, file: Path) -> Any:
-    shipped = shipped_robots()
-    if name not in shipped:
-        error = unknown_name("robot", name, shipped, str(file))
-        raise InputError(f"{error}; a robot of your own is named by its file (a path from {file.name} on), or with --robot")
-    return shipped[name]

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.film import truth_of
-from wlr_gym.data.format import COLUMNS
-from wlr_gym.data.ghost import GHOST_CHANNELS, replayed_rows
+from wlr_gym.data.format import CHANNELS, COLUMNS
+from wlr_gym.data.ghost import replayed_rows
 from wlr_gym.data.odometry import rolled_poses
 from wlr_gym.data.read import Run
 from wlr_gym.data.replay import prepare
@@ -105,7 +105,7 @@ class RunRecording:
         self._t = run["t"] - run["t"][0]
         self._rolled = rolled_poses(run, self.robot)
         rows = len(self._t)
-        self.ghost = Track(np.full((rows, TRUTH_LAYOUT.width), np.nan), np.full((rows, len(GHOST_CHANNELS)), np.nan))
+        self.ghost = Track(np.full((rows, TRUTH_LAYOUT.width), np.nan), np.full((rows, len(CHANNELS)), np.nan))
         self.true = Track(np.full((rows, TRUTH_LAYOUT.width), np.nan), np.zeros((rows, 0)))
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="ghost", daemon=True)
@@ -127,7 +127,9 @@ class RunRecording:
         names = [name for name in COLUMNS if name != "t" and name in self.run]
         groups = {COLUMNS[name].group: COLUMNS[name].unit for name in names}
         titles = groups | {name: COLUMNS[name].unit for name in names}
-        return titles | ({title: TRUTH_LAYOUT.channels[name].unit for title, name in _TRUE.items()} if self._simulates else {})
+        if self.run.simulation is None and self._backend is None:
+            return titles
+        return titles | {title: TRUTH_LAYOUT.channels[name].unit for title, name in _TRUE.items()}
 
     def at(self, time: float) -> Moment:
         """Return the robot: as it was simulated, where that is known, else as it was measured."""
@@ -146,7 +148,7 @@ class RunRecording:
         curves = []
         for k, name in enumerate(names):
             curves.append(Curve(name, self._t, self.run[name], colour=k))
-            if name in GHOST_CHANNELS and self.ghost.done > 1:
+            if name in CHANNELS and self.ghost.done > 1:
                 curves.append(Curve(f"{name}, replayed", *self._replayed_channel(name), dashed=True, colour=k))
         return curves
 
@@ -198,10 +200,6 @@ class RunRecording:
 
     # ---- what is worked out -----------------------------------------------------------------------------------------
 
-    @property
-    def _simulates(self) -> bool:
-        return self.run.simulation is not None or self._backend is not None
-
     def _work(self) -> None:
         if self.run.simulation is not None:
             self._fill(self.true, lambda: simulated_rows(self.run, self.robot))
@@ -230,7 +228,7 @@ class RunRecording:
     def _replayed_channel(self, name: str) -> tuple[Array, Array]:
         """Return times and values; what the camera shows is older than the ghost's pose by its delay."""
         done = self.ghost.done
-        t, values = self._t[:done], self.ghost.channels[:done, GHOST_CHANNELS.index(name)]
+        t, values = self._t[:done], self.ghost.channels[:done, CHANNELS.index(name)]
         if name.startswith("cam_"):
             t = t + float(self._model["camera.delay"][0])
         return t, _turned_to(values, self.run[name][:done]) if name == "cam_yaw" else values
@@ -246,10 +244,9 @@ class RunRecording:
 
 def _turned_to(yaw: Array, measured: Array) -> Array:
     """Return a heading, continuous, by the whole turns that bring it next to the measured one."""
-    known = np.isfinite(measured)
+    known, turned = np.isfinite(measured), np.unwrap(yaw)
     if not known.any():
-        return np.unwrap(yaw)
-    turned = np.unwrap(yaw)
+        return turned
     return turned + 2.0 * np.pi * np.round(np.median(measured[known] - turned[known]) / (2.0 * np.pi))
 
 
@@ -263,8 +260,4 @@ def open_recordings(
     """
     for run in runs:
         prepare(run, robot, effects=patch)
-
-    def open_one(place: int) -> RunRecording:
-        return RunRecording(runs[place], robot, backend, patch, segment)
-
-    return open_one
+    return lambda place: RunRecording(runs[place], robot, backend, patch, segment)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.data.check import integral
 from wlr_gym.data.logs.align import Lag, find_lag
-from wlr_gym.data.logs.map import TopicClock
-from wlr_gym.data.logs.signals import GUESS, LIKELY, SURE, BodyMotion, LogSignals, behind, integral
+from wlr_gym.data.logs.signals import GUESS, LIKELY, SURE, BodyMotion, LogSignals, behind
 
 Array = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def _received(look: LogSignals, joints: str, topics: Collection[str]) -> Iterato
     for topic in sorted(topics):
         late = behind(look.log, topic)
         if base is not None and late is not None:
-            rest = late - base - look.clocks.get(topic, TopicClock()).offset
+            rest = late - base - look.clock(topic).offset
             yield Pair(topic, joints, rest, _DELIVERY, "when they were received")
 
 
@@ -116,7 +116,7 @@ def _solve(pairs: Sequence[Pair], unknown: Sequence[str]) -> list[tuple[float, f
 
 
 def _set(look: LogSignals, topic: str, offset: float, sigma: float, pairs: Sequence[Pair]) -> None:
-    clock = look.clocks.get(topic, TopicClock())
+    clock = look.clock(topic)
     by = "; ".join(f"{pair.by}: {1e3 * pair.lag:+.1f} ms" for pair in pairs)
     text = f"{1e3 * offset:+.1f} ms, 1 sigma {1e3 * sigma:.1f} ms ({by}){_gross(look, topic)}"
     sure = SURE if sigma < 0.003 else LIKELY if sigma < 0.01 else GUESS
@@ -128,5 +128,5 @@ def _set(look: LogSignals, topic: str, offset: float, sigma: float, pairs: Seque
 
 
 def _gross(look: LogSignals, topic: str) -> str:
-    offset = look.clocks.get(topic, TopicClock()).offset
+    offset = look.clock(topic).offset
     return f"; its header counts from another moment ({offset:.3f} s)" if offset else ""

@@ -38,11 +38,6 @@ class ExportedRun:
     notes: tuple[str, ...]
 
 
-def is_exported(log: Log) -> bool:
-    """Whether a log was written by this library."""
-    return RUN in log.topics and bool(log.topics[RUN].text)
-
-
 def read_exported(path: str | Path, tell: Share = quiet) -> ExportedRun:
     """Read a run back from an MCAP file or a rosbag2 of :func:`wlr_gym.data.logs.write.export_run`.
 
@@ -53,12 +48,8 @@ def read_exported(path: str | Path, tell: Share = quiet) -> ExportedRun:
     for topic, field in PLACES.values():
         fields.setdefault(topic, set()).add(field)
     (log,) = read_logs(path, fields, tell=tell)
-    if not is_exported(log):
+    if RUN not in log.topics or not log.topics[RUN].text:
         raise InputError(f"{path}: no message on '{RUN}': another program's log; import it with a map")
-    return _run(log)
-
-
-def _run(log: Log) -> ExportedRun:
     content = read_content(log.topics[RUN].text, log.name)
     if JOINT_STATES not in log.topics:
         raise InputError(f"{log.name}: no message on '{JOINT_STATES}': the run has no row")

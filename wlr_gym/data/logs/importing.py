@@ -242,13 +242,21 @@ def _make_runs(
     tell: Share,
 ) -> Iterator[ImportedRun]:
     """Yield the runs that a log makes, written into ``folder``; as much of it is in memory as a run needs."""
-    progress = _Progress(tell)
-    number = 0
-    for recording in read_recordings(log, wanted_fields(resolved), tell=progress.reading):
+    number, read = 0, 0.0
+
+    def reading(share: float) -> None:
+        nonlocal read
+        read = max(read, share)
+        tell(_READING * read)
+
+    def making(share: float) -> None:
+        tell(_READING * read + (1.0 - _READING) * share * read)
+
+    for recording in read_recordings(log, wanted_fields(resolved), tell=reading):
         with closing(recording):
             check_new(recording)
             runs: list[ImportedRun] = []
-            for made in runs_of(recording, found, resolved, split, progress.making):
+            for made in runs_of(recording, found, resolved, split, making):
                 number += 1
                 findings = _check(made, recording.name, resolved, robot)
                 path = write_run(folder / f"{number}{suffix}", made.table)
@@ -256,20 +264,6 @@ def _make_runs(
                 runs.append(ImportedRun(path, recording.name, made.origin, made.facts, findings, made.notes))
             yield from (replace(one, notes=(*recording.notes, *one.notes)) for one in runs)
     tell(1.0)
-
-
-class _Progress:
-    """Shares of an import: most of it is reading."""
-
-    def __init__(self, tell: Share) -> None:
-        self._tell, self._read = tell, 0.0
-
-    def reading(self, share: float) -> None:
-        self._read = max(self._read, share)
-        self._tell(_READING * self._read)
-
-    def making(self, share: float) -> None:
-        self._tell(_READING * self._read + (1.0 - _READING) * share * self._read)
 
 
 def samples_of(run: Path) -> Path:
@@ -285,13 +279,19 @@ def _moved(run: ImportedRun, path: Path) -> ImportedRun:
 
 
 def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Robot) -> tuple[Finding, ...]:
+    """Return what is odd about a run; a refusal says from which topic and field the column came."""
     try:
         findings = tuple(check_table(made.table, name))
         for column in filter(is_effort, made.table):
             check_effort(column, made.table, resolved[column].unit, robot, name)
         return findings
     except InputError as error:
-        raise InputError(_with_source(str(error), resolved)) from None
+        found = re.search(r"column '(\w+)'", str(error))
+        source = resolved.get(found.group(1)) if found else None
+        if source is None:
+            raise
+        where = f"from topic '{source.topic}', field '{source.field}', read as {source.unit}: check its unit in the map"
+        raise InputError(f"{error} ({where})") from None
 
 
 def _unnamed_robot(resolved: Mapping[str, Resolved], robot: Robot) -> Iterator[str]:
@@ -299,15 +299,6 @@ def _unnamed_robot(resolved: Mapping[str, Resolved], robot: Robot) -> Iterator[s
     units = sorted({source.unit for column, source in resolved.items() if is_effort(column) and source.unit in CURRENTS})
     if units:
         yield f"efforts in {', '.join(units)} become N m by the torque constants of '{robot.name}': name your robot (--robot)"
-
-
-def _with_source(text: str, resolved: Mapping[str, Resolved]) -> str:
-    """Return a message about a column with the topic and field that it came from."""
-    found = re.search(r"column '(\w+)'", text)
-    source = resolved.get(found.group(1)) if found else None
-    if source is None:
-        return text
-    return f"{text} (from topic '{source.topic}', field '{source.field}', read as {source.unit}: check its unit in the map)"
 
 
 # ---- the record of what was imported ---------------------------------------------------------------------------------

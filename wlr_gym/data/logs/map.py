@@ -122,7 +122,8 @@ class LogMap(SettingsModel):
     def _right_handed(cls, value: dict[str, tuple[Axis, Axis, Axis]]) -> dict[str, tuple[Axis, Axis, Axis]]:
         _known(value, ("imu", "cam"), "frame")
         for name, axes in value.items():
-            if sorted(axis[-1] for axis in axes) != ["x", "y", "z"] or _handedness(axes) != 1:
+            order, flipped = "".join(axis[-1] for axis in axes), sum(axis.startswith("-") for axis in axes) % 2 == 1
+            if sorted(order) != ["x", "y", "z"] or (order in ("xyz", "yzx", "zxy")) == flipped:
                 raise InputError(f"frames.{name} = {list(axes)}: expected x, y and z once each, right-handed")
         return value
 
@@ -135,13 +136,6 @@ def _known(names: Any, valid: Any, what: str) -> None:
     for name in names:
         if name not in valid:
             raise unknown_name(what, str(name), valid)
-
-
-def _handedness(axes: tuple[str, ...]) -> int:
-    places = [("x", "y", "z").index(axis[-1]) for axis in axes]
-    even = places in ([0, 1, 2], [1, 2, 0], [2, 0, 1])
-    flipped = sum(axis.startswith("-") for axis in axes) % 2
-    return 1 if even != bool(flipped) else -1
 
 
 def read_map(path: str | Path) -> dict[str, Any]:
@@ -157,20 +151,16 @@ def read_map(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def combine(proposed: LogMap, given: Mapping[str, Any], where: str) -> LogMap:
+def combine(proposed: LogMap, given: Mapping[str, Any]) -> LogMap:
     """Return the proposed map with what is given laid over it.
 
     Raises:
         InputError: what comes out is no map.
     """
-    return parse_config(LogMap, overlay(content(proposed), _plain(given)), where)
-
-
-def _plain(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a map with joints by name in the long form, so that only what it says replaces what was proposed."""
-    joints = given.get("joints") or {}
-    long = {joint: {"name": str(one)} if isinstance(one, str | int) else one for joint, one in joints.items()}
-    return {**given, **({"joints": long} if joints else {})}
+    changes, joints = dict(given), given.get("joints")
+    if joints:  # by name in the long form, so that only what is said of them replaces what was proposed
+        changes["joints"] = {joint: {"name": str(one)} if isinstance(one, str | int) else one for joint, one in joints.items()}
+    return parse_config(LogMap, overlay(content(proposed), changes), "map")
 
 
 def content(found: LogMap) -> dict[str, Any]:

@@ -115,16 +115,12 @@ def _parts(made: MadeRun, split: float | None) -> Iterator[MadeRun]:
         made = replace(made, notes=(*made.notes, text))
     for first, last in kept:
         piece = made if len(pieces) == 1 else _part(made, first, last)
-        edges = [0, *_cuts(piece, split), len(piece.table["t"])]
+        whole = float(piece.table["t"][-1])
+        count = max(round(whole / split), 1)
+        cuts = [_quiet_row(piece, k * whole / count, whole / count) for k in range(1, count)]
+        edges = [0, *cuts, len(piece.table["t"])]
         for begin, end in itertools.pairwise(edges):
             yield piece if len(edges) == 2 else _part(piece, begin, end)
-
-
-def _cuts(made: MadeRun, split: float) -> list[int]:
-    """Return the rows that begin the second part of a recording without holes, and those after it."""
-    whole = float(made.table["t"][-1])
-    count = max(round(whole / split), 1)
-    return [_quiet_row(made, k * whole / count, whole / count) for k in range(1, count)]
 
 
 def _quiet_row(made: MadeRun, middle: float, length: float) -> int:

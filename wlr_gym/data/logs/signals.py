@@ -85,10 +85,14 @@ class LogSignals:
         """Whether all these columns have a field."""
         return all(column in self.chosen for column in columns)
 
+    def clock(self, topic: str) -> TopicClock:
+        """Return the clock of a topic, as far as it is known."""
+        return self.clocks.get(topic, TopicClock())
+
     def raw(self, column: str) -> tuple[Array, Array]:
         """Return times (s, from the log's start) and values of a column's field, as the log has them."""
         chosen = self.chosen[column]
-        topic, clock = self.log.topics[chosen.topic], self.clocks.get(chosen.topic, TopicClock())
+        topic, clock = self.log.topics[chosen.topic], self.clock(chosen.topic)
         if chosen.field not in topic.fields:
             at, values = pose_angle(topic, chosen.field, clock.use, self.frames.get("cam"), self.log.name)
         else:
@@ -105,7 +109,7 @@ class LogSignals:
         yaw = self.chosen.get("cam_yaw")
         if yaw is None or yaw.topic != name:
             return np.zeros(0, np.int64)
-        return lost_frames(self.log.topics[name], yaw.field, self.clocks.get(name, TopicClock()).use, self.log.name)
+        return lost_frames(self.log.topics[name], yaw.field, self.clock(name).use, self.log.name)
 
     def note(self, what: str, sure: str, why: str) -> None:
         """Keep a reason."""
@@ -159,11 +163,6 @@ def over_windows(t: Array, angle: Array, grid: Array) -> Array:
     return np.interp(grid + WINDOW, t, angle) - np.interp(grid, t, angle)
 
 
-def integral(t: Array, rate: Array) -> Array:
-    """Return the running integral of a rate."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t))])
-
-
 def common_grid(*times: Array) -> Array:
     """Return where windows begin that all signals cover, 0.1 s apart."""
     begin, end = max(t[0] for t in times), min(t[-1] for t in times)
@@ -176,8 +175,6 @@ def likeness(measured: Array, expected: Array) -> Likeness | None:
         return None
     product = float(measured @ expected)
     sizes = float(measured @ measured), float(expected @ expected)
-    if min(sizes) == 0.0:
-        return None
     return Likeness(product / sizes[1], product / np.sqrt(sizes[0] * sizes[1]))
 
 

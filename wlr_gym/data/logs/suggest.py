@@ -70,7 +70,7 @@ def propose(log: Log, robot: Robot, given: Mapping[str, Any] | None = None) -> P
     proposed = LogMap.model_validate(_content(look, joints, units))
     used = {one.topic for one in look.chosen.values()}
     unused = tuple(name for name in log.topics if name not in used)
-    return Proposal(combine(proposed, given, "map"), tuple(look.reasons), unused)
+    return Proposal(combine(proposed, given), tuple(look.reasons), unused)
 
 
 def _look(log: Log, robot: Robot, known: LogMap) -> LogSignals:
@@ -87,7 +87,7 @@ def _look(log: Log, robot: Robot, known: LogMap) -> LogSignals:
     _leave_out_short(log, chosen)
     rows = known.rows or (chosen["pos_leg_lf"].topic if "pos_leg_lf" in chosen else topics[0])
     clocks = roughly_one_clock(log, topics, known.clocks, rows)
-    return LogSignals(log, robot, chosen, known, clocks)
+    return LogSignals(log, robot, chosen, known, clocks, frames=dict(known.frames))
 
 
 def _unnamed(look: LogSignals) -> None:
@@ -169,10 +169,8 @@ def _every(look: LogSignals, rows: str | None) -> int:
     t, _ = look.raw("pos_leg_lf")
     rate = 1.0 / float(np.median(np.diff(t)))
     every = max(round(rate / 50.0), 1)
-    text = f"topic '{rows}', {rate:.0f} messages a second" + (
-        f"; every {every}th makes a row" if every > 1 else "; each makes a row"
-    )
-    look.note("rows", SURE, text)
+    which = f"every {every}th" if every > 1 else "each"
+    look.note("rows", SURE, f"topic '{rows}', {rate:.0f} messages a second; {which} makes a row")
     return every
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.data.check import integral
 from wlr_gym.data.logs.align import Lag, find_lag
-from wlr_gym.data.logs.map import TopicClock
 from wlr_gym.data.logs.poses import pose_angle
 from wlr_gym.data.logs.signals import (
     GUESS,
@@ -17,7 +17,6 @@ from wlr_gym.data.logs.signals import (
     BodyMotion,
     LogSignals,
     common_grid,
-    integral,
     likeness,
     over_windows,
     unit_of,
@@ -99,7 +98,9 @@ def find_pose(look: LogSignals) -> BodyMotion | None:
     topic = look.chosen["cam_x"].topic
     by_name = look.log.topics[topic].kind.endswith(("PoseStamped", "Odometry")) or topic == "table"
     taken = ", ".join(look.chosen[f"cam_{axis}"].field for axis in ("x", "y", "yaw"))
-    text = f"topic '{topic}': {taken}; in {unit} by how fast the robot can be{_said_lost(look, topic)}"
+    lost = len(look.lost(topic))
+    left_out = f"; {lost} frames without a rotation left out" if lost else ""
+    text = f"topic '{topic}': {taken}; in {unit} by how fast the robot can be{left_out}"
     look.note("cam", SURE if by_name else LIKELY, text)
     _said_tilt(look)
     if "odom" in topic.lower() or look.log.topics[topic].kind.endswith("Odometry"):
@@ -115,16 +116,11 @@ def _said_tilt(look: LogSignals) -> None:
     if chosen.field in topic.fields:
         return
     field = f"{chosen.field.rpartition('.')[0]}.tilt"
-    use = look.clocks.get(chosen.topic, TopicClock()).use
+    use = look.clock(chosen.topic).use
     tilt = float(np.median(pose_angle(topic, field, use, look.frames.get("cam"), look.log.name)[1]))
     if tilt > _TILTED:
         text = f"its quaternion tilts the robot by {np.degrees(tilt):.0f} deg in the median: are its parts in another order"
         look.note("cam_yaw", GUESS, f"topic '{chosen.topic}': {text} (x, y, z, w against w, x, y, z), or is its z not up?")
-
-
-def _said_lost(look: LogSignals, topic: str) -> str:
-    lost = len(look.lost(topic))
-    return f"; {lost} frames without a rotation left out" if lost else ""
 
 
 def _in_degrees(look: LogSignals, yaw: Array) -> bool:
@@ -148,8 +144,6 @@ def _length_unit(look: LogSignals, t: Array, x: Array, y: Array) -> str:
 def _upright(look: LogSignals) -> None:
     """Find out which axis of a pose points up: the one that hardly changes while the robot drives."""
     if not look.has("cam_z") or "cam" in look.given.frames:
-        if "cam" in look.given.frames:
-            look.frames["cam"] = look.given.frames["cam"]
         return
     spread = [float(np.ptp(look.raw(f"cam_{axis}")[1])) for axis in XYZ]
     still = int(np.argmin(spread))
@@ -202,9 +196,7 @@ def find_imu(look: LogSignals, body: BodyMotion | None, wheels: BodyMotion | Non
     units: dict[str, str] = {}
     up = _upward(look, units)
     yaw = _yaw_axis(look, body, wheels, units, up)
-    if "imu" in look.given.frames:
-        look.frames["imu"] = look.given.frames["imu"]
-    else:
+    if "imu" not in look.given.frames:
         _axes(look, up, yaw, body, wheels)
     x, _, z = look.frames.get("imu", XYZ)
     heading = _along(look, "gyro", z) if yaw is not None else None
@@ -283,7 +275,7 @@ def _yaw_axis(
     lag = known[axis]
     is_clear = lag.believable and abs(lag.correlation) - lag.opposite > _MARGIN
     if topic not in look.given.clocks and is_clear and abs(lag.seconds) > _ROUGH:
-        clock = look.clocks.get(topic, TopicClock())
+        clock = look.clock(topic)
         look.clocks[topic] = clock.model_copy(update={"offset": clock.offset + lag.seconds})
     if abs(lag.correlation) < 0.6:
         text = f"its turning does not go with {by} (correlation {abs(lag.correlation):.2f}): neither unit nor axis shows"

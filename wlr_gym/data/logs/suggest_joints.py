@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.data.check import integral
 from wlr_gym.data.logs.names import words
 from wlr_gym.data.logs.signals import (
     GUESS,
@@ -17,7 +19,6 @@ from wlr_gym.data.logs.signals import (
     Likeness,
     LogSignals,
     common_grid,
-    integral,
     likeness,
     over_windows,
     unit_of,
@@ -28,7 +29,10 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-_ANGLES, _RATES = FACTORS["rad"], FACTORS["rad/s"]
+_ANGLES = FACTORS["rad"]
+#: Units that setpoints and rates are likely to be in.
+_ANGLE_UNITS = {unit: _ANGLES[unit] for unit in ("rad", "deg", "count")}
+_RATE_UNITS = {unit: FACTORS["rad/s"][unit] for unit in ("rad/s", "deg/s", "rpm", "count")}
 #: rad; angles whose steps nearly reach one of these start anew after it.
 _LARGEST_ANGLE = 2.2 * np.pi
 #: Correlation from which on a comparison decides.
@@ -178,14 +182,12 @@ def _legs_against_body(look: LogSignals, found: JointFindings, motion: BodyMotio
 
 
 def _mirror(found: JointFindings, leg: str, look: LogSignals) -> None:
-    """Turn a leg's sign; straight down stays straight down."""
-    sign, zero = found.joint_sign.get(leg, 1), found.joint_zero.get(leg, 0.0)
+    """Turn a leg's sign; straight down stays straight down: -s (x - z') = 2 down - s (x - z)."""
+    sign = found.joint_sign.get(leg, 1)
     found.joint_sign[leg] = -sign
-    down = look.robot.home.leg_angle
-    zero_now = zero + 2.0 * sign * down  # -s (x - z') = 2 down - s (x - z)
-    found.joint_zero[leg] = float(zero_now)
-    if abs(found.joint_zero[leg]) < 1e-9:
-        del found.joint_zero[leg]
+    zero = found.joint_zero.pop(leg, 0.0) + 2.0 * sign * look.robot.home.leg_angle
+    if abs(zero) >= 1e-9:
+        found.joint_zero[leg] = float(zero)
 
 
 # ---- rates, setpoints, efforts ---------------------------------------------------------------------------------------
@@ -193,23 +195,22 @@ def _mirror(found: JointFindings, leg: str, look: LogSignals) -> None:
 
 def _rate(look: LogSignals, found: JointFindings, joint: str) -> None:
     column = f"vel_{joint}"
-    if not look.has(column):
-        return
-    hint = look.chosen[column].unit
-    same = _rate_against_angle(look, found, joint, column)
-    if hint in _RATES:
+    if look.has(column):
+        of_same_kind = {"deg": "deg/s", "count": "count"}.get(found.unit.get(f"pos_{joint}", "rad"), "rad/s")
+        _decide(look, found, column, _rate_against_angle(look, found, joint, column), _RATE_UNITS, of_same_kind)
+
+
+def _decide(
+    look: LogSignals, found: JointFindings, column: str, same: Likeness | None, units: Mapping[str, float], default: str
+) -> None:
+    """Set a column's unit: that of its name, else by how it goes with the joint's angle, else the default; and its sign."""
+    hint, clear = look.chosen[column].unit, same is not None and abs(same.correlation) > _CLEAR
+    if hint is not None and hint in units:
         found.unit[column] = hint
-    elif same is not None and abs(same.correlation) > _CLEAR:
-        found.unit[column], _ = unit_of(same.ratio, {unit: _RATES[unit] for unit in ("rad/s", "deg/s", "rpm", "count")})
     else:
-        found.unit[column] = _same_kind(found, joint)
+        found.unit[column] = unit_of(same.ratio, units)[0] if same is not None and clear else default
     if same is not None and same.correlation < -_CLEAR:
         found.sign[column] = -1
-
-
-def _same_kind(found: JointFindings, joint: str) -> str:
-    angle_unit = found.unit.get(f"pos_{joint}", "rad")
-    return {"deg": "deg/s", "count": "count"}.get(angle_unit, "rad/s")
 
 
 def _rate_against_angle(look: LogSignals, found: JointFindings, joint: str, column: str) -> Likeness | None:
@@ -229,22 +230,12 @@ def _setpoint(look: LogSignals, found: JointFindings, joint: str) -> None:
     column = f"cmd_{joint}"
     if not look.has(column):
         return
-    hint = look.chosen[column].unit
     if joint in WHEELS:
-        same = _rate_against_angle(look, found, joint, column)
-        units = {unit: _RATES[unit] for unit in ("rad/s", "deg/s", "rpm", "count")}
-        default = found.unit.get(f"vel_{joint}", "rad/s")
+        same, default = _rate_against_angle(look, found, joint, column), found.unit.get(f"vel_{joint}", "rad/s")
+        _decide(look, found, column, same, _RATE_UNITS, default)
     else:
-        same = _against_position(look, found, joint, column)
-        units = {unit: _ANGLES[unit] for unit in ("rad", "deg", "count")}
-        default = found.unit.get(f"pos_{joint}", "rad")
-    if hint in units:
-        found.unit[column] = hint
-    else:
-        clear = same is not None and abs(same.correlation) > _CLEAR
-        found.unit[column] = unit_of(same.ratio, units)[0] if clear and same is not None else default
-    if same is not None and same.correlation < -_CLEAR:
-        found.sign[column] = -1
+        same, default = _against_position(look, found, joint, column), found.unit.get(f"pos_{joint}", "rad")
+        _decide(look, found, column, same, _ANGLE_UNITS, default)
 
 
 def _against_position(look: LogSignals, found: JointFindings, leg: str, column: str) -> Likeness | None:

@@ -57,13 +57,9 @@ def find_sides(look: LogSignals, found: JointFindings) -> None:
     for side, sign in (("left", best.left), ("right", best.right)):
         for wheel in _SIDES[side]:
             found.joint_sign[wheel] = sign * found.joint_sign.get(wheel, 1)
-    sure = GUESS if upward is None else LIKELY
+    sure, by = (GUESS, "is not shown") if upward is None else (LIKELY, f"by gravity along {upward}")
     ways = f"left {best.left:+d}, right {best.right:+d}"
-    look.note("joints.wheel_*.sign", sure, f"{ways}: no pose; {text}; which way as a whole, {_by(upward)}")
-
-
-def _by(upward: str | None) -> str:
-    return "is not shown" if upward is None else f"by gravity along {upward}"
+    look.note("joints.wheel_*.sign", sure, f"{ways}: no pose; {text}; which way as a whole, {by}")
 
 
 def _readings(look: LogSignals, found: JointFindings) -> list[_Reading]:

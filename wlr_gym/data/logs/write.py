@@ -6,7 +6,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
@@ -59,35 +58,6 @@ class McapSink:
     def finish(self) -> None:
         """Write the index; the file stays open."""
         self._writer.finish()
-
-
-class RosbagSink:
-    """Writes messages of ROS 2 into a new rosbag2 (sqlite3).
-
-    Args:
-        folder: of the bag; it must not be there.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        require_package("rosbags", "logs")
-        from rosbags.rosbag2 import Writer
-
-        self._writer = Writer(folder, version=8)
-        self._connections: dict[str, Any] = {}
-
-    def __enter__(self) -> RosbagSink:
-        self._writer.open()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._writer.close()
-
-    def add(self, message: Sent) -> None:
-        """Write a message."""
-        if message.topic not in self._connections:
-            added = self._writer.add_connection(message.topic, message.kind, typestore=typestore())
-            self._connections[message.topic] = added
-        self._writer.write(self._connections[message.topic], message.time, message.data)
 
 
 def export_run(run: Run, path: Path, form: str = "mcap") -> Path:
@@ -144,12 +114,18 @@ def _write_rosbag(path: Path, run: Run) -> None:
     """A folder cannot be replaced in one step: the bag is made beside its place and moved there when complete."""
     if path.exists():
         raise InputError(f"{path}: is there already; a bag is written to a new folder")
+    require_package("rosbags", "logs")
+    from rosbags.rosbag2 import Writer
+
+    connections: dict[str, Any] = {}
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as made:
             bag = Path(made) / path.name
-            with RosbagSink(bag) as sink:
+            with Writer(bag, version=8) as writer:
                 for message in messages_of(run):
-                    sink.add(message)
+                    if message.topic not in connections:
+                        connections[message.topic] = writer.add_connection(message.topic, message.kind, typestore=typestore())
+                    writer.write(connections[message.topic], message.time, message.data)
             shutil.move(bag, path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
