@@ -61,7 +61,8 @@ NESTED = {("vision", "check")}
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``wlr`` and return its exit code: 0 done, 1 failed, 2 bad input, 130 interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    _prepare_compilation()
+    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # numba colours messages that nobody reads
+    gc.set_threshold(max(50_000, gc.get_threshold()[0]))  # and leaves much to the garbage collector while it compiles
     try:
         try:
             return _answered(words)
@@ -84,12 +85,6 @@ def _answered(words: list[str]) -> int:
     except KeyboardInterrupt as interruption:
         _say(str(interruption) or "interrupted", "yellow")
         return INTERRUPTED
-
-
-def _prepare_compilation() -> None:
-    """Save numba time: it colours messages that nobody reads while it compiles, and leaves much to the garbage collector."""
-    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
-    gc.set_threshold(max(50_000, gc.get_threshold()[0]))
 
 
 def _output_is_closed() -> bool:

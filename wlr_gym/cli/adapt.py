@@ -9,12 +9,10 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -30,9 +28,6 @@ if TYPE_CHECKING:
 
     from wlr_gym.learning.adaptation import Adapted
     from wlr_gym.learning.adaptation.robots import RealRobot
-
-#: Without it the page would be of nothing.
-_NONE_CHOSEN = "nothing to adapt to: give measured runs (--robot-runs DATA), an emulated robot (--emulated), or --hardware FILE"
 
 
 @dataclass(frozen=True)
@@ -89,54 +84,49 @@ def run(options: AdaptOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.learning.adaptation import adapt
+    from wlr_gym.learning.adaptation.page import NUMBERS_FILE
 
     _check(options)
     console = Console(soft_wrap=True, highlight=False, file=sys.stderr if options.json else None)
     real = _real(options, console) if options.hardware is not None else None
-    with _resumable(), progress(console) as tell:
-        found = adapt(
-            options.policy,
-            options.out,
-            robot_runs=options.robot_runs,
-            driven=real,
-            effects=options.patch() if options.emulated else None,
-            backend=options.backend,
-            environment=options.env,
-            robot=options.robot,
-            excitations=options.excitation,
-            budget_runs=options.budget_runs,
-            budget_seconds=options.budget_seconds,
-            drives=options.drives,
-            drive_seconds=options.drive_seconds,
-            steps=options.steps,
-            learning_rate=options.learning_rate,
-            episodes=options.episodes,
-            sensors=options.present() or (),
-            seed=options.seed,
-            threads=options.threads or os.cpu_count() or 1,
-            tell=partial(tell, ""),
-        )
-    if options.json:
-        from wlr_gym.learning.adaptation.page import NUMBERS_FILE
-
-        print_json(json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8")))
-        return OK
-    _print(found, console)
-    return OK
-
-
-@contextmanager
-def _resumable() -> Iterator[None]:
-    """Say on Ctrl-C how it goes on."""
     try:
-        yield
+        with progress(console) as tell:
+            found = adapt(
+                options.policy,
+                options.out,
+                robot_runs=options.robot_runs,
+                driven=real,
+                effects=options.patch() if options.emulated else None,
+                backend=options.backend,
+                environment=options.env,
+                robot=options.robot,
+                excitations=options.excitation,
+                budget_runs=options.budget_runs,
+                budget_seconds=options.budget_seconds,
+                drives=options.drives,
+                drive_seconds=options.drive_seconds,
+                steps=options.steps,
+                learning_rate=options.learning_rate,
+                episodes=options.episodes,
+                sensors=options.present() or (),
+                seed=options.seed,
+                threads=options.threads or os.cpu_count() or 1,
+                tell=partial(tell, ""),
+            )
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted; the same command goes on where it was") from None
+    content = json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"))
+    if options.json:
+        print_json(content)
+    else:
+        _print(found, content, console)
+    return OK
 
 
 def _check(options: AdaptOptions) -> None:
     if not (options.robot_runs or options.emulated or options.hardware):
-        raise InputError(_NONE_CHOSEN)
+        robots = "measured runs (--robot-runs DATA), an emulated robot (--emulated), or --hardware FILE"
+        raise InputError(f"nothing to adapt to: give {robots}")
     if options.emulated and (options.robot_runs or options.hardware):
         raise InputError("--emulated: an emulated robot, a real one (--hardware) or its runs (--robot-runs): one of them")
     if options.effects and not options.emulated:
@@ -159,12 +149,11 @@ def _real(options: AdaptOptions, console: Console) -> RealRobot:
     return RealRobot(own, options.hardware or "nominal", port_pairs(options.port), ask)
 
 
-def _print(found: Adapted, console: Console) -> None:
+def _print(found: Adapted, content: dict[str, Any], console: Console) -> None:
     from wlr_gym.base.text import duration
     from wlr_gym.cli.tables import print_table
-    from wlr_gym.learning.adaptation.page import NUMBERS_FILE, headline
+    from wlr_gym.learning.adaptation.page import headline
 
-    content = json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"))
     rows = [
         (name, duration(one.driving), duration(one.computing), one.said[0] if one.said else "")
         for name, one in found.steps.items()

@@ -43,8 +43,6 @@ MEASUREMENTS = {
     "camera": "wlr_gym.studies.bench.camera_chain:measure_camera",
     "sysid": "wlr_gym.studies.bench.sysid:measure_sysid",
 }
-#: Measurements with rows of their own kind; each has its list in the report.
-_OWN_ROWS = ("convergence", "vision")
 #: Take long or need packages that few have: only made when named.
 _ON_REQUEST = ("vision", "bus", "camera", "perception", "learning", "sysid")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
@@ -121,14 +119,15 @@ def run(options: BenchOptions) -> int:
     if options.out is not None:
         return _lab_films(options, asked)
     console = Console()
-    report: dict[str, Any] = {"schema": SCHEMA, "machine": machine(), "rounds": options.rounds, "quick": options.quick}
+    here = machine()
+    report: dict[str, Any] = {"schema": SCHEMA, "machine": here, "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
-    console.print(_machine_line(report["machine"]))
+    console.print(f"{here['processor']}, {here['cores']} cores, {here['system']}; {tally(here['versions'])}")
     names = asked or tuple(name for name in MEASUREMENTS if name not in _ON_REQUEST)
     for name, rows in _measured(names, Size(options.rounds, options.quick), console):
         if name == "engine":
             rows = _engine_pairs(rows, report, console, options.save)
-        report[name if name in _OWN_ROWS else "measurements"] += [row.as_dict() for row in rows]
+        report[name if name in _TABLES else "measurements"] += [row.as_dict() for row in rows]
         _TABLES.get(name, _print_speed)(rows, console)
     if options.json:
         print_json(report)
@@ -147,7 +146,8 @@ def _measured(names: Sequence[str], size: Size, console: Console) -> Iterator[tu
                 tell("", f"measuring {name}", (done + share) / len(names))
 
             told(0.0)
-            yield name, _measure(name, replace(size, tell=told))
+            module, _, function = MEASUREMENTS[name].partition(":")
+            yield name, getattr(importlib.import_module(module), function)(replace(size, tell=told))
 
 
 def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:
@@ -258,16 +258,6 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
     return OK
 
 
-def _measure(name: str, size: Size) -> Any:
-    module, _, function = MEASUREMENTS[name].partition(":")
-    return getattr(importlib.import_module(module), function)(size)
-
-
-def _machine_line(found: dict[str, Any]) -> str:
-    packages = tally(found["versions"])
-    return f"{found['processor']}, {found['cores']} cores, {found['system']}; {packages}"
-
-
 def _print_speed(rows: Sequence[Measurement], console: Console) -> None:
     """Print what was measured; a peer is named below what it is held against, one unit of all rows in the title."""
     units = {row.unit for row in rows}
@@ -279,17 +269,14 @@ def _print_speed(rows: Sequence[Measurement], console: Console) -> None:
         ratio = f">= {ratio}" if row.at_least else ratio
         bar = "-" if row.bar is None else f">= {row.bar:.3g}" if row.peer else f"< {row.bar:g}"
         what = f"{row.what}\n  peer: {row.peer_name}" if row.peer else row.what
-        ours = _number(found["ours"], row.unit)
+        form = "{median:.2f} [{min:.2f}..{max:.2f}]" if row.unit in ("s", "-") else "{median:,.0f}"
+        ours = form.format(**found["ours"])
         cells.append((what, ours if len(units) == 1 else f"{ours} {row.unit}", peer, ratio, bar, _YES_NO[row.met]))
     title = f"{rows[0].name}, {units.pop()}" if len(units) == 1 else rows[0].name
     print_table(console, ("what", "ours", "peer", "ratio [min..max]", "bar", "met"), cells, title)
 
 
 _YES_NO = {True: "yes", False: "NO", None: "-"}
-
-
-def _number(found: dict[str, Any], unit: str) -> str:
-    return ("{median:.2f} [{min:.2f}..{max:.2f}]" if unit in ("s", "-") else "{median:,.0f}").format(**found)
 
 
 def _print_convergence(rows: Sequence[Deviation], console: Console) -> None:
@@ -309,6 +296,7 @@ def _print_vision(rows: Sequence[VisionResult], console: Console) -> None:
     print_table(console, ("what", "method", "value", "bar", "met", "samples"), cells, "vision (rendered)")
 
 
+#: Measurements with rows of their own kind; each has its list in the report.
 _TABLES = {"convergence": _print_convergence, "vision": _print_vision}
 
 

@@ -165,13 +165,13 @@ def _named(source: str, frames: Frames, tell: Callable[[str, float], None]) -> I
 
 def _shutter(camera: Camera, told: Readout) -> str:
     """What is known of the shutter, in words."""
+    found = f" (found {1e3 * told.value:.1f} ± {1e3 * told.std:.1f} ms)" if math.isfinite(told.std) else ""
     if camera.readout is None:
-        seen = f" (found {1e3 * told.value:.1f} ± {1e3 * told.std:.1f} ms)" if math.isfinite(told.std) else ""
         return (
-            f"readout not known{seen}: films of the robot tell it themselves, a live camera needs it. Calibrate from a video "
+            f"readout not known{found}: films of the robot tell it themselves, a live camera needs it. Calibrate from a video "
             "in which the board moves to and fro, up and down, or give --readout (0 for a global shutter)"
         )
-    known = f" (found {1e3 * told.value:.1f} ± {1e3 * told.std:.1f} ms)" if math.isfinite(told.std) and told.std else " (given)"
+    known = found if found and told.std else " (given)"
     if camera.readout == 0:
         return f"global shutter{known}"
     return f"rolling shutter: {1e3 * camera.readout:.1f} ms from the first row to the last{known}"

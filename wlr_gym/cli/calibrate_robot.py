@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import find_config
 from wlr_gym.base.text import tally
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import JsonOption
@@ -35,8 +36,6 @@ Result = TypeVar("Result")
 
 #: Which side of the sensor points up, in the order of the poses.
 _UP = ("z up (as it stands)", "z down", "x up", "x down", "y up", "y down")
-#: Reads averaged for one angle.
-_READS = 20
 
 
 @dataclass(frozen=True)
@@ -196,8 +195,8 @@ def _calibrate(joint: str, robot: Robot, hardware: Hardware, servos: Servos, ask
 
 
 def _counts(servos: Servos) -> NDArray[np.float64]:
-    """Return Present Position of all joints in counts, averaged."""
-    return np.mean([[servos.get(joint, "present_position") for joint in JOINTS] for _ in range(_READS)], axis=0)
+    """Return Present Position of all joints in counts, the average of 20 reads."""
+    return np.mean([[servos.get(joint, "present_position") for joint in JOINTS] for _ in range(20)], axis=0)
 
 
 def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
@@ -280,11 +279,7 @@ def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
 
 @contextlib.contextmanager
 def _dialogue() -> Iterator[None]:
-    """Turn trouble with the hardware into a message: nothing moves, so there is nothing to save.
-
-    Raises:
-        InputError: a servo or the IMU does not answer as it should.
-    """
+    """Turn trouble with the hardware into an :class:`InputError`: nothing moves, so there is nothing to save."""
     from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 
     try:
@@ -320,8 +315,6 @@ def _yes(ask: Ask, text: str) -> bool:
 
 def source_of(hardware: str, out: Path) -> Path:
     """Return the file the hardware comes from; refuse to write over another one."""
-    from wlr_gym.base.paths import find_config
-
     source = find_config("hardware", hardware)
     if out.suffix not in {".yaml", ".yml"} or not out.parent.is_dir():
         raise InputError(f"--out {out}: expected a .yaml file in a folder that exists")

@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
+from wlr_gym.base.paths import find_config
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import RobotOption, ask_terminal
+from wlr_gym.cli.tables import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,8 +38,6 @@ if TYPE_CHECKING:
 REPORT = "commission.json"
 #: File in ``--out``: the hardware file with what was measured.
 COPY = "hardware.yaml"
-#: Digits of a value in the table.
-_DIGITS = 3
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,6 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, refuse_existing
     from wlr_gym.hardware.commissioning.registry import choose
 
     console = Console(soft_wrap=True, highlight=False, stderr=options.json)
@@ -128,8 +128,6 @@ def _named(options: CommissionOptions, robot: Robot) -> str:
 def _commission(
     options: CommissionOptions, out: Path, tests: Sequence[StandTest], ask: Callable[[str], str], console: Console
 ) -> int:
-    from wlr_gym.base.files import write_json
-    from wlr_gym.base.paths import find_config
     from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.commissioning.runner import Commissioning, content_of
     from wlr_gym.hardware.config import load_hardware
@@ -209,8 +207,6 @@ def _write(target: Path, source: Path, findings: Iterable[StandFinding], earlier
 
 
 def _list(tests: Sequence[StandTest], console: Console, as_json: bool) -> None:
-    from wlr_gym.cli.tables import print_table
-
     rows = [{"test": one.name, "what": one.title, "hands": one.asks or "off", "moves": one.moves} for one in tests]
     if as_json:
         print_json(rows)
@@ -220,8 +216,6 @@ def _list(tests: Sequence[StandTest], console: Console, as_json: bool) -> None:
 
 def _print_table(findings: Sequence[StandFinding], console: Console) -> None:
     """One row for all places where a quantity is as expected, one for each where it differs; then what to do."""
-    from wlr_gym.cli.tables import print_table
-
     groups = []
     for quantity in dict.fromkeys(finding.quantity for finding in findings):
         alike = [finding for finding in findings if finding.quantity == quantity]
@@ -247,10 +241,9 @@ def _untested(tests: Sequence[StandTest], results: Sequence[StandResult]) -> lis
 
 def _print_end(findings: Sequence[StandFinding], untested: Sequence[str], console: Console) -> None:
     """Say what was not tested, and whether all that was is as expected."""
-    is_good = bool(findings) and all(finding.is_expected for finding in findings)
     if untested:
         console.print(f"Not tested: {', '.join(untested)}.", style="bold yellow")
-    if is_good:
+    if findings and all(finding.is_expected for finding in findings):
         rest = " of the other tests" if untested else ""
         console.print(f"All {len(findings)} values{rest} as expected.", style="" if untested else "bold green")
 
@@ -264,6 +257,6 @@ def _row(group: Sequence[StandFinding]) -> tuple[str, ...]:
 
 
 def _span(values: Sequence[float], unit: str) -> str:
-    low, high = (f"{round(value, 9) + 0.0:.{_DIGITS}g}" for value in (min(values), max(values)))
+    low, high = (f"{round(value, 9) + 0.0:.3g}" for value in (min(values), max(values)))
     text = low if low == high else f"{low} .. {high}"
     return text if unit == "-" else f"{text} {unit}"

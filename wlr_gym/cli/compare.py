@@ -13,8 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import output_folder, refuse_existing, write_json, write_text
+from wlr_gym.base.progress import progress
+from wlr_gym.base.provenance import record_provenance
+from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_threads, settings_of
 from wlr_gym.cli.results import print_json
+from wlr_gym.cli.tables import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,8 +34,6 @@ if TYPE_CHECKING:
 
 #: Share of the time that driving takes, about; drawing takes the rest.
 _DRIVES = 0.7
-#: Letters of the effects in a figure's file name, the last ones: file systems take 255 in all.
-_LONGEST_LABEL = 120
 
 
 @dataclass(frozen=True)
@@ -76,11 +79,8 @@ def run(options: CompareOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import output_folder, refuse_existing, write_json, write_text
-    from wlr_gym.base.provenance import record_provenance
-    from wlr_gym.cli import FAILED, OK
     from wlr_gym.data.compared_plants import parse_plant
-    from wlr_gym.data.comparison_report import markdown, summary_table
+    from wlr_gym.data.comparison_report import markdown, summary_table, tables
 
     require_threads(options.threads)
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
@@ -94,16 +94,17 @@ def run(options: CompareOptions) -> int:
         for comparison in _compare_all(options, motions, (first, second), robot, patches, console):
             comparisons.append(comparison)
             if len(patches) == 1 and not options.json:
-                _print_all(console, comparison)
+                for table in tables(comparison):
+                    _print(console, table)
     found = [comparison.as_dict() for comparison in comparisons]
     if options.json:
         print_json(found)
     elif len(patches) > 1:
         _print(console, summary_table(comparisons))
     write_json(options.out / "compare.json", found)
-    text = markdown(comparisons, f"{first.label} and {second.label}")
-    write_text(options.out / "report.md", text)
-    record_provenance(options.out, _resolved(options, motions, robot, patches[0]))
+    write_text(options.out / "report.md", markdown(comparisons, f"{first.label} and {second.label}"))
+    driven = {"robot": robot.name, "motions": [motion.name for motion in motions], "effects": patches[0].content()["effects"]}
+    record_provenance(options.out, settings_of(options) | driven)
     console.print(f"report: {options.out / 'report.md'}", soft_wrap=True)
     return FAILED if options.strict and any(comparison.broken for comparison in comparisons) else OK
 
@@ -118,7 +119,7 @@ def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     if options.seconds is not None and not options.seconds > 0.0:
         raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     if options.runs is None:
-        robot = load_robot(options.robot) if options.robot else load_robot()
+        robot = load_robot(options.robot or "nominal")
         names = options.excitation or tuple(EXCITATIONS)
         return [excite(name, options.seed, robot, seconds=options.seconds) for name in names], robot
     if options.excitation:
@@ -150,7 +151,6 @@ def _compare_all(
     patches: Sequence[Patch],
     console: Console,
 ) -> Iterator[Comparison]:
-    from wlr_gym.base.progress import progress
     from wlr_gym.data.comparison import compare
 
     with progress(console) as tell:
@@ -173,31 +173,13 @@ def _compare_all(
 def _draw(found: Comparison, out: Path, tell: Callable[[str, float], None]) -> None:
     from wlr_gym.data.comparison_report import save_map, save_motion_plot
 
-    label = re.sub(r"[^\w]+", "_", found.effects)[-_LONGEST_LABEL:]
+    label = re.sub(r"[^\w]+", "_", found.effects)[-120:]  # file systems take names of 255 letters
     for index, motion in enumerate(found.motions):
         tell("drawing", index / len(found.motions))
         save_motion_plot(found, index, out / f"{label}_{motion.name}.png")
     save_map(found, out / f"{label}.png")
 
 
-def _resolved(options: CompareOptions, motions: Sequence[Motion], robot: Robot, patch: Patch) -> dict[str, object]:
-    return {
-        **settings_of(options),
-        "robot": robot.name,
-        "motions": [motion.name for motion in motions],
-        "effects": patch.content()["effects"],
-    }
-
-
-def _print_all(console: Console, comparison: Comparison) -> None:
-    from wlr_gym.data.comparison_report import tables
-
-    for table in tables(comparison):
-        _print(console, table)
-
-
 def _print(console: Console, table: ReportTable) -> None:
-    from wlr_gym.cli.tables import print_table
-
     styles = ["red" if any(cell.endswith(" !") for cell in row) else "" for row in table.rows]
     print_table(console, table.headings, table.rows, table.title, styles)

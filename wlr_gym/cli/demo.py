@@ -27,11 +27,13 @@ from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
     from wlr_gym.studies.demo.settings import Demo
-    from wlr_gym.studies.demo.stage import Section
 
-STEPS = 3_000_000
-QUICK_STEPS = 16_384
-_QUICK = {"further_steps": 32_768, "drives": 2, "drive_seconds": 1.0}
+STEPS, QUICK_STEPS = 3_000_000, 16_384
+#: Sizes with --quick.
+_SHORT = {
+    "episodes": 4, "film_seconds": 0.4, "run_seconds": 3.2, "runs": 3, "further_steps": 32_768, "drives": 2,
+    "drive_seconds": 1.0,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ def run(options: DemoOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.base.text import duration
+    from wlr_gym.studies.demo import stage
     from wlr_gym.studies.demo.page import write_page
     from wlr_gym.studies.demo.workers import WORKERS, run_workers
 
@@ -81,7 +84,9 @@ def run(options: DemoOptions) -> int:
             {name: getattr(one, name) for name in ("title", "headline", "verdict", "not_good")} for one in outcome.sections
         ]
         print_json({"page": demo.page, "interrupted": outcome.interrupted, "sections": found})
-    return INTERRUPTED if outcome.interrupted else _code(outcome.sections)
+    if outcome.interrupted:
+        return INTERRUPTED
+    return FAILED if any(one.verdict == stage.FAILED for one in outcome.sections) else OK
 
 
 def _demo(options: DemoOptions) -> Demo:
@@ -90,26 +95,14 @@ def _demo(options: DemoOptions) -> Demo:
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps}: expected 1 or more")
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
-    short = {"episodes": 4, "film_seconds": 0.4, "run_seconds": 3.2, "runs": 3} | _QUICK if options.quick else {}
-    return Demo(options.out, options.seed, steps, **short)
-
-
-def _code(sections: list[Section]) -> int:
-    from wlr_gym.studies.demo import stage
-
-    return FAILED if any(one.verdict == stage.FAILED for one in sections) else OK
-
-
-def _is_demo(folder: Path) -> bool:
-    path = folder / CONFIG_FILE
-    return path.is_file() and "quick" in read_yaml(path)
+    return Demo(options.out, options.seed, steps, **(_SHORT if options.quick else {}))
 
 
 def _clear(folder: Path) -> None:
     """Make the folder anew; one that holds anything but a demo is refused."""
     make_output_folder(folder)
-    inside = list(folder.iterdir())
-    if inside and not _is_demo(folder):
+    inside, config = list(folder.iterdir()), folder / CONFIG_FILE
+    if inside and not (config.is_file() and "quick" in read_yaml(config)):
         raise InputError(
             f"{folder}: '{inside[0].name}' is in the way, and this is not the folder of a demo; give another --out"
         )

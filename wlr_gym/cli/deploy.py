@@ -37,8 +37,6 @@ _LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no 
 _PAD_DEADMAN = 0.2
 #: File of an emulated robot's true pose, and its key among the ports.
 _POSES = "poses"
-#: Steps between two looks of the live status.
-_STATUS_TICKS = 10
 
 
 def run(options: DeployOptions) -> int:
@@ -181,11 +179,7 @@ def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> 
 
 
 def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Console) -> list[DrivingPad]:
-    """Return the gamepad that steers, or none.
-
-    Raises:
-        InputError: its sticks steer none of the task's commands.
-    """
+    """Return the gamepad that steers, or none; refuse one whose sticks steer none of the task's commands."""
     from wlr_gym.hardware.gamepad import DrivingPad
 
     if options.gamepad is None:
@@ -301,7 +295,7 @@ def _serving(
         for helper in helpers:
             helper.serve(loop.operator)
         count += 1
-        if live is not None and count % _STATUS_TICKS == 0:
+        if live is not None and count % 10 == 0:
             live.update(view.table(), refresh=True)
 
     loop.operator.spare = spare

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.safety.check import Check
     from wlr_gym.robot import Robot
 
-#: Times that registers are written: of a servo that answered nothing before, more are seen afterwards.
-_MEND_PASSES = 2
-
 
 @dataclass(frozen=True)
 class DoctorOptions(JsonOption, CameraOption):
@@ -92,7 +89,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
         if options.scan:
             _scan(link, hardware, buses, console)
         servos = preflight.check_servos(link.servos, robot, hardware, joints)
-        for _ in range(_MEND_PASSES if options.mend else 0):
+        for _ in range(2 if options.mend else 0):  # of a servo that answered nothing before, more is seen afterwards
             if not _mend(link, servos, console):
                 break
             servos = preflight.check_servos(link.servos, robot, hardware, joints)
@@ -112,11 +109,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
 
 
 def _mend(link: Link, checks: Sequence[Check], console: Console) -> bool:
-    """Say which registers will be written, ask, write; return whether there were any.
-
-    Raises:
-        InputError: nobody there to ask.
-    """
+    """Say which registers will be written, ask, write; return whether there were any."""
     from wlr_gym.hardware.safety.registers import mend, mendable
 
     registers = [(check.where, check.found, *check.fix) for check in mendable(checks) if check.fix]
@@ -156,11 +149,7 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
 
 
 def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:
-    """Print who answers on the buses.
-
-    Raises:
-        BusGoneError: a port is gone.
-    """
+    """Print who answers on the buses; raise ``BusGoneError`` where a port is gone."""
     from wlr_gym.hardware.dynamixel.errors import BusGoneError
     from wlr_gym.hardware.servo_setup import find_servos
 

@@ -54,7 +54,10 @@ def run(options: EffectsOptions) -> int:
             print_json([_content(_effect(name)) for name in names])
         case names:
             for name in names:
-                _explain(name)
+                if name == UNKNOWN_EFFECT:
+                    _explain_formulas()
+                else:
+                    _explain(_effect(name))
     return OK
 
 
@@ -68,7 +71,8 @@ def _range(bounds: tuple[float, float]) -> str:
 
 def _content(effect: Effect) -> dict[str, Any]:
     """Return an effect as JSON has it."""
-    parameters = {name: {field: getattr(p, field) for field in _FIELDS} for name, p in effect.parameters.items()}
+    fields = ("unit", "doc", "low", "high", "prior", "neutral", "severity", "optional")
+    parameters = {name: {field: getattr(p, field) for field in fields} for name, p in effect.parameters.items()}
     return {
         "name": effect.name,
         "what": effect.doc,
@@ -78,23 +82,7 @@ def _content(effect: Effect) -> dict[str, Any]:
     }
 
 
-#: Of a parameter, as JSON.
-_FIELDS = ("unit", "doc", "low", "high", "prior", "neutral", "severity", "optional")
-
-
-def _explain(name: str) -> None:
-    if name == UNKNOWN_EFFECT:
-        _explain_formulas()
-    else:
-        _explain_effect(_effect(name))
-
-
 def _effect(name: str) -> Effect:
-    """Return an effect of the library.
-
-    Raises:
-        InputError: no such effect.
-    """
     if name in EFFECTS:
         return EFFECTS[name]
     if name.endswith((".yaml", ".yml")) or name in config_names("effects"):
@@ -102,7 +90,7 @@ def _effect(name: str) -> Effect:
     raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT])
 
 
-def _explain_effect(effect: Effect) -> None:
+def _explain(effect: Effect) -> None:
     rows = []
     for name, p in effect.parameters.items():
         cells = (p.doc, _range((p.low, p.high)), _range(p.prior), _neutral(p.neutral), f"{p.severity:g}")

@@ -133,12 +133,8 @@ def machine_of(options: EmulateOptions) -> Machine:
 def _print_ports(server: Server, links: Path | None) -> None:
     buses = server.machine.hardware.buses
     for name, path in server.ports.items():
-        bus = buses.get(name)
-        text = (
-            f"{bus.model}, {bus.baud_rate} bit/s: {', '.join(bus.joints)}"
-            if bus
-            else f"frames of {'the IMU' if name == 'imu' else name}"
-        )
+        bus, sensor = buses.get(name), "the IMU" if name == "imu" else name
+        text = f"{bus.model}, {bus.baud_rate} bit/s: {', '.join(bus.joints)}" if bus else f"frames of {sensor}"
         print(f"{name:8} {links / name if links else path}  {text}", flush=True)
 
 
@@ -162,7 +158,11 @@ def _take_commands(server: Server, seconds: float) -> None:
             data = os.read(source, 4096)
             *lines, text = (text + data).split(b"\n")
             for line in filter(None, map(bytes.strip, lines)):
-                print(_answer(server, line.decode("utf-8", "replace")), flush=True)
+                try:
+                    said = server.command(line.decode("utf-8", "replace"))
+                except InputError as error:
+                    said = f"error: {error}"
+                print(said, flush=True)
             source = source if data else None
 
 
@@ -172,10 +172,3 @@ def _standard_input() -> int | None:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
         return None
-
-
-def _answer(server: Server, line: str) -> str:
-    try:
-        return server.command(line)
-    except InputError as error:
-        return f"error: {error}"

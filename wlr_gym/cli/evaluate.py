@@ -135,7 +135,8 @@ def run(options: EvaluateOptions) -> int:
         print_json(content(card))
     else:
         print_card(card)
-    robot = options.robot or common_robot(read_subjects([options.policy, *(options.baselines or ())]))
+    subjects = read_subjects([options.policy, *(options.baselines or ())])
+    robot = options.robot or common_robot(subjects)
     keywords = {
         "randomization": options.randomization, "robot": robot, "effects": patch, "threads": options.threads,
         "backend": BACKENDS[0] if options.backend == "both" else options.backend, **having(options.present()),
@@ -145,9 +146,8 @@ def run(options: EvaluateOptions) -> int:
         record_provenance(options.out, settings_of(options) | driven | {"effects": patch.content()["effects"]}, options.seed)
         _write(options.out, card, samples, options.seed)
         if options.record:
-            _record(options, _shown(card, read_subjects([options.policy])[0]), options.out / "runs", keywords)
+            _record(options, _shown(card, subjects[0]), options.out / "runs", keywords)
     if options.video is not None:
-        subjects = read_subjects([options.policy, *(options.baselines or ())])
         _film(options, [_shown(card, subject) for subject in subjects[:2]], options.video, keywords)
     return OK
 
@@ -212,15 +212,11 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
         fitting = fitting_baselines(environment, names)
         if len(fitting) < len(names):
             print(f"no baseline here, made for other tasks: {', '.join(name for name in names if name not in fitting)}")
-        chosen["baselines"] = (*fitting, *(_shipped_for(environment) if full else ()))
+        shipped = shipped_names() if full else ()  # reading them needs onnxruntime
+        chosen["baselines"] = (*fitting, *(name for name in shipped if trained_environment(name) == environment))
     elif (subject := read_subjects([options.policy])[0]) in read_subjects(options.baselines):
         print(f"no baseline, the policy itself: {subject.name}")
     return replace(options, **{name: value for name, value in chosen.items() if getattr(options, name) is None})
-
-
-def _shipped_for(environment: str) -> list[str]:
-    """Return the shipped policies that were trained in an environment; reading them needs onnxruntime."""
-    return [name for name in shipped_names() if trained_environment(name) == environment]
 
 
 def _check(options: EvaluateOptions) -> None:

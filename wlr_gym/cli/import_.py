@@ -16,9 +16,12 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.progress import progress
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
+from wlr_gym.cli.tables import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -96,8 +99,6 @@ def _check(options: ImportOptions) -> None:
 @contextmanager
 def _reading(console: Console, log: Path) -> Iterator[Callable[[float], None]]:
     """Show a bar of how much of a log has been read; yields a function that is told the share."""
-    from wlr_gym.base.progress import progress
-
     with progress(console) as tell:
         yield partial(tell, "", f"reading {log.name}")
 
@@ -107,7 +108,6 @@ def _reading(console: Console, log: Path) -> Iterator[Callable[[float], None]]:
 
 def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) -> dict[str, Any]:
     """Propose, print and write a map; return what it says."""
-    from wlr_gym.base.files import make_output_folder
     from wlr_gym.data.logs import suggest_map
     from wlr_gym.data.logs.importing import MAP_FILE, write_map
     from wlr_gym.data.logs.map import content
@@ -123,19 +123,13 @@ def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) ->
 
 
 def _print_proposal(found: Proposal, console: Console) -> None:
-    from wlr_gym.cli.tables import print_table
+    from wlr_gym.data.logs.map import GROUPS
 
     rows = [(reason.what, reason.sure, reason.why) for reason in found.reasons]
     print_table(console, ("of the map", "how sure", "why"), rows, styles=[_COLOURS[reason.sure] for reason in found.reasons])
     if found.unused:
         console.print(f"not used: {', '.join(found.unused)}", style="dim", markup=False)
-    _print_costs(_columns(found), console)
-
-
-def _columns(found: Proposal) -> set[str]:
-    from wlr_gym.data.logs.map import GROUPS
-
-    return {column for key in found.map.channels for column in GROUPS.get(key, (key,))}
+    _print_costs({column for key in found.map.channels for column in GROUPS.get(key, (key,))}, console)
 
 
 def _print_costs(columns: set[str], console: Console) -> None:
@@ -162,8 +156,6 @@ def _report(imported: Sequence[ImportedRun], console: Console) -> None:
 
 
 def _print_facts(one: ImportedRun, console: Console) -> None:
-    from wlr_gym.cli.tables import print_table
-
     rows = []
     groups: dict[tuple[Any, ...], list[Any]] = {}
     for fact in one.facts:

@@ -23,8 +23,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.base.seeds import require_seed
 
-#: Columns of a help text: at least (the parser knows no fewer), at most.
-WIDTHS = (40, 80)
 #: Type -> how help writes a value of it, and what a mistake is told.
 _WRITTEN = {int: "INT", float: "FLOAT", str: "STR", Path: "PATH"}
 _EXPECTED = {int: "a whole number", float: "a number", str: "a value", Path: "a path"}
@@ -86,9 +84,8 @@ def usage(program: str, commands: Mapping[str, str], description: str = "") -> s
 
 
 def width() -> int:
-    """Return the columns of a help text: those of the terminal, within bounds."""
-    least, most = WIDTHS
-    return max(least, min(most, shutil.get_terminal_size().columns))
+    """Return the columns of a help text: those of the terminal, but 40 at least (the parser knows no fewer) and 80 at most."""
+    return max(40, min(80, shutil.get_terminal_size().columns))
 
 
 def wrapped(text: str) -> str:
@@ -263,11 +260,7 @@ def _plain(text: str) -> str:
 
 
 def _check(options: Mapping[str, inspect.Parameter], program: str, arguments: Sequence[str]) -> None:
-    """Refuse unknown options, values that do not fit, and what is missing, with the nearest name.
-
-    Raises:
-        InputError: the first of them.
-    """
+    """Refuse unknown options, values that do not fit, and what is missing, with the nearest name."""
     if any(word in _HELP for word in arguments):
         return
     named = {f"--{name.replace('_', '-')}": one for name, one in options.items() if not _is_positional(one.annotation)}

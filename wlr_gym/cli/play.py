@@ -13,6 +13,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import refuse_existing
+from wlr_gym.base.progress import tracked
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, require_simulator
 from wlr_gym.cli.results import print_json
@@ -177,7 +178,6 @@ def _check_commands(script: Script, ranges: Ranges, robot: Robot) -> None:
 def _film(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None) -> None:
     from rich.console import Console
 
-    from wlr_gym.base.progress import tracked
     from wlr_gym.learning.evaluation.film import film, film_length
     from wlr_gym.render import write_video
 
@@ -205,7 +205,6 @@ def _print_film(options: PlayOptions, core: Core) -> None:
 def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
     from rich.console import Console
 
-    from wlr_gym.base.progress import tracked
     from wlr_gym.learning.evaluation import read_subjects
     from wlr_gym.learning.evaluation.film import film_beside
 

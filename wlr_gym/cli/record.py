@@ -202,13 +202,10 @@ def _list(console: Console, robot: Robot, as_json: bool) -> None:
     from wlr_gym.cli.tables import print_table
     from wlr_gym.data.excitations import EXCITATIONS, excite
 
+    lengths = {name: excite(name, robot=robot).duration for name in EXCITATIONS}
+    kinds = EXCITATIONS.items()
     if as_json:
-        print_json(
-            [
-                {"name": name, "seconds": excite(name, robot=robot).duration, "does": one.doc, "shows": one.shows}
-                for name, one in EXCITATIONS.items()
-            ]
-        )
+        print_json([{"name": name, "seconds": lengths[name], "does": one.doc, "shows": one.shows} for name, one in kinds])
         return
-    rows = [(name, f"{excite(name, robot=robot).duration:.0f}", one.doc, one.shows) for name, one in EXCITATIONS.items()]
+    rows = [(name, f"{lengths[name]:.0f}", one.doc, one.shows) for name, one in kinds]
     print_table(console, ("excitation", "seconds", "what the robot does", "what it shows"), rows)

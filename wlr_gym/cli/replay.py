@@ -17,11 +17,15 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
+from wlr_gym.base.progress import tracked
+from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import HardwareOption, confirm
+from wlr_gym.cli.tables import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,8 +72,6 @@ def run(options: ReplayOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
-    from wlr_gym.base.provenance import record_provenance
     from wlr_gym.data.read import read_runs
     from wlr_gym.data.replay import prepare
     from wlr_gym.data.replay_plots import save_plots
@@ -106,7 +108,9 @@ def run(options: ReplayOptions) -> int:
     else:
         _print(results, patch, console, "repeated" if on_robot else "simulated")
     write_json(options.out / ERRORS_FILE, errors)
-    record_provenance(options.out, _resolved(options, results, patch))
+    first, driven = results[0], [str(result.run.path) for result in results]
+    found = {"robot": first.robot.name, "clock": first.clock, "physics_step": first.physics_step, "runs": driven}
+    record_provenance(options.out, settings_of(options) | found | {"effects": patch.content()["effects"]})
     console.print(f"errors, plots and provenance: {options.out}")
     if options.video is not None:
         _film(options, results, patch, console)
@@ -121,7 +125,6 @@ def _films(options: ReplayOptions, names: Sequence[str]) -> list[Path]:
 
 
 def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
-    from wlr_gym.base.progress import tracked
     from wlr_gym.data.film import FPS, film_length, replay_film
     from wlr_gym.data.replay import prepare
     from wlr_gym.render import write_video
@@ -135,7 +138,6 @@ def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch,
 
 
 def _replay_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
-    from wlr_gym.base.progress import tracked
     from wlr_gym.data.replay import replay
 
     for measured in tracked(runs, len(runs), f"replaying on {options.backend}", console):
@@ -167,17 +169,6 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
             console.print(f"stopped: {drive.reason or 'nothing was logged'}", style="red")
             return
         yield compare_repeat(measured, read_run(drive.run), chosen, options.segment)
-
-
-def _resolved(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch) -> dict[str, object]:
-    return {
-        **settings_of(options),
-        "robot": results[0].robot.name,
-        "clock": results[0].clock,
-        "physics_step": results[0].physics_step,
-        "runs": [str(result.run.path) for result in results],
-        "effects": patch.content()["effects"],
-    }
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -215,7 +206,6 @@ def _in_noise_units(errors: Sequence[ChannelError]) -> str:
 
 
 def _print_errors(errors: Sequence[tuple[str, ChannelError]], title: str, console: Console) -> None:
-    from wlr_gym.cli.tables import print_table
     from wlr_gym.data.replay import pooled
 
     rows = []
@@ -229,7 +219,6 @@ def _print_errors(errors: Sequence[tuple[str, ChannelError]], title: str, consol
 
 
 def _print_joints(errors: Sequence[tuple[str, ChannelError]], console: Console) -> None:
-    from wlr_gym.cli.tables import print_table
     from wlr_gym.data.format import COLUMNS
     from wlr_gym.robot import CORNERS
 
@@ -242,7 +231,6 @@ def _print_joints(errors: Sequence[tuple[str, ChannelError]], console: Console) 
 
 
 def _print_runs(results: Sequence[ReplayResult], console: Console) -> None:
-    from wlr_gym.cli.tables import print_table
     from wlr_gym.data.format import COLUMNS
 
     def kind(name: str) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import write_text
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
@@ -62,7 +63,6 @@ def import_robot(options: RobotImportOptions) -> int:
     Raises:
         InputError: no such file, another kind of robot, or numbers that no robot file can hold; nothing is written.
     """
-    from wlr_gym.base.files import write_text
     from wlr_gym.physics.feasibility import examine_robot
     from wlr_gym.robot.interchange import recognise
     from wlr_gym.robot.interchange.robot_file import base_beside, new_file, of_all, robot_over, robot_text
@@ -108,7 +108,6 @@ def export_robot(options: RobotExportOptions) -> int:
     Raises:
         InputError: no such robot, or a file that is there or of no known format.
     """
-    from wlr_gym.base.files import write_text
     from wlr_gym.physics.plants.mujoco.mjcf_file import NOT_IN_MJCF, mjcf_text
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.interchange import urdf_text

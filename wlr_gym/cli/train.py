@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tyro
 
@@ -18,9 +18,6 @@ from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
 from wlr_gym.policy import Training, TrainingProgress
-
-if TYPE_CHECKING:
-    from wlr_gym.physics.effects import Patch
 
 
 @dataclass(frozen=True)
@@ -110,14 +107,9 @@ def _config(options: TrainOptions, environment: str) -> dict[str, Any]:
         config["seed"] = options.seed
     if options.backend is not None:
         config["environment"] = (config.get("environment") or {}) | {"backend": options.backend}
-    add_effects(config, options.patch())
-    return with_robot(config, options.robot)
-
-
-def add_effects(config: dict[str, Any], patch: Patch) -> None:
-    """Put a patch into an agent's settings, in place: its content, so that the run folder says what was added."""
-    if patch:
+    if patch := options.patch():  # its content, so that the run folder says what was added
         config["environment"] = (config.get("environment") or {}) | {"effects": patch.content()["effects"]}
+    return with_robot(config, options.robot)
 
 
 def _require_own_settings(options: TrainOptions) -> None:

@@ -18,10 +18,13 @@ import numpy as np
 import tyro
 
 from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.base.progress import progress
+from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, settings_of
 from wlr_gym.cli.results import print_json
+from wlr_gym.cli.tables import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -79,8 +82,6 @@ def run(options: VisionOptions) -> int:
     require_package("cv2", "vision")
     from rich.console import Console
 
-    from wlr_gym.base.files import make_output_folder, refuse_existing
-    from wlr_gym.base.provenance import record_provenance
     from wlr_gym.data import read_run
     from wlr_gym.perception.vision import load_camera, load_target, save_video_analysis
 
@@ -159,8 +160,6 @@ def _analyse(
 
 
 def _print(analysis: VideoAnalysis, console: Console) -> None:
-    from wlr_gym.cli.tables import print_table
-
     found = analysis.summary()
     for finding in found["findings"]:
         console.print(finding, style="yellow")
@@ -175,8 +174,7 @@ def _print(analysis: VideoAnalysis, console: Console) -> None:
             ", ".join(f"{1e3 * w[f'{axis}_std_from_layout_m']:.2f}" for axis in ("longitudinal", "lateral")),
         ) for wheel, w in found["wheels"].items()
     ]  # fmt: skip
-    body = (f"{1e3 * found[f'body_{axis}_slip_m']:+.2f}" for axis in ("longitudinal", "lateral"))
-    longitudinal, lateral = body
+    longitudinal, lateral = (f"{1e3 * found[f'body_{axis}_slip_m']:+.2f}" for axis in ("longitudinal", "lateral"))
     headings = ("wheel", "longitudinal", "± from radius", "lateral", "± from layout")
     title = f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma"
     print_table(console, headings, [*rows, ("body", longitudinal, "", lateral, "")], title)
