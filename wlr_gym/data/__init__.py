@@ -5,12 +5,11 @@
 """
 
 from wlr_gym.data.check import Finding, check_table
-from wlr_gym.data.convert import convert
 from wlr_gym.data.format import COLUMNS, Column, Profile, RunMeta
 from wlr_gym.data.read import DataSet, Run, read_dataset, read_meta, read_run
 from wlr_gym.data.resimulation import simulate_again, simulated_parameters
 from wlr_gym.data.simulation_record import Simulation
-from wlr_gym.data.write import write_meta, write_run
+from wlr_gym.data.write import convert, write_meta, write_run
 
 __all__ = [
     "COLUMNS",

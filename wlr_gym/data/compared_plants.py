@@ -24,8 +24,6 @@ Array = NDArray[np.float64]
 
 #: s at the first setpoints before time 0, not compared: until the bounce of being set down has died out.
 SETTLE = 0.5
-#: Steps between two calls with the share that is done.
-_TOLD = 50
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ def drive(
         for tick in range(len(setpoints) + 1):
             sensors.append(readings.values.copy())
             truth.append(simulator.truth().values.copy())
-            if tick % _TOLD == 0:
+            if tick % 50 == 0:
                 tell(tick / len(setpoints))
             if tick < len(setpoints):
                 readings = simulator.step(setpoints[tick], torque_on[tick])

@@ -21,8 +21,8 @@ _PANELS = (
     ("normal_force",), ("total_along", "total_across"), ("total_turn",), ("slip_along", "slip_across"), ("gyro",),
     ("friction_across",),
 )  # fmt: skip
-# Colours of the first and the second plant, and of the threshold.
-_FIRST, _SECOND, _LIMIT = BLUE, ORANGE, GREEN
+# Colours of the first and the second plant.
+_FIRST, _SECOND = BLUE, ORANGE
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ def _draw_panel(comparison: Comparison, index: int, names: Sequence[str], above:
         signal = comparison.signals[name]
         error = np.abs(difference(comparison.first, comparison.second, name, signal, motion, index))
         below.plot(t, np.maximum(error.max(axis=1) / signal.resolution, 1e-3), linewidth=0.9, color="#444444")
-    below.axhline(comparison.threshold, color=_LIMIT, linewidth=0.8)
+    below.axhline(comparison.threshold, color=GREEN, linewidth=0.8)
     below.set_yscale("log")
     below.set_ylim(1e-3, max(1e2, below.get_ylim()[1]))
     below.set_ylabel("noise units", fontsize=8)

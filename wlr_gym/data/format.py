@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import Field
 
 from wlr_gym.base.settings import SettingsModel
-from wlr_gym.robot import JOINTS, LEGS, Vector3
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Vector3
 from wlr_gym.robot.parameter_table import XYZ
 
 #: File suffixes a run may have.
@@ -43,11 +43,8 @@ class Column:
 
 def _joint_columns(kind: str, unit: tuple[str, str], doc: str, **flags: bool) -> list[Column]:
     """One column per joint; ``unit`` holds the unit for legs and for wheels."""
-    groups = [("leg", unit[0]) if joint in LEGS else ("wheel", unit[1]) for joint in JOINTS]
-    return [
-        Column(f"{kind}_{joint}", f"{kind}_{type_}", joint_unit, doc, **flags)
-        for joint, (type_, joint_unit) in zip(JOINTS, groups, strict=True)
-    ]
+    legs = [Column(f"{kind}_{leg}", f"{kind}_leg", unit[0], doc, **flags) for leg in LEGS]
+    return legs + [Column(f"{kind}_{wheel}", f"{kind}_wheel", unit[1], doc, **flags) for wheel in WHEELS]
 
 
 _NO_READING, _NO_FRAME = "NaN without a new valid reading", "NaN without a new frame"

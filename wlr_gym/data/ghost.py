@@ -25,8 +25,8 @@ _AROUND = 1.0
 
 def replayed_rows(
     run: Run, robot: Robot, parameters: Parameters, backend: str, patch: Patch | None, segment: float
-) -> Iterator[tuple[Truth, Array]]:
-    """Yield the truth (1 robot) and the channels :data:`wlr_gym.data.format.CHANNELS` of a replay at each row of the run.
+) -> Iterator[tuple[Parameters, Truth, Array]]:
+    """Yield parameters (1), truth (1) and the channels :data:`wlr_gym.data.format.CHANNELS` of a replay at each row of the run.
 
     As in :func:`wlr_gym.data.replay.replay` the plant ticks on a clock of its own, and each row's setpoint acts from that row's
     time on; every ``segment`` s the plant starts anew from the measured state, at once and not as one batch.
@@ -59,7 +59,7 @@ def replayed_rows(
             truth = plant.truth()
             channels = readings(sensors, truth, shift, offset)[None]
             camera_frame(channels, parameters)
-            yield truth, channels[0, 0]
+            yield parameters, truth, channels[0, 0]
     finally:
         plant.close()
 

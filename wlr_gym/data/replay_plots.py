@@ -23,8 +23,6 @@ _BODY = [
     ["cam_x", "cam_y", "cam_yaw"],
     ["cam_z", "cam_pitch", "volt"],
 ]
-# Colours of the curves.
-_MEASURED, _FULL, _SEGMENTS = GREY, ORANGE, BLUE
 _CALM = 6.0  # noise units; flat channels are not blown up beyond this
 
 
@@ -62,11 +60,11 @@ def _draw(axes: Axes, result: ReplayResult, name: str) -> None:
     style: dict[str, Any] = (
         {"marker": ".", "markersize": 2.5, "linestyle": ""} if COLUMNS[name].may_be_nan else {"linewidth": 2.2}
     )
-    axes.plot(t[known], run[name][known], color=_MEASURED, label="measured", **style)
-    axes.plot(t, result.full[name], color=_FULL, linewidth=0.9, label="full run")
+    axes.plot(t[known], run[name][known], color=GREY, label="measured", **style)
+    axes.plot(t, result.full[name], color=ORANGE, linewidth=0.9, label="full run")
     pieces = result.segments[name].copy()
     pieces[list(result.starts)] = np.nan  # lift the pen between segments
-    axes.plot(t, pieces, color=_SEGMENTS, linewidth=0.9, label="segments")
+    axes.plot(t, pieces, color=BLUE, linewidth=0.9, label="segments")
     low, high = axes.get_ylim()
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     if half < _CALM * error.noise:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,6 @@ Array = NDArray[np.float64]
 
 #: s between the points at which the ghost starts anew from the measured robot.
 SEGMENT = 10.0
-#: s that closing waits.
-_PATIENCE = 0.5
 #: s around a time whose samples say where the robot is then.
 _AROUND = 1.0
 #: Elements of the truth that can be plotted where a simulator knows them.
@@ -174,7 +173,7 @@ class RunRecording:
     def close(self) -> None:
         """Give up what is being worked out."""
         self._closed.set()  # seen at the next row; a kernel that is being compiled is not waited for
-        self._thread.join(_PATIENCE)
+        self._thread.join(0.5)
 
     # ---- what is measured -------------------------------------------------------------------------------------------
 
@@ -202,14 +201,10 @@ class RunRecording:
 
     def _work(self) -> None:
         if self.run.simulation is not None:
-            self._fill(self.true, lambda: simulated_rows(self.run, self.robot))
-        if self._backend is not None:
-            self._fill(self.ghost, self._replayed)
-
-    def _replayed(self) -> Iterator[tuple[Parameters, Truth, Array]]:
-        assert self._backend is not None
-        for truth, channels in replayed_rows(self.run, self.robot, self._model, self._backend, self._patch, self._segment):
-            yield self._model, truth, channels
+            self._fill(self.true, partial(simulated_rows, self.run, self.robot))
+        if (backend := self._backend) is not None:
+            ghost = partial(replayed_rows, self.run, self.robot, self._model, backend, self._patch, self._segment)
+            self._fill(self.ghost, ghost)
 
     def _fill(self, track: Track, rows: Callable[[], Iterator[tuple[Parameters, Truth, Array]]]) -> None:
         try:

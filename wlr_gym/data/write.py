@@ -1,4 +1,4 @@
-"""Write runs: the same format that is read, checked before and moved into place when complete."""
+"""Write and convert runs: the same format that is read, checked before and moved into place when complete."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file, write_text
 from wlr_gym.data.check import check_table
 from wlr_gym.data.format import COLUMNS, META_FILE, SUFFIXES, RunMeta
-from wlr_gym.data.read import read_meta
-from wlr_gym.data.robot_file import note_robot
+from wlr_gym.data.read import read_dataset, read_meta, read_run
+from wlr_gym.data.robot_file import note_robot, own_robot
 from wlr_gym.data.simulation_record import Simulation, write_simulation
 
 if TYPE_CHECKING:
@@ -66,9 +66,8 @@ def write_meta(folder: str | Path, meta: RunMeta) -> Path:
     """
     path = Path(folder) / META_FILE
     check_meta(folder, meta)
-    if path.is_file():
-        return path
-    write_text(path, yaml.safe_dump(meta.content(), sort_keys=False, allow_unicode=True))
+    if not path.is_file():
+        write_text(path, yaml.safe_dump(meta.content(), sort_keys=False, allow_unicode=True))
     return path
 
 
@@ -106,3 +105,37 @@ def _write_parquet(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
     import pyarrow.parquet
 
     pyarrow.parquet.write_table(pyarrow.table(columns), path, compression="zstd")
+
+
+# ---- the other format ------------------------------------------------------------------------------------------------
+
+
+def convert(source: str | Path, target: str | Path, suffix: str | None = None) -> list[Path]:
+    """Convert a run (``target`` is a file) or a data set (``target`` is a folder) and return the files written.
+
+    Args:
+        source: a run or a folder of runs.
+        target: file whose suffix says the format, or folder.
+        suffix: format of the files in the folder: ``.csv`` or ``.parquet``.
+
+    Raises:
+        InputError: unreadable source, or a format that is not known.
+    """
+    source, target = Path(source), Path(target)
+    if source.is_file():
+        run = read_run(source)
+        meta = _moved(run.meta, source.parent, target.parent) if (source.parent / META_FILE).is_file() else None
+        return [write_run(target, run.table, meta, run.simulation)]
+    if suffix not in SUFFIXES:
+        raise InputError(f"convert {source}: the format of a data set is {' or '.join(SUFFIXES)}, not {suffix!r}")
+    data = read_dataset(source)
+    written = [write_run(target / f"{run.name}{suffix}", run.table, simulation=run.simulation) for run in data.runs]
+    if (source / META_FILE).is_file():
+        write_meta(target, _moved(data.meta, source, target))
+    return written
+
+
+def _moved(meta: RunMeta, source: Path, target: Path) -> RunMeta:
+    """Return meta data for another folder; a robot file that stands beside the runs goes with them."""
+    robot = own_robot(meta, source) if target.resolve() != source.resolve() else None
+    return meta if robot is None else note_robot(target, robot, meta)

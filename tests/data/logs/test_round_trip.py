@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.data import Run, read_run, write_run
-from wlr_gym.data.convert import convert
+from wlr_gym.data import Run, convert, read_run, write_run
 from wlr_gym.data.format import COLUMNS, COMMANDS, REQUIRED, Profile, RunMeta
 from wlr_gym.data.logs import export_run, import_log, read_exported, read_logs
 from wlr_gym.data.logs.messages import nanoseconds, seconds

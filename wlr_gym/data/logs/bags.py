@@ -14,8 +14,6 @@ from wlr_gym.data.logs.definitions import Definitions, UnknownTypeError, full_na
 from wlr_gym.data.logs.topics import Message, Share, cannot_read
 
 METADATA = "metadata.yaml"
-#: Messages between two reports of progress.
-_STRIDE = 500
 
 
 def messages(path: Path, wants: Callable[[str], bool], notes: list[str], tell: Share) -> Iterator[Message]:
@@ -64,7 +62,7 @@ def _by_rosbags(path: Path, wants: Callable[[str], bool], notes: list[str], tell
     try:
         for connection, time, data in reader.messages(connections=chosen) if chosen else ():
             count += 1
-            if count % _STRIDE == 0:
+            if count % 500 == 0:
                 tell(min(count / total, 1.0))
             kind = connection.msgtype
             try:

@@ -138,11 +138,7 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _unique(names: list[str], path: Path) -> list[str]:
-    """Return the names of columns, those without one by their place.
-
-    Raises:
-        InputError: two columns have the same.
-    """
+    """Return the names of columns, those without one by their place; refuse a name that occurs twice."""
     named = [name or f"column {k}" for k, name in enumerate(names)]
     repeated = next((name for k, name in enumerate(named) if name in named[:k]), None)
     if repeated is not None:

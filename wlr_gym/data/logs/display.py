@@ -33,8 +33,6 @@ POSE_TYPE, TRANSFORM_TYPE, MARKER_TYPE = (
 RATE = 12.5
 #: m of arrow per m/s of slip, and its shaft, m.
 _LENGTH, _SHAFT = 1.0, 0.012
-_ARROW = 0
-_COLOUR = (0.9, 0.1, 0.1, 1.0)
 
 
 def display_messages(run: Run, times: list[int]) -> dict[int, list[Sent]]:
@@ -141,18 +139,17 @@ def _markers(time: int, feet: Array, arrows: Array) -> Sent:
 def _arrow(time: int, corner: int, foot: Array, velocity: Array) -> object:
     tip = foot + _LENGTH * velocity
     points = [make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.005) for x, y in (foot, tip)]
-    still = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
     return make(
         MARKER_TYPE.replace("Array", ""),
         header=header(time, FLOOR),
         ns=f"slip of {CORNER_NAMES[CORNERS[corner]]} wheel",
         id=corner,
-        type=_ARROW,
+        type=0,  # an arrow
         action=0,
         pose=_pose((0.0, 0.0, 0.0), np.array([1.0, 0.0, 0.0, 0.0])),
         scale=make("geometry_msgs/msg/Vector3", x=_SHAFT, y=2 * _SHAFT, z=0.0),
-        color=make("std_msgs/msg/ColorRGBA", **dict(zip("rgba", _COLOUR, strict=True))),
-        lifetime=still,
+        color=make("std_msgs/msg/ColorRGBA", r=0.9, g=0.1, b=0.1, a=1.0),
+        lifetime=make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
         frame_locked=False,
         points=points,
         colors=[],

@@ -172,11 +172,7 @@ def _beside_robot(map: LogMap) -> LogMap:
 
 
 def _robot_of(meta: RunMeta, robot: str | None) -> Robot:
-    """Return the robot of an import, as a map's meta data or ``robot`` says.
-
-    Raises:
-        InputError: no such robot, or the two say different ones.
-    """
+    """Return the robot of an import, as a map's meta data or ``robot`` says; refuse different ones."""
     named = robot_of_meta(meta, Path(), "map")
     chosen = load_robot(robot) if robot else named
     if meta.robot is not None and chosen != named:  # whole: the fingerprint leaves out what makes torques of currents

@@ -12,8 +12,6 @@ from wlr_gym.base.errors import require_package
 from wlr_gym.data.logs.definitions import Definitions, UnknownTypeError, full_name
 from wlr_gym.data.logs.topics import Message, Share, cannot_read
 
-#: Bytes of the longest record that is believed: beyond is a broken length.
-LONGEST_RECORD = 2**30
 #: Schema encodings of ROS, by message encoding.
 _ROS = {"cdr": ("ros2msg", "ros2idl"), "ros1": ("ros1msg",)}
 
@@ -71,7 +69,7 @@ def _records(file: IO[bytes], path: Path, notes: list[str], tell: Share) -> Iter
     from mcap.stream_reader import StreamReader
 
     size = max(path.stat().st_size, 1)
-    reader = StreamReader(file, emit_chunks=True, record_size_limit=LONGEST_RECORD)
+    reader = StreamReader(file, emit_chunks=True, record_size_limit=2**30)  # bytes; beyond is a broken length
     count, ended = 0, False
     try:
         for record in reader.records:

@@ -13,7 +13,7 @@ import numpy as np
 from wlr_gym.data.logs.map import LogMap, Resolved
 from wlr_gym.data.logs.rows import MadeRun, NoRowsError, Samples, check_sources, make_run, rows_topic
 from wlr_gym.data.logs.topic_store import TopicStore
-from wlr_gym.data.logs.topics import Log, Share
+from wlr_gym.data.logs.topics import Share
 from wlr_gym.robot import JOINTS, WHEELS
 
 #: s, and numbers of the log, that a part may have (250 s of 40 channels at 200 Hz); ``split`` may ask for longer ones.
@@ -65,7 +65,13 @@ def _part_until(
     """Return the rows of a span (ns), its end moved by up to ``play`` to where the robot is quiet, and that end."""
     begin, edge = span
     end = edge + play
-    made = make_run(_between(recording, found, begin, end), found, resolved, (begin, end))
+
+    def when(topic: str) -> tuple[str, int, int]:
+        clock = found.use(topic)
+        offset = round(clock.offset * 1e9)
+        return clock.use, begin - offset, end - offset
+
+    made = make_run(recording.between(when), found, resolved, (begin, end))
     t, middle = made.table["t"], (edge - made.origin) * 1e-9
     last = _quiet_row(made, middle, play * 1e-9 / _PLAY) if play and 0.0 < middle < t[-1] else 0
     if last < 2:  # nothing to be cut
@@ -87,15 +93,6 @@ def _edges(recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved
     inner = [begins[k * len(begins) // count] for k in range(1, count)]
     edges = sorted({begins[0], *inner, max(last for _, last in spans) + 1})
     return [edge + round(clock.offset * 1e9) for edge in edges]
-
-
-def _between(recording: TopicStore, found: LogMap, begin: int, end: int) -> Log:
-    def when(topic: str) -> tuple[str, int, int]:
-        clock = found.use(topic)
-        offset = round(clock.offset * 1e9)
-        return clock.use, begin - offset, end - offset
-
-    return recording.between(when)
 
 
 # ---- cutting what is in memory ---------------------------------------------------------------------------------------

@@ -25,8 +25,6 @@ FLUSH = 0.5
 SWITCH = 0.0005
 #: s that the rest may take to be written at the end.
 _LAST = 10.0
-#: s between two looks at whether the run is over.
-_WAKE = 0.05
 
 
 class McapStream:
@@ -55,7 +53,6 @@ class McapStream:
         self._rows: queue.Queue[tuple[float, list[float]]] = queue.Queue(WAITING)
         self._over = threading.Event()
         self._flushed = time.monotonic()
-        self._switch = sys.getswitchinterval()
         run = run_message(columns, 0, 0, meta)  # what first messages compile and look up is done now, not while it drives
         for message in (run, *row_messages(dict.fromkeys((*COMMANDS, *columns), 0.0), 0)):
             definition(message.kind)
@@ -110,7 +107,7 @@ class McapStream:
         while True:
             over = self._over.is_set()  # asked first: what came before is in the queue
             try:
-                return self._rows.get(timeout=_WAKE)
+                return self._rows.get(timeout=0.05)
             except queue.Empty:
                 if over:
                     return None

@@ -109,11 +109,7 @@ def _no_pose(look: LogSignals) -> None:
 
 
 def _leave_out_short(log: Log, chosen: dict[str, FieldCandidate]) -> None:
-    """Leave out motions that are too short to be compared.
-
-    Raises:
-        InputError: those of the joints are.
-    """
+    """Leave out motions that are too short to be compared; refuse those of the joints."""
     for column, one in list(chosen.items()):
         received = log.topics[one.topic].received
         seconds = float(np.ptp(received)) * 1e-9 if len(received) else 0.0
@@ -150,7 +146,7 @@ def _content(look: LogSignals, found: JointFindings, units: Mapping[str, str]) -
         if joint in names or joint in found.joint_zero or found.joint_sign.get(joint, 1) < 0
     }
     used = {source.topic for source in channels.values()}
-    clocks = {name: clock for name, clock in look.clocks.items() if name in used}
+    clocks = {name: one for name, one in look.clocks.items() if name in used and (one.offset or one.use != "header")}
     rows = channels["pos_leg_lf"].topic if "pos_leg_lf" in channels else None
     return {
         "rows": rows,
@@ -158,7 +154,7 @@ def _content(look: LogSignals, found: JointFindings, units: Mapping[str, str]) -
         "joints": {joint: one.model_dump(exclude_defaults=True) for joint, one in joints.items()},
         "channels": {name: one.model_dump(exclude_defaults=True) for name, one in _grouped(channels).items()},
         "frames": {name: tuple(axes) for name, axes in look.frames.items()},
-        "clocks": {name: clock.model_dump() for name, clock in clocks.items() if clock.offset or clock.use != "header"},
+        "clocks": {name: one.model_dump() for name, one in clocks.items()},
     }
 
 

@@ -37,6 +37,8 @@ _TURN_SPEED, _SWING, _AROUND = 0.02, 0.05, 0.3
 _ROUGH = 0.1
 #: rad; a robot that drives is not tilted by so much.
 _TILTED = 1.0
+#: Units that gyroscopes read in.
+_GYRO_UNITS = {unit: FACTORS["rad/s"][unit] for unit in ("rad/s", "deg/s")}
 #: How much a gyroscope turns of what wheels or pose say: wheels slip in turns.
 _AS_MUCH = (0.12, 3.0)
 #: Readings show gravity that are 1 g within this share, and this share of that along one axis.
@@ -309,17 +311,14 @@ def _turns_as_much(t: Array, rate: Array, reference: BodyMotion) -> bool:
     if len(grid) < 2:
         return False
     sizes = [float(np.std(over_windows(*one, grid))) for one in ((t, integral(t, rate)), (reference.t, reference.heading))]
-    return sizes[1] > 0.0 and any(
-        _AS_MUCH[0] < FACTORS["rad/s"][unit] * sizes[0] / sizes[1] < _AS_MUCH[1] for unit in ("rad/s", "deg/s")
-    )
+    return sizes[1] > 0.0 and any(_AS_MUCH[0] < one * sizes[0] / sizes[1] < _AS_MUCH[1] for one in _GYRO_UNITS.values())
 
 
 def _gyro_unit(look: LogSignals, axis: str, reference: BodyMotion) -> str:
     t, rate = look.raw(f"gyro_{axis}")
     grid = common_grid(t, reference.t)
     same = likeness(over_windows(t, integral(t, rate), grid), over_windows(reference.t, reference.heading, grid))
-    units = {unit: FACTORS["rad/s"][unit] for unit in ("rad/s", "deg/s")}
-    return unit_of(same.ratio, units)[0] if same is not None else "rad/s"
+    return unit_of(same.ratio, _GYRO_UNITS)[0] if same is not None else "rad/s"
 
 
 def _axes(look: LogSignals, up: str | None, yaw: str | None, body: BodyMotion | None, wheels: BodyMotion | None) -> None:

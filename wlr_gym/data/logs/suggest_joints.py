@@ -57,7 +57,7 @@ def find_joints(look: LogSignals, motion: BodyMotion | None) -> JointFindings:
         found.joint_sign[joint], found.joint_zero[joint] = look.given.joints[joint].sign, look.given.joints[joint].zero
     for joint in JOINTS:
         if look.has(f"pos_{joint}"):
-            _position(look, found, joint)
+            found.unit[f"pos_{joint}"] = _angle_unit(look, f"pos_{joint}")
     if motion is not None:
         _wheels_against_body(look, found, motion)
     for joint in JOINTS:
@@ -91,14 +91,11 @@ def angle(look: LogSignals, found: JointFindings, joint: str) -> tuple[Array, Ar
 # ---- positions -------------------------------------------------------------------------------------------------------
 
 
-def _position(look: LogSignals, found: JointFindings, joint: str) -> None:
-    column = f"pos_{joint}"
-    hint = look.chosen[column].unit
-    found.unit[column] = hint if hint is not None and hint in _ANGLES else _angle_unit(look, column)
-
-
 def _angle_unit(look: LogSignals, column: str) -> str:
-    """Return the unit by magnitude: a leg's angle is within a turn; a wheel turns less than 9 rad/s."""
+    """Return the unit by name, else by magnitude: a leg's angle is within a turn; a wheel turns less than 9 rad/s."""
+    hint = look.chosen[column].unit
+    if hint is not None and hint in _ANGLES:
+        return hint
     t, raw = look.raw(column)
     whole = bool(np.all(raw == np.round(raw))) and np.ptp(raw) > 20.0
     if column.removeprefix("pos_") in LEGS:

@@ -202,8 +202,7 @@ def _nanoseconds(column: pandas.Series, step: int) -> NDArray[np.int64]:
 def _step(name: str, column: pandas.Series, path: Path) -> int:
     """Return how many ns a unit of a column of times is: by its name's ending, else as rows are 0.5 ms to 0.5 s apart.
 
-    Raises:
-        InputError: rows are so far apart, or so close, that it is another unit.
+    Rows that are so far apart, or so close, that it is another unit are refused.
     """
     lowered = name.lower().replace("[", "_").replace("(", "_").rstrip("])")
     apart = float(np.median(np.abs(np.diff(column.to_numpy(np.float64)))))

@@ -60,7 +60,7 @@ class TopicStore:
         except OSError as error:
             text = f"no room for its numbers in {tempfile.gettempdir()} (TMPDIR): {error.strerror}"
             raise InputError(f"{self.name}: {text}") from None
-        spans = {use: _span(topic, use) for use in (HEADER, LOG)}
+        spans = {use: (int(topic.clock(use).min()), int(topic.clock(use).max())) for use in (HEADER, LOG)}
         self._blocks.setdefault(topic.name, []).append(_Block(self._end, len(content), spans))
         self._end += len(content)
         self.numbers += sum(len(values) for _, values in topic.fields.values())
@@ -119,11 +119,6 @@ class TopicStore:
             parts.append(pickle.loads(self._file.read(block.length)))
         topic = in_order(joined(parts))
         return topic if all(self._stamped[name]) else replace(topic, stamped=None)
-
-
-def _span(topic: Topic, use: str) -> tuple[int, int]:
-    times = topic.clock(use)
-    return int(times.min()), int(times.max())
 
 
 def _about(blocks: Sequence[_Block], clock: str, begin: int, end: int) -> Iterable[_Block]:

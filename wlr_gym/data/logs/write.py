@@ -40,16 +40,13 @@ class McapSink:
 
     def add(self, message: Sent) -> None:
         """Write a message; a topic's first one writes its definition, too."""
-        if message.topic not in self._channels:
-            self._channels[message.topic] = self._writer.register_channel(
-                message.topic, "cdr", self._schema(message.kind), {"offered_qos_profiles": ""}
-            )
-        self._writer.add_message(self._channels[message.topic], message.time, message.data, message.time)
-
-    def _schema(self, kind: str) -> int:
+        topic, kind, time, data = message
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition(kind).encode())
-        return self._schemas[kind]
+        if topic not in self._channels:
+            qos = {"offered_qos_profiles": ""}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
+        self._writer.add_message(self._channels[topic], time, data, time)
 
     def flush(self) -> None:
         """Write out what has come so far: a reader finds it even if nothing comes after it."""
