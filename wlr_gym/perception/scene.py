@@ -216,7 +216,8 @@ class Renderer:
             kinds.append((*facet.half, facet.shade, disc, first[0], len(circles), first[1], len(tags), facet.texture))
         bits = np.concatenate(cells) if cells else np.zeros(0, np.uint8)
         boxes = np.array([self._box(same) for same in zip(*instants, strict=True)])
-        return geometry, np.array(kinds, float), boxes, _rows(circles, 5), _rows(tags, 5), bits
+        rings, signs = (np.array(rows, float).reshape(-1, 5) for rows in (circles, tags))
+        return geometry, np.array(kinds, float), boxes, rings, signs, bits
 
     def _box(self, facets: Sequence[Facet]) -> NDArray[np.int64]:
         """Pixels (x0, y0, x1, y1) that show the facets, with a margin."""
@@ -231,10 +232,6 @@ class Renderer:
         pixels = project(self.camera, points)
         low, high = np.floor(pixels.min(axis=0)) - 3, np.ceil(pixels.max(axis=0)) + 4
         return np.concatenate([low.clip(0, limit), high.clip(0, limit)]).astype(np.int64)
-
-
-def _rows(rows: Sequence[Any], width: int) -> Array:
-    return np.array(rows, float) if rows else np.zeros((0, width))
 
 
 def project(camera: Camera, points: Array) -> Array:

@@ -266,8 +266,8 @@ def test_the_filter_is_the_textbooks():
 
     age, flow, column = 0.1, 0.4, np.empty(4)
     measurements = [
-        (kalman.see_velocity(p, age, column), column.copy(), np.array([0, 1, age, 0])),
-        (kalman.see_flow(p, age, flow, column), column.copy(), np.array([0, 1, age, -flow])),
+        (kalman.see_velocity(p, age, 0.0, column), column.copy(), np.array([0, 1, age, 0])),
+        (kalman.see_velocity(p, age, flow, column), column.copy(), np.array([0, 1, age, -flow])),
         (kalman.see_position(p, age, column), column.copy(), h := np.array([1, -age, -0.5 * age**2, 0])),
     ]
     for spread, seen, row in measurements:

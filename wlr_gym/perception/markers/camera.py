@@ -96,11 +96,7 @@ def load_camera(path: str | Path) -> Camera:
 
 def save_camera(path: str | Path, camera: Camera) -> None:
     """Write a camera file (YAML)."""
-    content = {key: list(value) if isinstance(value, tuple) else value for key, value in camera.model_dump().items()}
-    if camera.quality is not None:
-        quality = camera.quality.model_dump()
-        content["quality"] = {key: list(value) if isinstance(value, tuple) else value for key, value in quality.items()}
-    write_yaml(Path(path), content)
+    write_yaml(Path(path), camera.model_dump(mode="json"))
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------

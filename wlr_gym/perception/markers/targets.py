@@ -107,8 +107,7 @@ def load_target(source: str | Path | Target) -> Target:
         return source
     data, where = read_config("vision", source)
     target = parse_config(Target, data, where)
-    for fault in _faults(target, where):
-        raise fault
+    _check(target, where)
     return target
 
 
@@ -117,31 +116,28 @@ def ring_radii(code: int) -> tuple[float, float, float]:
     return (1.0, *CODES[CODE_NAMES[code]])
 
 
-def _faults(target: Target, where: str) -> list[InputError]:
+def _check(target: Target, where: str) -> None:
     unknown = [marker for marker in target.markers if marker.code not in CODES]
     if unknown:
-        return [unknown_name("marker code", unknown[0].code, CODES, f"{where}: marker '{unknown[0].name}'")]
+        raise unknown_name("marker code", unknown[0].code, CODES, f"{where}: marker '{unknown[0].name}'")
     if len(target.markers) < 4:
-        return [InputError(f"{where}: {len(target.markers)} markers; a target needs at least 4")]
+        raise InputError(f"{where}: {len(target.markers)} markers; a target needs at least 4")
     positions, radii = target.positions, target.radii
     if np.abs(positions).max() > 20 or radii.max() > 1:
-        return [
-            InputError(f"{where}: positions up to {np.abs(positions).max():g}: expected metres; these look like millimetres")
-        ]
+        raise InputError(f"{where}: positions up to {np.abs(positions).max():g}: expected metres; these look like millimetres")
     if np.ptp(positions[:, 2]) > 1e-9:
-        return [InputError(f"{where}: markers at heights {sorted(set(positions[:, 2]))}; expected one plane (the same z)")]
+        raise InputError(f"{where}: markers at heights {sorted(set(positions[:, 2]))}; expected one plane (the same z)")
     singular = np.linalg.svd(positions[:, :2] - positions[:, :2].mean(axis=0), compute_uv=False)
     if singular[1] < 0.2 * singular[0]:
-        return [InputError(f"{where}: the markers lie nearly on a line; spread them over an area")]
+        raise InputError(f"{where}: the markers lie nearly on a line; spread them over an area")
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=2) - QUIET_ZONE * radii[:, None] - radii[None]
     if (gaps + 10 * np.eye(len(radii))).min() < 0:
-        return [InputError(f"{where}: markers are so close that one lies in the white margin ({QUIET_ZONE} radii) of another")]
+        raise InputError(f"{where}: markers are so close that one lies in the white margin ({QUIET_ZONE} radii) of another")
     first, second = target.long_side
     drawn = float(np.linalg.norm(positions[first] - positions[second]))
     if target.caliper is not None and abs(target.caliper / drawn - 1) > 0.03:
         names = f"{target.markers[first].name} and {target.markers[second].name}"
-        return [InputError(f"{where}: caliper {target.caliper:g}: expected about {drawn:g} (m, between {names})")]
+        raise InputError(f"{where}: caliper {target.caliper:g}: expected about {drawn:g} (m, between {names})")
     single = [code for code, count in Counter(marker.code for marker in target.markers).items() if count == 1]
     if len(single) != 1 or len({marker.code for marker in target.markers}) != 2:
-        return [InputError(f"{where}: expected one marker with a code of its own and one code for all others, got {single}")]
-    return []
+        raise InputError(f"{where}: expected one marker with a code of its own and one code for all others, got {single}")

@@ -54,7 +54,7 @@ def see_rolling(robot: Any, r: Any) -> None:
         if abs(innovation) < 0.5 * r.doubt:
             r.doubt *= share
         variance = 1.0 / precision + _QUIET**2 + (0.5 * RADIUS * speed) ** 2 + r.doubt**2
-        total = kalman.see_velocity(r.covariance[k], 0.0, r.column) + variance
+        total = kalman.see_velocity(r.covariance[k], 0.0, 0.0, r.column) + variance
         correct(r, k, innovation, max(total, innovation * innovation / _GATE))
 
 

@@ -55,7 +55,7 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
         mean = mean_x if k == 0 else mean_y
         r.flow_variance[k] = noise + blur * mean * mean
         r.flow_error[k] = mean - (r.velocity[k] - age * r.kick[k])
-        spread = kalman.see_flow(r.covariance[k], age, ahead, r.column)
+        spread = kalman.see_velocity(r.covariance[k], age, ahead, r.column)
         off = max(off, r.flow_error[k] ** 2 / (spread + r.flow_variance[k]))
     r.flow_off = math.sqrt(off)
     if off > GATE or stuck:
@@ -68,7 +68,7 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     else:
         r.flow_rejected = r.flow_refused = 0.0
         for k in range(2):
-            total = kalman.see_flow(r.covariance[k], age, ahead, r.column) + r.flow_variance[k]
+            total = kalman.see_velocity(r.covariance[k], age, ahead, r.column) + r.flow_variance[k]
             correct(r, k, r.flow_error[k], total)
     r.flow_time = 0.0
 

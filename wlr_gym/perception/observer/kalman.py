@@ -34,16 +34,11 @@ def predict(p: Any, step: float, velocity_noise: float, leak_noise: float) -> No
 
 
 @njit(cache=True, nogil=True)
-def see_velocity(p: Any, age: float, column: Any) -> float:
-    """Put P h' of the measurement of the velocity ``age`` s ago into ``column`` (4,); return h P h'."""
-    for k in range(SIZE):
-        column[k] = p[k, VELOCITY] + age * p[k, LEAK]
-    return column[VELOCITY] + age * column[LEAK]
+def see_velocity(p: Any, age: float, flow: float, column: Any) -> float:
+    """Put P h' of the measurement of the velocity ``age`` s ago less e ``flow`` into ``column`` (4,); return h P h'.
 
-
-@njit(cache=True, nogil=True)
-def see_flow(p: Any, age: float, flow: float, column: Any) -> float:
-    """Put P h' of the measurement of the velocity ``age`` s ago less e ``flow`` into ``column`` (4,); return h P h'."""
+    ``flow``: m/s, that the flow sensor measures; 0 = the wheels measure.
+    """
     for k in range(SIZE):
         column[k] = p[k, VELOCITY] + age * p[k, LEAK] - flow * p[k, LENS]
     return column[VELOCITY] + age * column[LEAK] - flow * column[LENS]

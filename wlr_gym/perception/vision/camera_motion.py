@@ -103,18 +103,17 @@ def _followed(
     guesses = [s.floor if len(seen) >= MINIMUM_MARKERS else None for s, seen in zip(samples, usable, strict=True)]
     speeds = velocities([sample.time for sample in samples], guesses)
     views = [
-        TargetView(seen, guess.rotation, guess.position, speed)
+        None if guess is None else TargetView(seen, guess.rotation, guess.position, speed)
         for seen, guess, speed in zip(usable, guesses, speeds, strict=True)
-        if guess is not None
     ]
-    target = adjust(floor, views, camera.height, readout).target.model_copy(update={"tolerance": 0.0})
-    for seen, guess, speed in zip(usable, guesses, speeds, strict=True):
-        if guess is None:
+    known = [view for view in views if view is not None]
+    target = adjust(floor, known, camera.height, readout).target.model_copy(update={"tolerance": 0.0})
+    for view in views:
+        if view is None:
             yield None
             continue
-        view = TargetView(seen, guess.rotation, guess.position, speed)
-        seen = at_frame_time(view, target, camera.height, readout) if readout else seen
-        yield solve_pose(seen, target, camera, guess.rotation, guess.position)
+        seen = at_frame_time(view, target, camera.height, readout) if readout else view.seen
+        yield solve_pose(seen, target, camera, view.rotation, view.position)
 
 
 def _moves(centres: Array) -> bool:

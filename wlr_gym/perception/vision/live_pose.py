@@ -6,15 +6,23 @@ located anew after the camera was moved.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Image, detect
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, Sample, Tracker, VideoFrame, check_size, locate_floor
+from wlr_gym.perception.vision.tracking import (
+    IMPOSSIBLE,
+    LOST,
+    MOVED,
+    Sample,
+    Tracker,
+    VideoFrame,
+    check_size,
+    locate_floor,
+    no_pose,
+)
 
 # Status of a sample without a pose, besides those of :mod:`wlr_gym.perception.vision.tracking`.
 #: The floor markers are not found (yet).
@@ -68,16 +76,16 @@ class PoseFinder:
         check_size(frame.image, self.camera, "camera")
         last, self._last = self._last, frame.image
         if last is not None and np.array_equal(last, frame.image):
-            return self._nothing(frame, FROZEN)
+            return no_pose(frame, FROZEN, self.body)
         if self._tracker is None:
             self._look_for_floor(frame)
             if self._tracker is None:
-                return self._nothing(frame, _judged(frame.image) or NO_FLOOR)
+                return no_pose(frame, _judged(frame.image) or NO_FLOOR, self.body)
         sample = self._tracker(frame)
         if sample.status == MOVED:
             self._tracker = None  # located anew, from the frames that follow
         if sample.status == LOST and (judged := _judged(frame.image)):
-            return self._nothing(frame, judged)
+            return no_pose(frame, judged, self.body)
         return sample
 
     def _look_for_floor(self, frame: VideoFrame) -> None:
@@ -100,10 +108,6 @@ class PoseFinder:
         self._floor_frames, self._waited = [], 0
         if located is not None:
             self._tracker = Tracker(self.camera, self.body, self.floor, *located)
-
-    def _nothing(self, frame: VideoFrame, status: str) -> Sample:
-        centres = np.full((len(self.body.markers), 2), np.nan)
-        return Sample(frame.index, frame.time, status, np.full(6, np.nan), np.full((6, 6), np.nan), 0, math.nan, centres)
 
 
 def _judged(image: Image) -> str:

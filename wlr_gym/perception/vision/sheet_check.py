@@ -97,7 +97,7 @@ def _checked(image: Image, camera: Camera, target: Target, detections: Sequence[
     if found is None:
         own = sum(detection.code in target.codes for detection in detections)
         return SheetCheck(target, own, sheet_fault(detections, target, camera))
-    seen = seen_at(image, target, camera.values, found)
+    seen = seen_at(image, target, camera.values, found.rotation, found.position)
     misfit = found.residual * float(found.position[2]) / camera.focal[0]
     if len(target_pages(target)) > 1:
         return SheetCheck(target, len(seen), misfit=misfit)

@@ -21,7 +21,6 @@ A4 = (297.0, 210.0)
 A3 = (420.0, 297.0)
 # Shade: 0 black to 1 white.
 _BLACK = 0.0
-_WHITE = 1.0
 _GREY = 0.6
 _MARGIN = 8.0  # mm that printers leave white
 _ARC = 0.5522847498  # control points of a quarter circle

@@ -67,33 +67,20 @@ def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: Array
     rejected, none, spreads = np.zeros(len(t), np.bool_), np.empty((0, 3)), np.empty((0, 3, 3))
     likelihood = [_filter(t, z - middle, variance, 10.0**q, jump, rejected, none, spreads) for q in _DENSITIES]
     density = 10.0 ** _DENSITIES[int(np.argmax(likelihood))]
-    moments, order, places = _merged(t, at)
-    rejected = np.zeros(len(moments), np.bool_)
-    states, spreads = _smoothed(moments, order, z - middle, variance, density, jump, rejected)
+    moments = np.concatenate([t, at])  # of samples, then of results without a sample
+    order = np.argsort(moments, kind="stable")
+    moments, places = moments[order], np.argsort(order, kind="stable")
+    inputs = np.concatenate([z - middle, np.full(len(at), np.nan)])[order]
+    noise = np.concatenate([variance, np.ones(len(at))])[order]
+    count = len(moments)
+    rejected, states, spreads = np.zeros(count, np.bool_), np.empty((count, 3)), np.empty((count, 3, 3))
+    _filter(moments, inputs, noise, density, jump, rejected, states, spreads)
+    _smooth_back(moments, density, states, spreads)
     rows, outliers = places[len(t) :], np.zeros(len(time), np.bool_)
-    outliers[np.flatnonzero(known)] = rejected[places[: len(t)]]
+    outliers[known] = rejected[places[: len(t)]]
     deviations = np.sqrt(np.maximum(spreads[rows][:, [0, 1], [0, 1]], 0.0))
     value, rate, acceleration = states[rows].T
     return Smoothed(value + middle, rate, acceleration, deviations[:, 0], deviations[:, 1], outliers, density)
-
-
-def _merged(time: Array, at: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Times of samples and results in order; the order; and at which place in it each sample, then each result, is."""
-    merged = np.concatenate([time, at])
-    order = np.argsort(merged, kind="stable")
-    return merged[order], order, np.argsort(order, kind="stable")
-
-
-def _smoothed(
-    moments: Array, order: NDArray[np.int64], values: Array, variance: Array, density: float, jump: float, rejected: Any
-) -> tuple[Array, Array]:
-    """Smoothed states (., 3) and covariances at all moments; ``rejected`` is written."""
-    others = len(moments) - len(values)
-    inputs, noise = np.concatenate([values, np.full(others, np.nan)])[order], np.concatenate([variance, np.ones(others)])[order]
-    states, spreads = np.empty((len(moments), 3)), np.empty((len(moments), 3, 3))
-    _filter(moments, inputs, noise, density, jump, rejected, states, spreads)
-    _smooth_back(moments, density, states, spreads)
-    return states, spreads
 
 
 @inner_kernel

@@ -8,7 +8,7 @@ hidden. A frame without a pose that passes every check gives a sample without a 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 
@@ -119,23 +119,22 @@ class Tracker:
         found, seen = self._follow(frame)
         if found is None:
             found, seen = self._search(frame)
-        centres = np.full((len(self.body.markers), 2), np.nan)
         if found is None or shift > _MOVED_BY:
             self._track = []
             dark = found is None and math.isinf(shift)  # nothing at all is seen
             status = MOVED if shift > _MOVED_BY and not dark else LOST
-            return replace(_no_pose(frame, status, centres), floor=self.floor_pose, floor_seen=floor_seen)
+            return replace(no_pose(frame, status, self.body), floor=self.floor_pose, floor_seen=floor_seen)
         before = self._track[-1:]
         self._track = [*before, (frame.time, found)]
         if self.camera.readout and not self._follow_camera:
             found = self._at_frame_time(found, seen)
         used = {index: detection for index, detection in seen.items() if found.used[index]}
-        for index, detection in used.items():
-            centres[index] = detection.ellipse[:2]
+        centres = _centres(self.body, used)
         pose, covariance = pose_in_floor(found, self.floor_pose)
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
-            return replace(_no_pose(frame, IMPOSSIBLE, centres), floor=self.floor_pose, floor_seen=floor_seen)
+            nothing = no_pose(frame, IMPOSSIBLE, self.body)
+            return replace(nothing, centres=centres, floor=self.floor_pose, floor_seen=floor_seen)
         count = int(found.used.sum())
         status = OK if count == len(self.body.markers) else PARTIAL
         return Sample(
@@ -151,18 +150,13 @@ class Tracker:
         if found is None or found.used.all():
             return found, seen
         # the prediction may have been off, or three markers seen from the wrong side of their plane's two likely tilts
-        tries = [(found, seen), *(self._solved_at(frame.image, *start) for start in (_seat(found), _mirrored(found)))]
+        starts = (found.rotation, found.position), _mirrored(found)
+        tries = [(found, seen), *(self._solved_at(frame.image, *start) for start in starts)]
         return max(tries, key=lambda t: (-1, 0.0) if t[0] is None else (int(t[0].used.sum()), -t[0].residual))
 
     def _solved_at(self, image: Image, rotation: Array, position: Array) -> tuple[TargetPose | None, dict[int, Detection]]:
         """The pose from the markers near where this one puts them."""
-        seen = {}
-        for index in range(len(self.body.markers)):
-            ellipse = expected_ellipse(self.body, index, self._values, rotation, position)
-            if ellipse is not None:
-                detection = refine(image, self._values, ellipse, int(self.body.codes[index]))
-                if detection is not None:
-                    seen[index] = detection
+        seen = seen_at(image, self.body, self._values, rotation, position)
         found = solve_pose(seen, self.body, self.camera, rotation, position)
         return (found, seen) if found is not None and found.residual < LARGEST_RESIDUAL else (None, seen)
 
@@ -227,7 +221,7 @@ class Tracker:
     def _locate_anew(self, image: Image) -> dict[int, Detection]:
         """Locate the floor in this frame alone; returns its markers. It stays where it was when too few are seen."""
         last = self.floor_pose
-        seen = seen_at(image, self.floor, self._values, last)
+        seen = seen_at(image, self.floor, self._values, last.rotation, last.position)
         if len(seen) < MINIMUM_MARKERS:
             detections = detect(image, self.camera)
             found = find_target(
@@ -235,7 +229,7 @@ class Tracker:
             )
             if found is None:
                 return {}
-            last, seen = found, seen_at(image, self.floor, self._values, found)
+            last, seen = found, seen_at(image, self.floor, self._values, found.rotation, found.position)
         found = solved_floor(seen, self.floor, self.camera, last)
         if found is None:
             return {}
@@ -248,10 +242,6 @@ class Tracker:
         ellipse = expected_ellipse(self.floor, index, self._values, pose.rotation, pose.position)
         seen = None if ellipse is None else refine(image, self._values, ellipse, int(self.floor.codes[index]))
         return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
-
-
-def _seat(pose: TargetPose) -> tuple[Array, Array]:
-    return pose.rotation, pose.position
 
 
 def _mirrored(pose: TargetPose) -> tuple[Array, Array]:
@@ -298,16 +288,13 @@ def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) ->
             most = max(most, detections, key=lambda found: sum(d.code in floor.codes for d in found))
             start = find_target(detections, floor, camera, tolerance=target_pixels(camera, detections, floor))
         if start is not None:
-            for index, detection in seen_at(frame.image, floor, camera.values, start).items():
+            for index, detection in seen_at(frame.image, floor, camera.values, start.rotation, start.position).items():
                 sums[index].append(detection)
     if start is None:
         raise InputError(f"no floor frame in the first {len(frames)} frames: {sheet_fault(most, floor, camera)}")
     means = {index: mean_detection(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
     found = solved_floor(means, floor, camera, start) or start
-    centres = np.full((len(floor.markers), 2), np.nan)
-    for index, detection in means.items():
-        centres[index] = detection.ellipse[:2]
-    return found, centres
+    return found, _centres(floor, means)
 
 
 def check_size(image: Image, camera: Camera, where: str) -> None:
@@ -362,15 +349,25 @@ def without_pose(sample: Sample, status: str) -> Sample:
     return replace(sample, status=status, pose=nothing[0], covariance=nothing[1], markers=0, residual=math.nan, in_camera=None)
 
 
-def _no_pose(frame: VideoFrame, status: str, centres: Array) -> Sample:
-    return Sample(frame.index, frame.time, status, np.full(6, np.nan), np.full((6, 6), np.nan), 0, math.nan, centres)
+def no_pose(frame: VideoFrame, status: str, body: Target) -> Sample:
+    """The sample of a frame that shows nothing."""
+    nothing = np.full(6, np.nan), np.full((6, 6), np.nan)
+    return Sample(frame.index, frame.time, status, *nothing, 0, math.nan, _centres(body, {}))
 
 
-def seen_at(image: Image, target: Target, camera: Array, pose: TargetPose) -> dict[int, Detection]:
+def _centres(target: Target, seen: Mapping[int, Detection]) -> Array:
+    """Centres (M, 2) px of a target's markers; NaN where not seen."""
+    centres = np.full((len(target.markers), 2), np.nan)
+    for index, detection in seen.items():
+        centres[index] = detection.ellipse[:2]
+    return centres
+
+
+def seen_at(image: Image, target: Target, camera: Array, rotation: Array, position: Array) -> dict[int, Detection]:
     """The markers of a target where a pose puts them."""
     seen = {}
     for index in range(len(target.markers)):
-        ellipse = expected_ellipse(target, index, camera, pose.rotation, pose.position)
+        ellipse = expected_ellipse(target, index, camera, rotation, position)
         detection = None if ellipse is None else refine(image, camera, ellipse, int(target.codes[index]))
         if detection is not None:
             seen[index] = detection
