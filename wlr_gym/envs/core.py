@@ -109,20 +109,17 @@ class Core:
             self.observer = SlipObserver(robot, config.control_period, self.count, config.observer.camera)
         self._score_kernel = compile_scores(self.task)
         self._computed_kernel = compile_computed(self.task) if self.task.computed else None
-        self._make_spaces()
+        policy, privileged = (
+            spaces.Box(*bounds(columns), dtype=np.float32) for columns in (self.task.policy, self.task.privileged)
+        )
+        self.observation_space = spaces.Dict({"policy": policy, "privileged": privileged}) if self.dictionary else policy
+        self.action_space = spaces.Box(-1.0, 1.0, (len(self.task.actions),), dtype=np.float32)
         self.everyone: Mask = np.ones(self.count, dtype=bool)
         self._make_parts()
         if settings.is_real:
             self._load_kernels()
 
     # ---- set-up ----
-
-    def _make_spaces(self) -> None:
-        policy, privileged = (
-            spaces.Box(*bounds(columns), dtype=np.float32) for columns in (self.task.policy, self.task.privileged)
-        )
-        self.observation_space = spaces.Dict({"policy": policy, "privileged": privileged}) if self.dictionary else policy
-        self.action_space = spaces.Box(-1.0, 1.0, (len(self.task.actions),), dtype=np.float32)
 
     def _make_parts(self) -> None:
         task, count, real = self.task, self.count, self.settings.is_real

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.signals import signals_of
 from wlr_gym.envs.tasks.task import Task
-from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.envs.tasks.terms import COMPUTED, SCALARS
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Sensors
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ def measurable(task: Task, has_camera: bool) -> tuple[Task, tuple[str, ...]]:
         if column.source == "truth" or (column.source == "computed" and not _is_known(COMPUTED[column.term].function)):
             raise InputError(f"observation '{column.term}': only a simulator knows the true state")
     kept, left_out = {}, []
-    for group, registry in (("rewards", REWARDS), ("terminations", TERMINATIONS), ("measures", MEASURES)):
+    for group, registry in SCALARS.items():
         chosen = getattr(task.config, group)
         kept[group] = {name: values for name, values in chosen.items() if _is_known(registry[name].function)}
         left_out += [name for name in chosen if name not in kept[group]]

@@ -26,8 +26,6 @@ Rows = NDArray[np.intp]
 Seeds = NDArray[np.uint64]
 Counts = NDArray[np.int64]
 
-_AS_THE_ROBOT = SensorsConfig()
-
 
 class RandomizedRobots:
     """Parameters and initial states of N robots.
@@ -54,7 +52,7 @@ class RandomizedRobots:
         patch: Patch,
         control_period: float,
         count: int,
-        sensors: SensorsConfig = _AS_THE_ROBOT,
+        sensors: SensorsConfig,
     ) -> None:
         self._randomization = randomization
         self._patch = patch

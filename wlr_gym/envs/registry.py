@@ -67,16 +67,11 @@ def register_environments() -> None:
         enter(f"WLR-{title}-v0", name, f"wlr_gym.envs.classes:{title}Env", f"wlr_gym.envs.classes:{title}VectorEnv")
 
 
-def register_definition(env_id: str, source: str, definition: dict[str, Any]) -> None:
-    """Register a task by its whole content, so that a spec of it works in processes that know neither id nor file.
-
-    A task that is registered again is what it says now.
-    """
-    enter(env_id, source, "wlr_gym.envs.single:WlrEnv", "wlr_gym.envs.vector:WlrVectorEnv", definition=definition)
-
-
 def enter(env_id: str, task: str, single: str, vector: str, **keywords: Any) -> None:
-    """Enter an id into Gymnasium's registry and :data:`ENVIRONMENTS`, with the classes' places and keywords."""
+    """Enter an id into Gymnasium's registry and :data:`ENVIRONMENTS`, with the classes' places and keywords.
+
+    A task that is entered again is what its keywords say now.
+    """
     import gymnasium
 
     if env_id in gymnasium.registry and gymnasium.registry[env_id].kwargs != keywords:

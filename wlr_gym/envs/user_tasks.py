@@ -6,7 +6,7 @@ from pathlib import Path
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import find_config
-from wlr_gym.envs.registry import ENVIRONMENTS, register_definition, title_of
+from wlr_gym.envs.registry import ENVIRONMENTS, enter, title_of
 from wlr_gym.envs.tasks.task_config import read_task
 
 
@@ -34,6 +34,6 @@ def register_task(path: str | Path) -> str:
     present = ENVIRONMENTS.get(env_id, source)
     if present != source:
         raise InputError(f"{source}: '{env_id}' is the task '{present}' already; give it another name")
-    definition = config.model_dump(mode="json", exclude_none=True)
-    register_definition(env_id, source, definition)
+    definition = config.model_dump(mode="json", exclude_none=True)  # so that a spec works where neither id nor file is known
+    enter(env_id, source, "wlr_gym.envs.single:WlrEnv", "wlr_gym.envs.vector:WlrVectorEnv", definition=definition)
     return env_id

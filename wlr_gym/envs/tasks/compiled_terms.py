@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.signals import PRESENCE, START, Signals, Value
 from wlr_gym.envs.tasks.task import Task
-from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, TERMINATIONS
+from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, SCALARS, TERMINATIONS
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.codegen import Graph, emit, load_module, ops, straight_line_source
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
@@ -135,15 +135,10 @@ def constants(task: Task) -> Mapping[str, float]:
     values = {"task.control_period": config.control_period}
     values |= {f"task.action.{name}": scale for name, scale in config.action}
     values |= {f"controller.{name}": gain for name, gain in config.controller or ()}
-    groups = (
-        ("reward", task.config.rewards, REWARDS),
-        ("termination", task.config.terminations, TERMINATIONS),
-        ("measure", task.config.measures, MEASURES),
-    )
-    for kind, chosen, registry in groups:
-        for name, given in chosen.items():
+    for group, registry in SCALARS.items():
+        for name, given in getattr(config, group).items():
             merged = {**registry[name].parameters, **given}
-            values |= {f"{kind}.{name}.{key}": float(value) for key, value in merged.items()}
+            values |= {f"{group.removesuffix('s')}.{name}.{key}": float(value) for key, value in merged.items()}
     return values
 
 

@@ -232,43 +232,28 @@ class Randomization:
             spread: (M,) share of every distribution about its middle that is drawn from, below 1 early in a curriculum;
                 None = 1.
         """
-        count = len(episode_seeds)
-        values = np.repeat(self._nominal.values, count, axis=0)
-        if self._sampler is not None:
-            spread = np.ones(count) if spread is None else spread
-            self._apply(values, self._draw(self._sampler, robot_seeds, episode_seeds, occurrences, time, spread))
-        return Parameters(values)
-
-    def _draw(
-        self,
-        sampler: Sampler,
-        robot_seeds: Seeds,
-        episode_seeds: Seeds,
-        occurrences: Counts | None,
-        time: Array | None,
-        spread: Array,
-    ) -> Array:
         count, strikes = len(episode_seeds), len(self.intervals)
+        values = np.repeat(self._nominal.values, count, axis=0)
+        if self._sampler is None:
+            return Parameters(values)
         seeds = np.where(self._at_startup, robot_seeds[:, None], episode_seeds[:, None])
         counts = np.zeros((count, strikes + len(self.drifts) + 1), dtype=np.int64)
         if occurrences is not None:
             counts[:, :strikes] = occurrences
-        if self._drift_sampler is None:
-            return sampler(seeds, counts[:, self._clock], spread)
-        knots = self._knots(episode_seeds, np.zeros(count) if time is None else time)
-        counts[:, strikes:-1] = np.floor(knots)
-        drawn = sampler(seeds, counts[:, self._clock], spread)
-        clock = self._clock[self._drifting]
-        following = self._drift_sampler(seeds[:, self._drifting], counts[:, clock] + 1, spread)
-        share = (knots - np.floor(knots))[:, clock - strikes]
-        share = share * share * (3.0 - 2.0 * share)  # rises smoothly from 0 to 1: the path has no kinks at its knots
-        drawn[:, self._drifting] += share * (following - drawn[:, self._drifting])
-        return drawn
-
-    def _knots(self, episode_seeds: Seeds, time: Array) -> Array:
-        """How many knots (M, len(drifts)) each drifting event has passed."""
         low, high = self._drift_limits.T
-        return time[:, None] / (low + (high - low) * uniforms(episode_seeds, self._drift_streams))
+        passed = np.zeros((count, 1)) if time is None else time[:, None]
+        knots = passed / (low + (high - low) * uniforms(episode_seeds, self._drift_streams))  # of each drifting event
+        counts[:, strikes:-1] = np.floor(knots)
+        spread = np.ones(count) if spread is None else spread
+        drawn = self._sampler(seeds, counts[:, self._clock], spread)
+        if self._drift_sampler is not None:
+            clock = self._clock[self._drifting]
+            following = self._drift_sampler(seeds[:, self._drifting], counts[:, clock] + 1, spread)
+            share = (knots - np.floor(knots))[:, clock - strikes]
+            share = share * share * (3.0 - 2.0 * share)  # rises smoothly from 0 to 1: the path has no kinks at its knots
+            drawn[:, self._drifting] += share * (following - drawn[:, self._drifting])
+        self._apply(values, drawn)
+        return Parameters(values)
 
     def _apply(self, values: Array, drawn: Array) -> None:
         start = 0

@@ -12,16 +12,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.signals import signals_of
 from wlr_gym.envs.tasks.task_config import TaskConfig, read_task
-from wlr_gym.envs.tasks.terms import (
-    COMMANDS,
-    COMPUTED,
-    MEASURES,
-    POLICY_TERMS,
-    PRIVILEGED_TERMS,
-    REWARDS,
-    TERMINATIONS,
-    ObservationTerm,
-)
+from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, POLICY_TERMS, PRIVILEGED_TERMS, SCALARS, ObservationTerm
 from wlr_gym.envs.tasks.terms.observations import limit_for
 from wlr_gym.policy.sources import FED
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, RobotSource, load_robot
@@ -116,8 +107,7 @@ class Task:
     def needs_observer(self) -> bool:
         """Whether any term needs the slip observer's estimate."""
         functions = [COMPUTED[name].function for name in self.computed_terms]
-        for names, registry in ((self.rewards, REWARDS), (self.terminations, TERMINATIONS), (self.measures, MEASURES)):
-            functions += [registry[name].function for name in names]
+        functions += [registry[name].function for group, registry in SCALARS.items() for name in getattr(self.config, group)]
         return self.shows_estimate or any(map(_reads_estimate, functions))
 
     @property

@@ -14,26 +14,18 @@ from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_config
 from wlr_gym.envs.tasks.scaling import check_rule, scaled
 from wlr_gym.envs.tasks.signals import signals_of
-from wlr_gym.envs.tasks.terms import (
-    COMMANDS,
-    COMPUTED,
-    MEASURES,
-    POLICY_TERMS,
-    PRIVILEGED_TERMS,
-    REWARDS,
-    TERMINATIONS,
-    ScalarTerm,
-)
+from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, POLICY_TERMS, PRIVILEGED_TERMS, SCALARS
 from wlr_gym.policy.slip_compensating import SlipGains
 from wlr_gym.robot import Robot, load_robot
 
-#: Group of a task's data -> what its terms are called, and those there are.
-_TERMS: dict[str, tuple[str, Mapping[str, Any]]] = {
-    "observations": ("observation term", POLICY_TERMS),
-    "privileged": ("privileged term", PRIVILEGED_TERMS),
-    "rewards": ("reward term", REWARDS),
-    "terminations": ("termination term", TERMINATIONS),
-    "measures": ("measure", MEASURES),
+#: Group of a task's data -> those of its terms that there are, and what they are called.
+_TERMS: dict[str, Mapping[str, Any]] = {"observations": POLICY_TERMS, "privileged": PRIVILEGED_TERMS, **SCALARS}
+_CALLED = {
+    "observations": "observation term",
+    "privileged": "privileged term",
+    "rewards": "reward term",
+    "terminations": "termination term",
+    "measures": "measure",
 }
 
 
@@ -208,9 +200,8 @@ def read_task(
     config = parse_config(TaskConfig, data, where)
     _check_ranges(config, where)
     _check_names(vars(config), where)
-    _check_scalars("reward term", config.rewards, REWARDS, {"weight"}, where)
-    _check_scalars("termination term", config.terminations, TERMINATIONS, set(), where)
-    _check_scalars("measure", config.measures, MEASURES, set(), where)
+    for group in SCALARS:
+        _check_scalars(group, getattr(config, group), where)
     for name in config.success:
         if name not in config.measures:
             raise unknown_name("measure", name, config.measures, f"{where}: success")
@@ -226,8 +217,7 @@ def _for_robot(data: Any, changed_rules: Any, robot: Robot, where: str) -> Any:
     rules = overlay(written.scaling, changed_rules if isinstance(changed_rules, Mapping) else {})
     for place, rule in rules.items():
         check_rule(place, rule, where)
-    reference = load_robot(written.robot)
-    return scaled(data, rules, robot, reference, where)
+    return scaled(data, rules, robot, load_robot(written.robot), where)
 
 
 def _task_data(source: Any) -> tuple[Any, str]:
@@ -236,24 +226,19 @@ def _task_data(source: Any) -> tuple[Any, str]:
     if not isinstance(source, (str, Path)):
         raise InputError(f"task = {source!r}: expected a name, a path or a mapping")
     data, where = read_config("task", source)
-    return _with_places(data, where), where
-
-
-def _with_places(data: Any, where: str) -> Any:
-    """Return a task file's content with the files that it names seen from its own folder."""
-    if not isinstance(data, Mapping):
-        return data
-    named = {key: data[key] for key in ("robot", "randomization") if isinstance(data.get(key), str)}
-    return {**data, **{key: str(named_in(where, name)) for key, name in named.items()}}
+    if isinstance(data, Mapping):  # the files that it names are seen from its own folder
+        named = {key: data[key] for key in ("robot", "randomization") if isinstance(data.get(key), str)}
+        data = {**data, **{key: str(named_in(where, name)) for key, name in named.items()}}
+    return data, where
 
 
 def _check_names(data: Mapping[str, Any], where: str) -> None:
     """Refuse a term that does not exist, in changes also one that is to be removed."""
-    for group, (kind, registry) in _TERMS.items():
+    for group, registry in _TERMS.items():
         names = data.get(group)
         for name in names if isinstance(names, Mapping) else ():
             if name not in registry:
-                raise unknown_name(kind, str(name), registry, where)
+                raise unknown_name(_CALLED[group], str(name), registry, where)
 
 
 def _check_ranges(config: TaskConfig, where: str) -> None:
@@ -287,9 +272,8 @@ def _check_ranges(config: TaskConfig, where: str) -> None:
         raise InputError(f"{where}: episode_length = {length:g} s is not a whole number of control periods of {period:g} s")
 
 
-def _check_scalars(
-    kind: str, chosen: Mapping[str, Mapping[str, float]], registry: Mapping[str, ScalarTerm], required: set[str], where: str
-) -> None:
+def _check_scalars(group: str, chosen: Mapping[str, Mapping[str, float]], where: str) -> None:
+    kind, registry, required = _CALLED[group], SCALARS[group], {"weight"} if group == "rewards" else set[str]()
     for name, values in chosen.items():
         valid = required | set(registry[name].parameters)
         for key in values:
@@ -306,9 +290,11 @@ def _check_scalars(
 
 def _check_commands(config: TaskConfig, where: str) -> None:
     """Refuse a term that reads a command which the task does not give."""
-    functions = {f"reward term '{name}'": REWARDS[name].function for name in config.rewards}
-    functions |= {f"termination term '{name}'": TERMINATIONS[name].function for name in config.terminations}
-    functions |= {f"measure '{name}'": MEASURES[name].function for name in config.measures}
+    functions = {
+        f"{_CALLED[group]} '{name}'": registry[name].function
+        for group, registry in SCALARS.items()
+        for name in getattr(config, group)
+    }
     used = [name for name in (*config.observations, *config.privileged) if name in COMPUTED]
     functions |= {f"observation term '{name}'": COMPUTED[name].function for name in used}
     for term, function in functions.items():

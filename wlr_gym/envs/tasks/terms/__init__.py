@@ -12,6 +12,9 @@ from wlr_gym.envs.tasks.terms.rewards import REWARDS
 from wlr_gym.envs.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
 from wlr_gym.envs.tasks.terms.terminations import TERMINATIONS
 
+#: Group of a task's terms that are single numbers -> those there are.
+SCALARS = {"rewards": REWARDS, "terminations": TERMINATIONS, "measures": MEASURES}
+
 __all__ = [
     "COMMANDS",
     "COMPUTED",
