@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from hand_clock import HandClock
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -28,17 +29,6 @@ ROBOT = load_robot("flow")
 SENSOR: Any = ROBOT.sensors.flow
 PORT = FlowPort(port="/dev/spidev0.0", driver="spi", axes=("x", "y"))
 STREAM = FlowPort(port="/dev/ttyACM1", axes=("x", "y"))
-
-
-class Clock:
-    def __init__(self):
-        self.time = 100.0
-
-    def __call__(self):
-        return self.time
-
-    def sleep(self, seconds):
-        self.time += seconds
 
 
 class Chip:
@@ -109,7 +99,7 @@ class Chip:
 
 
 def set_up_chip(**options):
-    clock = Clock()
+    clock = HandClock(100.0)
     chip = Chip(clock, **options)
     driver = Pmw3901(chip, clock.sleep)
     driver.set_up("flow sensor")
@@ -149,7 +139,7 @@ def test_burst_holds_signed_counts_quality_and_shutter():
 
 def polled(chip_of=Chip, **options):
     """A poller whose thread stands still: the test polls."""
-    clock = Clock()
+    clock = HandClock(100.0)
     chip = chip_of(clock, **options)
     poller = ChipPoller(PORT, SENSOR, clock, lambda path: chip, clock.sleep)
     poller._bus, poller._chip = chip, Pmw3901(chip, clock.sleep)
@@ -160,10 +150,10 @@ def polled(chip_of=Chip, **options):
 
 def test_readings_are_over_the_frames_own_time_whatever_the_control_steps_cut():
     clock, chip, poller = polled()
-    start, frame, readings = clock.time, 0, []
+    start, frame, readings = clock.now, 0, []
     for poll in range(1, 600):
-        clock.time = start + poll / (2.5 * SENSOR.rate)
-        if clock.time - start >= (frame + 1) / SENSOR.rate:
+        clock.now = start + poll / (2.5 * SENSOR.rate)
+        if clock.now - start >= (frame + 1) / SENSOR.rate:
             frame += 1
             chip.move(11, -4)
             chip.quality = 90 + frame % 2
@@ -180,7 +170,7 @@ def test_a_floor_at_rest_reads_zero_and_is_new():
     readings = []
     for _ in range(20):
         for _ in range(6):
-            clock.time += 1 / (2.5 * SENSOR.rate)
+            clock.now += 1 / (2.5 * SENSOR.rate)
             poller.poll()
         readings.append(poller.read())
     assert all(reading.is_new and not reading.flow.any() for reading in readings)
@@ -190,13 +180,13 @@ def test_a_line_that_is_disturbed_is_tried_again_and_a_dead_one_is_said():
     clock, chip, poller = polled()
     chip.fails = 5
     for _ in range(10):
-        clock.time += 0.004
+        clock.now += 0.004
         poller.poll()
     assert poller.read().is_new
     assert poller.statistics.lost == 5
     chip.fails = 10**6
     for _ in range(pmw3901.PATIENCE):
-        clock.time += 0.004
+        clock.now += 0.004
         poller.poll()
     reading = poller.read()
     assert not reading.is_new
@@ -275,7 +265,7 @@ class Pipe:
 
 
 def stream_and_pipe():
-    clock, pipe = Clock(), Pipe()
+    clock, pipe = HandClock(100.0), Pipe()
     stream = FlowStream(STREAM, SENSOR, clock, lambda *port: pipe)
     stream.open()
     return clock, pipe, stream
@@ -288,13 +278,13 @@ def test_stream_gives_the_mean_over_what_came_and_ages_between():
     np.testing.assert_allclose(first.flow, np.array([15, -2]) * SENSOR.count / 8264e-6)
     assert first.is_new
     assert first.quality == pytest.approx(88 / 255)
-    clock.time += 0.02
+    clock.now += 0.02
     held = stream.read()
     assert not held.is_new
     assert not held.trouble  # one control step without a frame is none
     assert held.age == pytest.approx(first.age + 0.02)
     np.testing.assert_array_equal(held.flow, first.flow)
-    clock.time += 0.2
+    clock.now += 0.2
     assert stream.read().trouble == "silent: no frame for 0.2 s"
     pipe.dead = True
     gone = stream.read()

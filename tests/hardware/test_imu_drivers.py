@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hand_clock import HandClock
 from pydantic import ValidationError
 
 from wlr_gym.base.errors import InputError
@@ -25,17 +26,6 @@ from wlr_gym.robot import load_robot
 
 G = STANDARD_GRAVITY
 PORT = ImuPort(port="/dev/i2c-9", driver="i2c", rate=200.0)
-
-
-class Clock:
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        return self.now
-
-    def sleep(self, seconds):
-        self.now += seconds
 
 
 class Chip:
@@ -101,7 +91,7 @@ class Chip:
 
 @pytest.fixture
 def clock():
-    return Clock()
+    return HandClock()
 
 
 @pytest.fixture

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ from wlr_gym.physics.model.dynamics import (
     mass_matrix_and_bias,
     rotation_matrix,
 )
+from wlr_gym.physics.plants.base import Truth
 from wlr_gym.robot import LEG_SLICE
 from wlr_gym.robot.parameters import Parameters
 
@@ -34,6 +37,23 @@ def potential_energy(parameters: Parameters, position: Array, quaternion: Array,
         "nij,nj->ni", rotation_matrix(quaternion), _first_moment(constants, joint_position)
     )
     return -np.einsum("ni,ni->n", gravity_in_floor(parameters), moment)
+
+
+def mechanical_energy(parameters: Parameters, state: Any) -> Array:
+    """Return kinetic and potential energy (N,), J, of robots in a plant's truth or mechanical state."""
+    motion = state.linear_velocity_in_body, state.angular_velocity_in_body, state.joint_position, state.joint_velocity
+    place = state.position, state.quaternion, state.joint_position
+    return kinetic_energy(parameters, *motion) + potential_energy(parameters, *place)
+
+
+def wheel_gaps(parameters: Parameters, truth: Truth) -> Array:
+    """Return the height (N, 4) of every thin-disc wheel's lowest point over the floor, m."""
+    normal = rotation_matrix(truth.quaternion)[:, 2]
+    angle = truth.joint_position[:, :4]
+    axle = parameters["hip.position"][:, None, :] * [[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]
+    axle += parameters["leg.length"][..., None] * np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], axis=-1)
+    reach = parameters["wheel.radius"] * np.hypot(normal[:, :1], normal[:, 2:])
+    return truth.position[:, 2:] + np.einsum("nwk,nk->nw", axle, normal) - reach
 
 
 def _first_moment(constants: dict[str, Array], joint_position: Array) -> Array:

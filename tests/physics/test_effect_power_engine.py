@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from energy import kinetic_energy, potential_energy
+from energy import mechanical_energy, wheel_gaps
 from rig import LEGS_DOWN, ROBOT, drive, float_in_space, gears, lift, lock, make_plant
 
-from wlr_gym.physics.model import dynamics
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.physics.plants.forces import make_force
 
@@ -50,23 +49,12 @@ def stored(plant):
     truth, state, parameters = plant.truth(), plant.mechanical_state(), plant.parameters.copy()
     play, armature = parameters["servo.backlash"], parameters["servo.armature"].copy()
     parameters["servo.armature"] = np.where(play > 0.0, 0.0, armature)
-    v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
-    total = kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
-    total += potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
+    total = mechanical_energy(parameters, truth)
     pressed = np.maximum(np.abs(state.rotor_lead) - 0.5 * play, 0.0)
     rotor = armature * state.rotor_rate**2 + parameters["servo.gear_stiffness"] * pressed**2
     total += 0.5 * np.where(play > 0.0, rotor, 0.0).sum(axis=1)
     reach = truth.position[:, :2] - parameters["tether.anchor"]
     return total + 0.5 * parameters["tether.stiffness"] * (reach**2).sum(axis=1)
-
-
-def wheel_gaps(parameters, truth):
-    normal = dynamics.rotation_matrix(truth.quaternion)[:, 2]
-    angle = truth.joint_position[:, :4]
-    axle = parameters["hip.position"][:, None, :] * [[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]
-    axle += parameters["leg.length"][..., None] * np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], axis=-1)
-    reach = parameters["wheel.radius"] * np.hypot(normal[:, :1], normal[:, 2:])
-    return truth.position[:, 2:] + np.einsum("nwk,nk->nw", axle, normal) - reach
 
 
 @pytest.mark.parametrize("family", FAMILIES)

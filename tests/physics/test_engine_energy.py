@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from energy import kinetic_energy, potential_energy
+from energy import mechanical_energy, wheel_gaps
 from rig import make_plant
 
-from wlr_gym.physics.model import dynamics
 from wlr_gym.physics.plants.base import Truth
 
 COUNT = 4
@@ -24,22 +23,6 @@ def edit(parameters):
     parameters["servo.profile_acceleration"] = np.repeat([15.0, 10.0], 4)
 
 
-def energy(parameters, truth):
-    v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
-    kinetic = kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
-    return kinetic + potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
-
-
-def wheel_gaps(parameters, truth):
-    """Height (N, 4) of every thin-disc wheel's lowest point over the floor."""
-    normal = dynamics.rotation_matrix(truth.quaternion)[:, 2]
-    angle = truth.joint_position[:, :4]
-    axle = parameters["hip.position"][:, None, :] * [[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]
-    axle += parameters["leg.length"][..., None] * np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], axis=-1)
-    reach = parameters["wheel.radius"] * np.hypot(normal[:, :1], normal[:, 2:])
-    return truth.position[:, 2:] + np.einsum("nwk,nk->nw", axle, normal) - reach
-
-
 def rates(truth):
     """Joint rates (N, 8), slip velocity (N, 8) and absolute spins of the wheels (N, 4)."""
     spin = truth.angular_velocity_in_body[:, 1:2] + truth.joint_velocity[:, :4] + truth.joint_velocity[:, 4:]
@@ -55,7 +38,7 @@ def audit():
     names = ("motor", "gear", "viscous", "friction", "normal", "rolling")
     work = {name: np.zeros((10_000, COUNT)) for name in names}
     shown = np.zeros((10_000, COUNT))
-    start = energy(parameters, plant.truth())
+    start = mechanical_energy(parameters, plant.truth())
     old = Truth(plant.truth().values.copy())
     old_gap, old_rates = wheel_gaps(parameters, old), rates(old)
     setpoints = np.zeros((COUNT, 8))
@@ -75,7 +58,7 @@ def audit():
         work["rolling"][tick] = (truth.rolling_torque * spin).sum(axis=1)
         shown[tick] = truth.mechanical_energy
         old_gap, old_rates = gap, new_rates
-    return start, energy(parameters, plant.truth()), work, shown
+    return start, mechanical_energy(parameters, plant.truth()), work, shown
 
 
 def test_energy_balance_closes(audit):

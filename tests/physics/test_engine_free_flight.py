@@ -3,7 +3,7 @@
 import itertools
 
 import numpy as np
-from energy import kinetic_energy, potential_energy
+from energy import kinetic_energy, mechanical_energy
 from rig import ROBOT, make_plant
 from test_contact_free_mujoco import random_parameters
 
@@ -116,14 +116,8 @@ def fly(step):
 
 def energies(plant):
     state = plant.mechanical_state()
-    kinetic = kinetic_energy(
-        plant.parameters,
-        state.linear_velocity_in_body,
-        state.angular_velocity_in_body,
-        state.joint_position,
-        state.joint_velocity,
-    )
-    return kinetic, kinetic + potential_energy(plant.parameters, state.position, state.quaternion, state.joint_position)
+    motion = state.linear_velocity_in_body, state.angular_velocity_in_body, state.joint_position, state.joint_velocity
+    return kinetic_energy(plant.parameters, *motion), mechanical_energy(plant.parameters, state)
 
 
 def test_free_flight_conserves_energy():

@@ -2,18 +2,10 @@
 
 import numpy as np
 import pytest
-from two_plants import BACKENDS, ROBOT, drive, make, turn
+from rig import free_wheels, lock, turn
+from two_plants import BACKENDS, ROBOT, drive, make
 
 G, MASS, RADIUS = ROBOT.gravity, ROBOT.total_mass, ROBOT.wheel.radius
-
-
-def lock(parameters):
-    parameters["servo.coulomb_friction"] = 50.0
-
-
-def free_wheels(parameters):
-    lock(parameters)
-    parameters["servo.coulomb_friction"][:, 4:] = 0.0
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from energy import kinetic_energy, potential_energy
+from energy import mechanical_energy, wheel_gaps
 from two_plants import ROBOT, make
 
-from wlr_gym.physics.model import dynamics
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.physics.plants.mujoco.batch import RobotBatch
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
@@ -77,19 +76,8 @@ def edit(parameters):
 
 
 def stored(parameters, truth):
-    v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
-    kinetic = kinetic_energy(parameters, v, w, truth.joint_position, truth.joint_velocity)
     tether = 0.5 * parameters["tether.stiffness"] * (truth.position[:, :2] ** 2).sum(axis=1)
-    return kinetic + tether + potential_energy(parameters, truth.position, truth.quaternion, truth.joint_position)
-
-
-def wheel_gaps(parameters, truth):
-    normal = dynamics.rotation_matrix(truth.quaternion)[:, 2]
-    angle = truth.joint_position[:, :4]
-    axle = parameters["hip.position"][:, None, :] * [[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]
-    axle += parameters["leg.length"][..., None] * np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], axis=-1)
-    reach = parameters["wheel.radius"] * np.hypot(normal[:, :1], normal[:, 2:])
-    return truth.position[:, 2:] + np.einsum("nwk,nk->nw", axle, normal) - reach
+    return mechanical_energy(parameters, truth) + tether
 
 
 @pytest.fixture(scope="module")

@@ -42,8 +42,3 @@ def drive(plant: Plant, seconds: float, setpoints=HOME, torque_on=None) -> np.nd
     for _ in range(round(seconds / plant.options.control_period)):
         plant.step(setpoints, torque_on)
     return plant.truth().linear_velocity_in_body.copy()
-
-
-def turn(state: PlantState, yaw: np.ndarray) -> None:
-    """Turn standing robots to headings ``yaw`` (N,), rad."""
-    state.quaternion[:] = np.column_stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)])

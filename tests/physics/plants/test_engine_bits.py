@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from simulators import random_setpoints
 
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.plants.gibbs_appell.plant import TILES_AT_A_TIME, GibbsAppellPlant
@@ -26,13 +27,6 @@ def random_parameters(count, seed=3):
         parameters["wheel.radius"][row] *= rng.uniform(0.98, 1.02, 4)
         parameters["command.delay"][row] = rng.uniform(0.0, 0.03)
     return parameters
-
-
-def random_setpoints(count, ticks, seed=4):
-    """Setpoints (ticks, count, 8); column i depends on i alone."""
-    rows = [np.random.default_rng([seed, row]) for row in range(count)]
-    low, high = np.repeat([1.2, -5.0], 4), np.repeat([1.9, 5.0], 4)
-    return np.stack([rng.uniform(low, high, (ticks, 8)) for rng in rows], axis=1)
 
 
 def rollout(parameters, setpoints, seeds, precision="float64", threads=1):
