@@ -9,7 +9,7 @@ from numba import njit
 
 from wlr_gym.perception.observer import kalman
 from wlr_gym.perception.observer.correction import correct, correct_yaw
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT
+from wlr_gym.perception.observer.layout import SENSOR
 
 #: Squared normalised innovation beyond which a frame is refused.
 GATE = 20.0
@@ -23,10 +23,6 @@ _SAME_YAW = 0.03
 #: s without a frame after which nothing is said about the last one.
 _SILENCE = 0.5
 
-_CAMERA = SENSOR_LAYOUT.slices["camera_pose"].start
-_AGE = SENSOR_LAYOUT.slices["camera_age"].start
-_IS_NEW = SENSOR_LAYOUT.slices["camera_is_new"].start
-
 
 @njit(cache=True, nogil=True)
 def see_camera(robot: Any, sensors: Any, r: Any) -> None:
@@ -38,14 +34,14 @@ def see_camera(robot: Any, sensors: Any, r: Any) -> None:
     robot that slides. A frame that repeats the last one to the last bit is no new picture.
     """
     r.frame_time += robot.period
-    x, y, yaw = sensors[_CAMERA], sensors[_CAMERA + 1], sensors[_CAMERA + 2]
-    if robot.camera == 0.0 or not r.seen[_IS_NEW] > 0.5 or not math.isfinite(x + y + yaw):
+    x, y, yaw = sensors[SENSOR.camera_pose], sensors[SENSOR.camera_pose + 1], sensors[SENSOR.camera_pose + 2]
+    if robot.camera == 0.0 or not r.seen[SENSOR.camera_is_new] > 0.5 or not math.isfinite(x + y + yaw):
         if r.frame_time > _SILENCE:
             r.camera_off = r.camera_rejected = r.refused = 0.0
         return
     repeated = x == r.frame[0] and y == r.frame[1] and yaw == r.frame[2]
     r.frame[0], r.frame[1], r.frame[2] = x, y, yaw
-    age = min(max(r.seen[_AGE], 0.0), r.tick * robot.period, (r.raw.shape[0] - 2) * robot.period)
+    age = min(max(r.seen[SENSOR.camera_age], 0.0), r.tick * robot.period, (r.raw.shape[0] - 2) * robot.period)
     then_x, then_y, then_yaw = _pose_before(robot, age, r)
     off = _off(robot, age, x - then_x, y - then_y, yaw - then_yaw, r)
     dx, dy, dyaw = x - then_x, y - then_y, yaw - then_yaw

@@ -7,12 +7,11 @@ from typing import Any
 
 from numba import njit
 
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT
+from wlr_gym.perception.observer.layout import SENSOR
 from wlr_gym.robot import FIRST_WHEEL
 
-_LEG_RATE = SENSOR_LAYOUT.slices["joint_velocity"].start
-_WHEEL_RATE = _LEG_RATE + FIRST_WHEEL
-_WHEEL_EFFORT = SENSOR_LAYOUT.slices["joint_effort"].start + FIRST_WHEEL
+_WHEEL_RATE = SENSOR.joint_velocity + FIRST_WHEEL
+_WHEEL_EFFORT = SENSOR.joint_effort + FIRST_WHEEL
 #: N. Less than this counts as a wheel in the air when something is divided by its load.
 LEAST_LOAD = 0.5
 
@@ -37,7 +36,7 @@ def look(robot: Any, sensors: Any, r: Any) -> None:
     wx, wy, wz = r.rate[0], r.rate[1], r.rate[2]
     reach = robot.wheel_radius * scale
     for i in range(4):
-        leg_rate, wheel_rate = sensors[_LEG_RATE + i], sensors[_WHEEL_RATE + i]
+        leg_rate, wheel_rate = sensors[SENSOR.joint_velocity + i], sensors[_WHEEL_RATE + i]
         r.leg[i, 0], r.leg[i, 1] = math.cos(sensors[i]), math.sin(sensors[i])
         leg_x, leg_z = robot.leg_length * r.leg[i, 0], -robot.leg_length * r.leg[i, 1]
         rim_x, rim_z = -reach * nx, -reach * nz
@@ -141,7 +140,7 @@ def pull(robot: Any, sensors: Any, r: Any) -> None:
     """
     for i in range(4):
         rate = sensors[_WHEEL_RATE + i]
-        spin = rate + sensors[_LEG_RATE + i] + r.rate[1]
+        spin = rate + sensors[SENSOR.joint_velocity + i] + r.rate[1]
         spin_up = (spin - r.spin[i]) / robot.period
         dry = robot.gear_friction * math.tanh(rate / robot.velocity_count)
         torque = sensors[_WHEEL_EFFORT + i] - dry - robot.spin_inertia * spin_up

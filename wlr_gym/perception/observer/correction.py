@@ -8,7 +8,7 @@ from typing import Any
 from numba import njit
 
 from wlr_gym.perception.observer import kalman
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT
+from wlr_gym.perception.observer.layout import SENSOR
 
 #: m/s: noise of a wheel's rolling speed from step to step.
 _QUIET = 0.0005
@@ -20,8 +20,6 @@ _DOUBT = 3.0
 RADIUS = 0.005
 #: m/s: slip below which a wheel counts as gripping.
 _SOFT = 0.003
-
-_VELOCITY = SENSOR_LAYOUT.slices["joint_velocity"].start
 
 
 @njit(cache=True, nogil=True)
@@ -62,7 +60,7 @@ def see_rolling(robot: Any, r: Any) -> None:
 def see_rest(robot: Any, r: Any) -> None:
     """While every joint rests, the gyroscope reads its bias."""
     for k in range(8):
-        if abs(r.seen[_VELOCITY + k]) > 0.5 * robot.velocity_count:
+        if abs(r.seen[SENSOR.joint_velocity + k]) > 0.5 * robot.velocity_count:
             return
     total = r.yaw_covariance[2] + robot.gyro_noise**2
     if r.yaw_rate * r.yaw_rate < 16.0 * total:

@@ -9,7 +9,7 @@ from numba import njit
 
 from wlr_gym.perception.observer import kalman
 from wlr_gym.perception.observer.correction import correct
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT
+from wlr_gym.perception.observer.layout import SENSOR
 
 # What the sensor's scale and mounting are taken for, 1 sigma.
 SCALE = 0.03
@@ -25,18 +25,13 @@ _SILENCE = 0.5
 #: m: shortest distance from lens to floor that is taken for one.
 _LEAST_HEIGHT = 0.02
 
-_FLOW = SENSOR_LAYOUT.slices["flow"].start
-_QUALITY = SENSOR_LAYOUT.slices["flow_quality"].start
-_AGE = SENSOR_LAYOUT.slices["flow_age"].start
-_IS_NEW = SENSOR_LAYOUT.slices["flow_is_new"].start
-
 
 @njit(cache=True, nogil=True)
 def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     """Take in a flow reading where there is a new one: flow_x = v_x/h - w_y, flow_y = v_y/h + w_x of the lens, body frame."""
     r.flow_time += robot.period
-    x, y = sensors[_FLOW], sensors[_FLOW + 1]
-    if robot.flow == 0.0 or not r.seen[_IS_NEW] > 0.5 or not math.isfinite(x + y):
+    x, y = sensors[SENSOR.flow], sensors[SENSOR.flow + 1]
+    if robot.flow == 0.0 or not r.seen[SENSOR.flow_is_new] > 0.5 or not math.isfinite(x + y):
         if r.flow_time > _SILENCE:
             r.flow_off = r.flow_rejected = r.flow_refused = 0.0
         return
@@ -46,8 +41,8 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     mean_x, mean_y, height = _seen_velocity(robot, x, y, r)
     if height < _LEAST_HEIGHT:
         return
-    age = max(r.seen[_AGE], 0.0) + 0.5 * robot.period  # of the middle of its interval
-    poor = max(robot.flow_quality / max(r.seen[_QUALITY], 1e-3), 1.0)
+    age = max(r.seen[SENSOR.flow_age], 0.0) + 0.5 * robot.period  # of the middle of its interval
+    poor = max(robot.flow_quality / max(r.seen[SENSOR.flow_quality], 1e-3), 1.0)
     noise = (height * poor * robot.flow_noise) ** 2
     blur = (poor * robot.flow_speed_noise) ** 2
     off, ahead = 0.0, r.velocity[0] - age * r.kick[0]

@@ -1,8 +1,11 @@
-"""What the observer says."""
+"""What the observer says, and where it and the sensors' readings stand in their rows."""
 
 from __future__ import annotations
 
-from wlr_gym.physics.plants.base import Channel, Layout
+from collections import namedtuple
+from typing import Any
+
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout
 from wlr_gym.robot import WHEELS
 
 _WHEEL_XY = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in ("x", "y"))
@@ -32,3 +35,11 @@ ESTIMATE_LAYOUT = Layout(
         Channel("flow_rejected", (), "-", "1 = the last flow reading was not believed, else 0"),
     )
 )
+
+
+def _starts(layout: Layout) -> Any:
+    """Return the first column of each channel, by its name: a named tuple, as compiled code takes it for constants."""
+    return namedtuple("Starts", layout.slices)(*(columns.start for columns in layout.slices.values()))
+
+
+SENSOR, ESTIMATE = _starts(SENSOR_LAYOUT), _starts(ESTIMATE_LAYOUT)

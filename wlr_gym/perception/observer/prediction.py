@@ -9,7 +9,7 @@ from numba import njit
 
 from wlr_gym.perception.observer import kalman
 from wlr_gym.perception.observer.contacts import carry
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT
+from wlr_gym.perception.observer.layout import SENSOR
 
 # What the prediction takes for granted; 1 sigma where it is an uncertainty. Chosen on simulated runs: docs/slip_observer.md.
 #: Share of the change of an IMU reading from step to step that one sample per step misses.
@@ -20,10 +20,6 @@ _GYRO_WANDER = 1e-5
 _SETTLE = 1.5
 #: s: low-pass of the friction demand.
 _SMOOTH = 0.06
-
-_GYRO = SENSOR_LAYOUT.slices["gyro"].start
-_LEG_RATE = SENSOR_LAYOUT.slices["joint_velocity"].start
-_ACCEL = SENSOR_LAYOUT.slices["accelerometer"].start
 
 
 @njit(cache=True, nogil=True)
@@ -56,7 +52,7 @@ def turn(robot: Any, r: Any) -> None:
     wx, wy, wz = r.rate[0], r.rate[1], r.rate[2]
     for k in range(3):
         r.last_rate[k] = r.rate[k]
-        r.rate[k] = r.seen[_GYRO + k]
+        r.rate[k] = r.seen[SENSOR.gyro + k]
     mx, my, mz = (0.5 * dt * (r.rate[0] + wx), 0.5 * dt * (r.rate[1] + wy), 0.5 * dt * (r.rate[2] + wz))
     nx, ny, nz = r.normal[0], r.normal[1], r.normal[2]
     x, y, z = nx - (my * nz - mz * ny), ny - (mz * nx - mx * nz), nz - (mx * ny - my * nx)
@@ -80,7 +76,7 @@ def set_normal(r: Any, x: float, y: float, z: float) -> None:
 @njit(cache=True, nogil=True)
 def measure_force(r: Any) -> None:
     """Turn the accelerometer's reading into the heading frame: ``r.last_force``."""
-    x, y, z = r.seen[_ACCEL], r.seen[_ACCEL + 1], r.seen[_ACCEL + 2]
+    x, y, z = r.seen[SENSOR.accelerometer], r.seen[SENSOR.accelerometer + 1], r.seen[SENSOR.accelerometer + 2]
     r.last_force[0] = r.heading[0] * x + r.heading[2] * z
     r.last_force[1] = r.left[0] * x + r.left[1] * y + r.left[2] * z
     r.last_force[2] = r.normal[0] * x + r.normal[1] * y + r.normal[2] * z
@@ -139,7 +135,7 @@ def spread(robot: Any, r: Any) -> None:
     dt = robot.period
     square = 0.0
     for i in range(4):
-        square += 0.25 * r.seen[_LEG_RATE + i] ** 2
+        square += 0.25 * r.seen[SENSOR.joint_velocity + i] ** 2
     r.legs = math.sqrt(square)
     # how bias and slope share what the accelerometer read at first is a guess, which shows as the robot turns
     guess = (robot.leak_turn * r.guess * r.turned) ** 2

@@ -17,32 +17,12 @@ from wlr_gym.perception.observer.camera import see_camera
 from wlr_gym.perception.observer.contacts import LEAST_LOAD, carry, look, pull
 from wlr_gym.perception.observer.correction import RADIUS, guess_velocity, see_rest, see_rolling
 from wlr_gym.perception.observer.flow import ROTATION, SCALE, see_flow
-from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
+from wlr_gym.perception.observer.layout import ESTIMATE, SENSOR
 from wlr_gym.perception.observer.prediction import measure_force, move, sense_force, settle, spread, turn
 from wlr_gym.perception.observer.trust import gather, judge
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 
 #: m, 1 sigma at the start.
 _START_PLACE = 1e-4
-
-# Where the readings and the estimates stand in their rows.
-_GYRO = SENSOR_LAYOUT.slices["gyro"].start
-_ACCEL = SENSOR_LAYOUT.slices["accelerometer"].start
-_O_POSITION = ESTIMATE_LAYOUT.slices["position"].start
-_O_YAW = ESTIMATE_LAYOUT.slices["yaw"].start
-_O_YAW_SIGMA = ESTIMATE_LAYOUT.slices["yaw_sigma"].start
-_O_VELOCITY = ESTIMATE_LAYOUT.slices["linear_velocity_in_body"].start
-_O_SIGMA = ESTIMATE_LAYOUT.slices["linear_velocity_sigma"].start
-_O_RATE = ESTIMATE_LAYOUT.slices["yaw_rate"].start
-_O_GRAVITY = ESTIMATE_LAYOUT.slices["gravity_in_body"].start
-_O_SLIP = ESTIMATE_LAYOUT.slices["slip_velocity"].start
-_O_SLIP_SIGMA = ESTIMATE_LAYOUT.slices["slip_sigma"].start
-_O_TRACTION = ESTIMATE_LAYOUT.slices["traction_force"].start
-_O_LOAD = ESTIMATE_LAYOUT.slices["normal_force"].start
-_O_USE = ESTIMATE_LAYOUT.slices["traction_use"].start
-_O_DEMAND = ESTIMATE_LAYOUT.slices["friction_demand"].start
-_O_CAMERA = ESTIMATE_LAYOUT.slices["camera_innovation"].start
-_O_FLOW = ESTIMATE_LAYOUT.slices["flow_innovation"].start
 
 
 @njit(cache=True, nogil=True)
@@ -67,7 +47,7 @@ def update(robot: Any, states: Any, mask: Any, sensors: Any, values: Any, work: 
 def _start(robot: Any, sensors: Any, r: Any) -> None:
     """Begin level and at rest; what the accelerometer reads along the floor is bias or, where it is much, a slope."""
     r.seen[:] = 0.0
-    r.seen[_ACCEL + 2] = robot.gravity
+    r.seen[SENSOR.accelerometer + 2] = robot.gravity
     _take(sensors, r)
     r.tick = r.yaw = r.turned = r.gyro_bias = r.demand = r.shaken = r.legs = 0.0
     r.camera_off = r.camera_rejected = r.refused = r.frame_time = r.doubt = 0.0
@@ -84,7 +64,7 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
     r.raw[:] = 0.0
     r.yaw_covariance[0], r.yaw_covariance[1], r.yaw_covariance[2] = 0.0, 0.0, robot.gyro_bias**2
     for k in range(3):
-        r.rate[k] = r.last_rate[k] = r.seen[_GYRO + k]
+        r.rate[k] = r.last_rate[k] = r.seen[SENSOR.gyro + k]
     r.yaw_rate = r.rate[2]
     look(robot, r.seen, r)
     measure_force(r)
@@ -148,26 +128,26 @@ def _report(robot: Any, r: Any, out: Any) -> None:
         carried += r.load[i]
     rise /= carried
     vx, vy = r.velocity[0], r.velocity[1]
-    out[_O_POSITION], out[_O_POSITION + 1] = r.position[0], r.position[1]
-    out[_O_YAW], out[_O_YAW_SIGMA] = r.yaw, math.sqrt(max(r.yaw_covariance[0], 0.0))
-    out[_O_VELOCITY] = vx * h[0] + vy * left[0] + rise * n[0]
-    out[_O_VELOCITY + 1] = vy * left[1] + rise * n[1]
-    out[_O_RATE] = r.yaw_rate
+    out[ESTIMATE.position], out[ESTIMATE.position + 1] = r.position[0], r.position[1]
+    out[ESTIMATE.yaw], out[ESTIMATE.yaw_sigma] = r.yaw, math.sqrt(max(r.yaw_covariance[0], 0.0))
+    out[ESTIMATE.linear_velocity_in_body] = vx * h[0] + vy * left[0] + rise * n[0]
+    out[ESTIMATE.linear_velocity_in_body + 1] = vy * left[1] + rise * n[1]
+    out[ESTIMATE.yaw_rate] = r.yaw_rate
     gx, gy = r.slope[0] / robot.gravity, r.slope[1] / robot.gravity
     gz = math.sqrt(max(0.0, 1.0 - gx * gx - gy * gy))
     for k in range(3):
-        out[_O_GRAVITY + k] = -(gx * h[k] + gy * left[k] + gz * n[k])
+        out[ESTIMATE.gravity_in_body + k] = -(gx * h[k] + gy * left[k] + gz * n[k])
     vote = (robot.velocity_count * robot.wheel_radius) ** 2 / 6.0
     for k in range(2):
         variance = max(r.covariance[k, kalman.VELOCITY, kalman.VELOCITY], 0.0)
-        out[_O_SIGMA + k] = math.sqrt(variance)
+        out[ESTIMATE.linear_velocity_sigma + k] = math.sqrt(variance)
         for i in range(4):
             own = vote + (RADIUS * r.rolling[i, 0]) ** 2 if k == 0 else (robot.gyro_noise * r.point[i, 0]) ** 2
-            out[_O_SLIP + 2 * i + k] = r.velocity[k] - r.rolling[i, k]
-            out[_O_SLIP_SIGMA + 2 * i + k] = math.sqrt(variance + own)
+            out[ESTIMATE.slip_velocity + 2 * i + k] = r.velocity[k] - r.rolling[i, k]
+            out[ESTIMATE.slip_sigma + 2 * i + k] = math.sqrt(variance + own)
     for i in range(4):
-        out[_O_TRACTION + i], out[_O_LOAD + i] = r.traction[i], r.load[i]
-        out[_O_USE + i] = abs(r.traction[i]) / max(r.load[i], LEAST_LOAD)
-    out[_O_DEMAND] = r.demand
-    out[_O_CAMERA], out[_O_CAMERA + 1] = r.camera_off, r.camera_rejected
-    out[_O_FLOW], out[_O_FLOW + 1] = r.flow_off, r.flow_rejected
+        out[ESTIMATE.traction_force + i], out[ESTIMATE.normal_force + i] = r.traction[i], r.load[i]
+        out[ESTIMATE.traction_use + i] = abs(r.traction[i]) / max(r.load[i], LEAST_LOAD)
+    out[ESTIMATE.friction_demand] = r.demand
+    out[ESTIMATE.camera_innovation], out[ESTIMATE.camera_rejected] = r.camera_off, r.camera_rejected
+    out[ESTIMATE.flow_innovation], out[ESTIMATE.flow_rejected] = r.flow_off, r.flow_rejected
