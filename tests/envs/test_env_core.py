@@ -5,8 +5,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from velocity import make, make_vec
 
-import wlr_gym  # noqa: F401
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.settings import Settings
@@ -24,16 +24,6 @@ from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, MEASURES, REWARDS, TERM
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
-
-ID = "WLR-Velocity-v0"
-
-
-def make(**keywords) -> Any:
-    return gym.make(ID, **keywords).unwrapped
-
-
-def make_vec(count, **keywords) -> Any:
-    return gym.make_vec(ID, num_envs=count, **keywords)
 
 
 def names(env):
@@ -347,16 +337,9 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
     matrices = random_matrices(task)
     count = len(matrices["truth"])
     expected = expressions(task, reader(task, matrices))
-    scores = Scores(
-        terms=np.zeros((count, len(task.rewards))),
-        total=np.zeros(count),
-        over=np.zeros((count, len(task.terminations))),
-        sums=np.ones((count, len(task.rewards))),
-        measures=np.zeros((count, len(task.measures))),
-        squares=np.ones((count, len(task.measures))),
-        largest=np.zeros((count, len(task.measures))),
-    )
+    scores = Scores.zeros(task, count)
     terms, total, over, sums, measures, squares, largest = scores
+    sums[:] = squares[:] = 1.0
     kernel = compile_scores(task)
     assert kernel.run(np.ones(count, bool), signals_in_order(matrices), kernel.numbers, tuple(scores)) == -1
     for k, name in enumerate(task.rewards):

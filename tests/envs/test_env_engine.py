@@ -1,30 +1,9 @@
 """The environment on the Gibbs-Appell engine."""
 
-import warnings
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-
-import wlr_gym  # noqa: F401
-
-ID = "WLR-Velocity-v0"
-
-
-def make(**keywords) -> Any:
-    return gym.make(ID, **keywords).unwrapped
-
-
-def make_vec(count, **keywords) -> Any:
-    return gym.make_vec(ID, num_envs=count, **keywords)
-
-
-def test_gymnasium_check_env_without_a_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(make())
+from velocity import ID, make, make_vec
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])

@@ -15,23 +15,13 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from velocity import ID, make, make_vec
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs import classes
 from wlr_gym.envs.settings import EnvironmentOptions, Settings
 from wlr_gym.envs.tasks.task_config import read_task
-
-ID = "WLR-Velocity-v0"
-
-
-def make(**keywords) -> Any:
-    return gym.make(ID, **keywords).unwrapped
-
-
-def make_vec(count, **keywords) -> Any:
-    return gym.make_vec(ID, num_envs=count, **keywords)
-
 
 SHORT = {"episode_length": 0.4, "randomization": "wide"}
 

@@ -131,15 +131,7 @@ class Core:
         self.pipeline = ObservationPipeline(
             task, self.randomization.config, count, has_latency=not real, has_privileged=self.dictionary
         )
-        self.scores = Scores(
-            terms=np.zeros((count, len(task.rewards))),
-            total=np.zeros(count),
-            over=np.zeros((count, len(task.terminations))),
-            sums=np.zeros((count, len(task.rewards))),
-            measures=np.zeros((count, len(task.measures))),
-            squares=np.zeros((count, len(task.measures))),
-            largest=np.zeros((count, len(task.measures))),
-        )
+        self.scores = Scores.zeros(task, count)
         self._score_buffers = tuple(self.scores)
         self._no_estimate = np.zeros((count, ESTIMATE_LAYOUT.width))
         self.start = np.zeros((count, len(START)))

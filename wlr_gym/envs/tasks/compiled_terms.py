@@ -45,6 +45,12 @@ class Scores(NamedTuple):
     squares: Array
     largest: Array
 
+    @classmethod
+    def zeros(cls, task: Task, count: int) -> Scores:
+        """Return the scores of ``count`` robots on a task before their first step."""
+        rewards, ends, measures = ((count, len(names)) for names in (task.rewards, task.terminations, task.measures))
+        return cls(*map(np.zeros, (rewards, count, ends, rewards, measures, measures, measures)))
+
 
 @dataclass(frozen=True)
 class TermKernel:

@@ -113,16 +113,7 @@ class _Score:
     def __init__(self, task: Task, core: Core, truth: Any) -> None:
         self._task, self._core, self._true = task, core, truth
         self._kernel = compile_scores(task)
-        wide, measures = len(task.rewards), len(task.measures)
-        self._scores = Scores(
-            terms=np.zeros((1, wide)),
-            total=np.zeros(1),
-            over=np.zeros((1, len(task.terminations))),
-            sums=np.zeros((1, wide)),
-            measures=np.zeros((1, measures)),
-            squares=np.zeros((1, measures)),
-            largest=np.zeros((1, measures)),
-        )
+        self._scores = Scores.zeros(task, 1)
         self._start = np.zeros_like(core.start)
         self._ticks = 0
 

@@ -65,12 +65,11 @@ class Detection:
         return math.sqrt(abs(self.ellipse[2] * self.ellipse[5] - self.ellipse[3] * self.ellipse[4]))
 
 
-def refine(image: Image, camera: Camera | Array, ellipse: Array, code: int) -> Detection | None:
-    """Fit a marker of a known code near a guessed ellipse (6,), px; None where there is none."""
-    values = camera.values if isinstance(camera, Camera) else camera
+def refine(image: Image, camera: Array, ellipse: Array, code: int) -> Detection | None:
+    """Fit a marker of a known code near a guessed ellipse (6,), px; None where there is none. ``camera``: its ``values``."""
     guess, shape, quality = np.array(ellipse, float), np.empty(6), np.empty(4)
     centres, covariances = np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan)
-    if not fit_marker(image, values, guess, _RADII[code], centres, covariances, shape, quality):
+    if not fit_marker(image, camera, guess, _RADII[code], centres, covariances, shape, quality):
         return None
     if quality[RADIUS_ERROR] > 0.1:
         return None

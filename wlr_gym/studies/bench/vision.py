@@ -133,7 +133,7 @@ def _centre_error(camera: Camera, look: Look, seed: int) -> float:
     image = Renderer(crop, ScenePose(np.zeros(3), np.eye(3)), []).frame([[facet]], look, seed)
     middle = project(camera, centre[None])[0] - corner + rng.uniform(-1, 1, 2)
     edge = project(camera, centre + radius * rotation[:, :2].T) - project(camera, centre[None])
-    found = refine(image, crop, np.array([*middle, edge[0, 0], edge[1, 0], edge[0, 1], edge[1, 1]]), code)
+    found = refine(image, crop.values, np.array([*middle, edge[0, 0], edge[1, 0], edge[0, 1], edge[1, 1]]), code)
     if found is None:
         return math.nan
     expected = np.empty((3, 2))
