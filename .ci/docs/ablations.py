@@ -7,12 +7,11 @@ arguments, the picture is drawn. tables.py has the table.
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from learning import interval, percent
+from learning import interval, percent, read_data
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.plots import BLUE, GREEN, ORANGE, WINE, legend_below, new_figure, save, tidy
@@ -23,6 +22,7 @@ from wlr_gym.learning.evaluation.training_seeds import expand
 
 ROOT = Path(__file__).resolve().parents[2]
 SWEEP = ROOT / "examples" / "ablations.yaml"
+#: Commit, episodes, settings -> floors -> numbers, controllers.
 DATA = ROOT / "docs" / "data" / "ablations.json"
 PICTURE = ROOT / "docs" / "figures" / "slip_weights.png"
 FLOORS, EPISODES = ("slippery", "split"), 128
@@ -45,7 +45,7 @@ def score(sweep: str, blind: str, plain: str) -> None:
     found = {name: f"{sweep}/trials/variant={name.replace(' ', '_')},seed=*" for name in read_yaml(SWEEP)["variants"]}
     found |= {BLIND[weight]: f"{blind}/trials/*slip.weight=-{weight:g},seed=*" for weight in BLIND}
     found |= {PLAIN: f"{plain}/trials/*"}
-    data = read_data() or {"commit": git_commit(), "episodes": EPISODES, "settings": {}, "controllers": {}}
+    data = read_data(DATA) or {"commit": git_commit(), "episodes": EPISODES, "settings": {}, "controllers": {}}
     for name in [one for one in found if expand(found[one]) and one not in data["settings"]]:
         data["settings"][name] = {floors: _numbers(data, found[name], found[RECIPE], floors) for floors in FLOORS}
         write_json(DATA, data)
@@ -73,16 +73,11 @@ def _numbers(data: dict[str, Any], ours: str, recipe: str, floors: str) -> dict[
     return numbers
 
 
-def read_data() -> dict[str, Any]:
-    """Return the kept numbers: commit, episodes, settings -> floors -> numbers, controllers."""
-    return json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {}
-
-
 def rows() -> list[list[str]]:
     """Return the rows of the table."""
     return [
         [name, *(cell for floors in FLOORS for cell in _cells(found[floors]))]
-        for name, found in read_data()["settings"].items()
+        for name, found in read_data(DATA)["settings"].items()
     ]
 
 
@@ -94,7 +89,7 @@ def _cells(numbers: dict[str, Any]) -> list[str]:
 
 def draw(path: Path) -> None:
     """Tracking error against all slip, for three weights of slip each."""
-    data = read_data()
+    data = read_data(DATA)
     figure = new_figure(8.0, 3.6)
     for k, floors in enumerate(FLOORS):
         axes = figure.add_subplot(1, 2, k + 1)

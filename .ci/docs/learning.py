@@ -135,9 +135,9 @@ def percent(numbers: list[float]) -> str:
     return f"{mean} [{low}, {high}]"
 
 
-def read_data() -> dict[str, Any]:
-    """Return the kept numbers: task -> SHA-256 of the policies, commit, date, rows."""
-    return json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {}
+def read_data(file: Path = DATA) -> dict[str, Any]:
+    """Return the kept numbers, here: task -> SHA-256 of the policies, commit, date, rows."""
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 
 if __name__ == "__main__":

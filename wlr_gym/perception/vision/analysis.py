@@ -319,14 +319,8 @@ def _draw_pose(analysis: VideoAnalysis) -> Any:
     slip, time = analysis.slip, np.array([s.time for s in analysis.samples]) + analysis.offset
     poses = np.stack([s.pose for s in analysis.samples])
     poses[:, 3] = np.unwrap(np.nan_to_num(poses[:, 3])) + 0 * poses[:, 3]
-    units = (
-        ("x", "mm", 1e3),
-        ("y", "mm", 1e3),
-        ("z", "mm", 1e3),
-        ("yaw", "deg", 180 / math.pi),
-        ("pitch", "deg", 180 / math.pi),
-    )
-    for axes, k, (name, unit, factor) in zip(panels, range(5), units, strict=True):
+    for k, (axes, name) in enumerate(zip(panels, ("x", "y", "z", "yaw", "pitch"), strict=True)):
+        unit, factor = ("mm", 1e3) if k < 3 else ("deg", 180 / math.pi)
         axes.plot(time, factor * poses[:, k], ".", color=GREY, markersize=3, label="frames")
         axes.plot(slip.time, factor * slip.pose[:, k], color=BLUE, linewidth=1.1, label="smoothed")
         std = f"1 sigma of a smoothed pose: {factor * np.median(slip.pose_std[:, k]):.2g} {unit}"
