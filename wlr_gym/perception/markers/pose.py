@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 MINIMUM_MARKERS = 3
 #: px; a pose whose circle centres miss by more (rms) is none.
 LARGEST_RESIDUAL = 1.5
+#: m; markers that were laid and measured by hand may be off by this much.
+FLOOR_TOLERANCE = 0.01
 _SHAPE_TOLERANCE = 0.25  # of a marker's seen size and shape against what the pose says
 _OUTLIER = 16.0  # chi square per degree of freedom that makes the worst marker suspicious
 _MODEL_ERROR = 0.15  # px; beyond its noise, but too small for an outlier
@@ -92,6 +94,13 @@ def find_target(
                     if best is None or _better(found, best, up):
                         best = found
     return best
+
+
+def find_laid_target(detections: Sequence[Detection], target: Target, camera: Camera) -> TargetPose | None:
+    """Find a target that was laid by hand: it may miss by what a marker off by :data:`FLOOR_TOLERANCE` looks like."""
+    sizes = [d.radius for d in detections if d.code in target.codes]
+    scale = max(sizes) / target.radii.min() if sizes else camera.focal[0]
+    return find_target(detections, target, camera, tolerance=LARGEST_RESIDUAL + FLOOR_TOLERANCE * scale)
 
 
 def solve_pose(

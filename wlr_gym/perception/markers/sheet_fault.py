@@ -7,18 +7,8 @@ from collections.abc import Iterator, Sequence
 
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection
-from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, find_target
+from wlr_gym.perception.markers.pose import find_laid_target
 from wlr_gym.perception.markers.targets import CODE_NAMES, Target
-
-#: m; positions of floor markers may be off by this much (they were measured by hand).
-FLOOR_TOLERANCE = 0.01
-
-
-def target_pixels(camera: Camera, detections: Sequence[Detection], target: Target) -> float:
-    """Largest residual of a hand-laid target (px): what a marker off by :data:`FLOOR_TOLERANCE` looks like."""
-    sizes = [d.radius for d in detections if d.code in target.codes]
-    scale = max(sizes) / target.radii.min() if sizes else camera.focal[0]
-    return LARGEST_RESIDUAL + FLOOR_TOLERANCE * scale
 
 
 def sheet_fault(detections: Sequence[Detection], target: Target, camera: Camera) -> str:
@@ -46,12 +36,12 @@ def sheet_fault(detections: Sequence[Detection], target: Target, camera: Camera)
 
 def _swaps(detections: Sequence[Detection], target: Target, camera: Camera) -> Iterator[str]:
     """Names of the markers that, with the key's sheet in their place and theirs in its, fit what is seen."""
-    key, tolerance = target.key, target_pixels(camera, detections, target)
+    key = target.key
     for other, marker in enumerate(target.markers):
         if other == key:
             continue
         markers = list(target.markers)
         markers[key] = markers[key].model_copy(update={"code": marker.code})
         markers[other] = marker.model_copy(update={"code": target.markers[key].code})
-        if find_target(detections, target.model_copy(update={"markers": tuple(markers)}), camera, tolerance=tolerance):
+        if find_laid_target(detections, target.model_copy(update={"markers": tuple(markers)}), camera):
             yield marker.name

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection, Image, detect
-from wlr_gym.perception.markers.pose import find_target
-from wlr_gym.perception.markers.sheet_fault import FLOOR_TOLERANCE, sheet_fault, target_pixels
+from wlr_gym.perception.markers.pose import FLOOR_TOLERANCE, find_laid_target
+from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import TargetView, adjust
 from wlr_gym.perception.vision.sheets import target_pages
@@ -92,8 +92,7 @@ def check_sheets(image: Image, camera: Camera, targets: Sequence[Target]) -> lis
 
 
 def _checked(image: Image, camera: Camera, target: Target, detections: Sequence[Detection]) -> SheetCheck:
-    loose = target.model_copy(update={"tolerance": FLOOR_TOLERANCE})
-    found = find_target(detections, loose, camera, tolerance=target_pixels(camera, detections, target))
+    found = find_laid_target(detections, target.model_copy(update={"tolerance": FLOOR_TOLERANCE}), camera)
     if found is None:
         own = sum(detection.code in target.codes for detection in detections)
         return SheetCheck(target, own, sheet_fault(detections, target, camera))

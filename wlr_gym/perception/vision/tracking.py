@@ -23,11 +23,12 @@ from wlr_gym.perception.markers.pose import (
     MINIMUM_MARKERS,
     TargetPose,
     expected_ellipse,
+    find_laid_target,
     find_target,
     solve_pose,
     solved_floor,
 )
-from wlr_gym.perception.markers.sheet_fault import sheet_fault, target_pixels
+from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import LONGEST_STEP, TargetView, at_frame_time, velocity_between
 
@@ -224,9 +225,7 @@ class Tracker:
         seen = seen_at(image, self.floor, self._values, last.rotation, last.position)
         if len(seen) < MINIMUM_MARKERS:
             detections = detect(image, self.camera)
-            found = find_target(
-                detections, self.floor, self.camera, tolerance=target_pixels(self.camera, detections, self.floor)
-            )
+            found = find_laid_target(detections, self.floor, self.camera)
             if found is None:
                 return {}
             last, seen = found, seen_at(image, self.floor, self._values, found.rotation, found.position)
@@ -239,8 +238,7 @@ class Tracker:
     def _marker_shift(self, image: Image, index: int) -> float:
         """Distance (px) of a floor marker from its place; NaN when it is not seen there."""
         pose = self.floor_pose
-        ellipse = expected_ellipse(self.floor, index, self._values, pose.rotation, pose.position)
-        seen = None if ellipse is None else refine(image, self._values, ellipse, int(self.floor.codes[index]))
+        seen = _marker_at(image, self.floor, index, self._values, pose.rotation, pose.position)
         return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
 
 
@@ -286,7 +284,7 @@ def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) ->
         if start is None:
             detections = detect(frame.image, camera)
             most = max(most, detections, key=lambda found: sum(d.code in floor.codes for d in found))
-            start = find_target(detections, floor, camera, tolerance=target_pixels(camera, detections, floor))
+            start = find_laid_target(detections, floor, camera)
         if start is not None:
             for index, detection in seen_at(frame.image, floor, camera.values, start.rotation, start.position).items():
                 sums[index].append(detection)
@@ -365,13 +363,13 @@ def _centres(target: Target, seen: Mapping[int, Detection]) -> Array:
 
 def seen_at(image: Image, target: Target, camera: Array, rotation: Array, position: Array) -> dict[int, Detection]:
     """The markers of a target where a pose puts them."""
-    seen = {}
-    for index in range(len(target.markers)):
-        ellipse = expected_ellipse(target, index, camera, rotation, position)
-        detection = None if ellipse is None else refine(image, camera, ellipse, int(target.codes[index]))
-        if detection is not None:
-            seen[index] = detection
-    return seen
+    found = {k: _marker_at(image, target, k, camera, rotation, position) for k in range(len(target.markers))}
+    return {k: detection for k, detection in found.items() if detection is not None}
+
+
+def _marker_at(image: Image, target: Target, index: int, camera: Array, rotation: Array, position: Array) -> Detection | None:
+    ellipse = expected_ellipse(target, index, camera, rotation, position)
+    return None if ellipse is None else refine(image, camera, ellipse, int(target.codes[index]))
 
 
 def _identified(detections: Sequence[Detection], found: TargetPose, target: Target, camera: Array) -> dict[int, Detection]:
