@@ -125,17 +125,12 @@ def load_agent(name: str) -> Agent:
     """
     if name not in agent_names():
         raise unknown_name("agent", name, agent_names())
-    return cast(Agent, _import_folder(data_directory("agents") / name))
-
-
-def _import_folder(folder: Path) -> types.ModuleType:
-    """Import ``agent.py`` as a module of a package made for its folder, so that it can import its neighbours relatively."""
-    package = f"wlr_gym_agents_{folder.name}"
+    package = f"wlr_gym_agents_{name}"  # made for its folder, so that it can import its neighbours relatively
     if package not in sys.modules:
         module = types.ModuleType(package)
-        module.__path__ = [str(folder)]
+        module.__path__ = [str(data_directory("agents") / name)]
         sys.modules[package] = module
-    return importlib.import_module(f"{package}.agent")
+    return cast(Agent, importlib.import_module(f"{package}.agent"))
 
 
 def agent_function(name: str, function: str) -> Callable[..., Any]:
@@ -195,23 +190,19 @@ def _read_config(name: str | Path, task: str | None) -> dict[str, Any]:
 def for_task(settings: Mapping[str, Any], task: str, where: str = "settings") -> dict[str, Any]:
     """Return settings with what their ``tasks`` says of one task laid over the others.
 
+    A task is a name in ``configs/task/`` or the path of a file.
+
     Raises:
         InputError: a task that is none.
     """
-    own = dict(settings)
-    return merge_changes(own, _of_task(where, own.pop("tasks", None), task))
-
-
-def _of_task(path: str, tasks: Any, task: str) -> Mapping[str, Any]:
-    """Return what a file's ``tasks`` says of one task; a task is a name in ``configs/task/`` or the path of a file."""
-    found: Mapping[str, Any] = {}
-    for name, given in _settings(tasks, f"{path}: tasks").items():
+    own, found = dict(settings), {}
+    for name, given in _settings(own.pop("tasks", None), f"{where}: tasks").items():
         if Path(name).suffix not in {".yaml", ".yml"} and name not in config_names("task"):
-            raise unknown_name("task", name, config_names("task"), f"{path}: tasks")
-        settings = _settings(given, f"{path}: tasks.{name}")
-        if name == task or named_in(path, name).resolve() == Path(task).resolve():  # a registered task is an absolute path
-            found = settings
-    return found
+            raise unknown_name("task", name, config_names("task"), f"{where}: tasks")
+        of_task = _settings(given, f"{where}: tasks.{name}")
+        if name == task or named_in(where, name).resolve() == Path(task).resolve():  # a registered task is an absolute path
+            found = of_task
+    return merge_changes(own, found)
 
 
 def _settings(value: Any, where: str) -> dict[str, Any]:

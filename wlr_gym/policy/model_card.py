@@ -38,8 +38,8 @@ def write_model_card(policy: Path, evaluation: str) -> Path:
             f"the score card is about another '{policy.stem}': SHA-256 {file_hash(policy)} is not in it; evaluate anew"
         )
     card = policy.with_suffix(SUFFIX)
-    text = "\n\n".join([f"# {policy.stem}", _summary(content), _table(_facts(policy, content)), _below(evaluation)]) + "\n"
-    write_text(card, text)
+    facts = "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in _facts(policy, content).items())])
+    write_text(card, "\n\n".join([f"# {policy.stem}", _summary(content), facts, _below(evaluation)]) + "\n")
     return card
 
 
@@ -74,7 +74,7 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
         "file": f"`{policy.name}`, {policy.stat().st_size / 1000:.0f} kB",
         "SHA-256": f"`{file_hash(policy)}`",
         "robot": f"{environment['robot']['name']}, at {1.0 / environment['control_period']:g} Hz",
-        "observation": f"{len(environment['observation'])} numbers: {_terms(environment['observation'])}",
+        "observation": f"{len(environment['observation'])} numbers: {tally(_term_counts(environment['observation']))}",
         "action": f"{len(environment['action'])} setpoints of joints",
         "randomisation": environment.get("randomization", {}).get("name") or "as in the contract",
     }
@@ -87,11 +87,6 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
         largest = max(parity["random"], parity["real"])
         facts["same as the trained network"] = f"within {largest:.1e} on {parity['observations']} observations"
     return facts
-
-
-def _terms(columns: list[Mapping[str, Any]]) -> str:
-    """``command 2, gyro 3``: the terms in their order, with how many numbers each has."""
-    return tally(_term_counts(columns))
 
 
 def _term_counts(columns: list[Mapping[str, Any]]) -> Counter[str]:
@@ -115,10 +110,6 @@ def _short(commit: str) -> str:
     """Abbreviate the hash; ``-dirty`` stays."""
     name, _, state = commit.partition("-")
     return f"{name[:7]}-{state}" if state else name[:7]
-
-
-def _table(facts: Mapping[str, str]) -> str:
-    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in facts.items())])
 
 
 def _below(evaluation: str) -> str:

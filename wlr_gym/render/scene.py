@@ -19,7 +19,6 @@ from wlr_gym.render.view import View
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 #: Areas, pads and arrows a scene has room for.
@@ -78,10 +77,23 @@ class Scene:
             self._stage = Stage(self.robot, parameters, row, self.view.size)
         stage = self._stage
         stage.pose(truth, parameters, row)
-        canvas, scene = self._open(stage)
+        if self._canvas is None or self._scene is None:
+            self._canvas = Canvas(stage.model, self.view.size)
+            self._scene = mujoco.MjvScene(stage.model, maxgeom=stage.model.ngeom + MAX_MARKS)
+        scene, eye = self._scene, mujoco.MjvCamera()
         middle = truth.position[row] if look_at is None else np.asarray(look_at)
-        floor = self._compose(scene, stage, truth, parameters, row, middle, trails)
-        picture = canvas.draw(scene)
+        up = camera.up_direction(parameters["ground.slope"][row])
+        place = (camera.CAMERAS[self.view.camera], middle, stage.yaw(), up, camera.magnification(self.robot))
+        # The endless floor is laid out around the camera the scene had before, so it gets its own first.
+        mujoco.mjv_updateCamera(stage.model, stage.data, eye, scene)
+        camera.aim(scene, *place)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(stage.model, stage.data, mujoco.MjvOption(), None, eye, everything, scene)
+        camera.aim(scene, *place)
+        floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
+        marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+        marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail)])
+        picture = self._canvas.draw(scene)
         if not self.view.text:
             return picture
         lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip) + [result] * bool(result)
@@ -100,36 +112,6 @@ class Scene:
         if self._canvas is not None:
             self._canvas.close()
         self._canvas = self._scene = None
-
-    def _open(self, stage: Stage) -> tuple[Canvas, mujoco.MjvScene]:
-        if self._canvas is None or self._scene is None:
-            self._canvas = Canvas(stage.model, self.view.size)
-            self._scene = mujoco.MjvScene(stage.model, maxgeom=stage.model.ngeom + MAX_MARKS)
-        return self._canvas, self._scene
-
-    def _compose(
-        self,
-        scene: mujoco.MjvScene,
-        stage: Stage,
-        truth: Truth,
-        parameters: Parameters,
-        row: int,
-        look_at: Array,
-        trails: Sequence[marks.Trail],
-    ) -> list[marks.Area]:
-        eye = mujoco.MjvCamera()
-        up = camera.up_direction(parameters["ground.slope"][row])
-        place = (camera.CAMERAS[self.view.camera], look_at, stage.yaw(), up, camera.magnification(self.robot))
-        # The endless floor is laid out around the camera the scene had before, so it gets its own first.
-        mujoco.mjv_updateCamera(stage.model, stage.data, eye, scene)
-        camera.aim(scene, *place)
-        everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(stage.model, stage.data, mujoco.MjvOption(), None, eye, everything, scene)
-        camera.aim(scene, *place)
-        floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
-        marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
-        marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail)])
-        return floor
 
     def _labels(self, floor: list[marks.Area], position: NDArray[np.float64]) -> list[overlay.Note]:
         """Write the friction of each area on it, beside the robot and clear of the other text."""

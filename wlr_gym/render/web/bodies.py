@@ -53,29 +53,18 @@ def bodies(stage: Stage) -> list[BodyShape]:
         first = int(model.body_geomadr[index])
         colours: dict[Colour, list[int]] = {}
         for geom in range(first, first + int(model.body_geomnum[index])):
-            if _is_drawn(model, geom):
-                colours.setdefault(_colour(model, geom), []).append(geom)
+            red, green, blue, opacity = (float(part) for part in model.geom_rgba[geom])
+            if int(model.geom_group[geom]) != _HIDDEN and opacity > 0.0:
+                colours.setdefault((red, green, blue), []).append(geom)
         if colours:
-            found.append(BodyShape(model.body(index).name, index, tuple(_surface(model, *one) for one in colours.items())))
+            surfaces = (_joined([_triangles(model, geom) for geom in geoms], colour) for colour, geoms in colours.items())
+            found.append(BodyShape(model.body(index).name, index, tuple(surfaces)))
     return found
 
 
 def joined(body: BodyShape, colour: Colour) -> Surface:
     """Return a body as one surface."""
     return _joined([(one.vertices, one.faces) for one in body.surfaces], colour)
-
-
-def _is_drawn(model: Any, geom: int) -> bool:
-    return int(model.geom_group[geom]) != _HIDDEN and float(model.geom_rgba[geom, 3]) > 0.0
-
-
-def _colour(model: Any, geom: int) -> Colour:
-    red, green, blue = (float(part) for part in model.geom_rgba[geom, :3])
-    return red, green, blue
-
-
-def _surface(model: Any, colour: Colour, geoms: list[int]) -> Surface:
-    return _joined([_triangles(model, geom) for geom in geoms], colour)
 
 
 def _joined(parts: list[tuple[Array, NDArray[np.int64]]], colour: Colour) -> Surface:

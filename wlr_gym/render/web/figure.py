@@ -11,7 +11,7 @@ from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render import marks
 from wlr_gym.render.camera import CAMERAS, up_direction
 from wlr_gym.render.colours import Colour, friction_colour
-from wlr_gym.render.stage import Stage
+from wlr_gym.render.stage import SQUARE, Stage
 from wlr_gym.render.view import View
 from wlr_gym.render.web.bodies import BodyShape, bodies, joined
 from wlr_gym.render.web.page import floor_pose
@@ -27,8 +27,8 @@ FLOOR = "/floor"
 #: Colour and opacity of a ghost.
 GHOST: Colour = (0.20, 0.35, 0.85)
 GHOST_OPACITY = 0.35
-#: m; width of the floor, and of its squares as in pictures.
-_WIDE, _SQUARE = 60.0, 0.2
+#: m; width of the floor.
+_WIDE = 60.0
 #: m; heads of arrows.
 _HEAD, _HEAD_LENGTH = 2.2 * marks.SHAFT, 6.0 * marks.SHAFT
 #: m; where an arrow lies that is not shown: viser keeps their number.
@@ -130,29 +130,23 @@ class PageFloor:
 
     def show(self, stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> None:
         """Draw the floor around the robot that is posed in ``stage``."""
-        mean = float(np.mean([parameters[f"ground.mu_{axis}"][row] for axis in "xy"]))
-        colour = friction_colour(mean)
+        colour = friction_colour(float(np.mean([parameters[f"ground.mu_{axis}"][row] for axis in "xy"])))
         if colour != self._colour:
-            self._plane(colour)
+            self._server.scene.add_grid(
+                f"{FLOOR}/plane", _WIDE, _WIDE, cell_size=SQUARE, section_size=5 * SQUARE, cell_color=(170, 170, 170),
+                section_color=(140, 140, 140), plane_color=rgb(colour), plane_opacity=1.0, shadow_opacity=0.3,
+                fade_distance=12.0,
+            )  # fmt: skip
+            self._colour = colour
         # Far around, so that areas need not be drawn anew at each step.
         middle = np.round(truth.position[row] / marks.REACH) * marks.REACH
         areas = marks.areas(parameters, row, middle) if view.friction else []
         if areas != self._areas:
-            self._lay(areas)
+            for node in self._shown:
+                node.remove()
+            self._shown = [node for k, area in enumerate(areas) for node in self._area(k, area)]
+            self._areas = areas
         self._put_pads(marks.spots(stage, parameters, row) if view.friction else [])
-
-    def _plane(self, colour: Colour) -> None:
-        self._server.scene.add_grid(
-            f"{FLOOR}/plane", _WIDE, _WIDE, cell_size=_SQUARE, section_size=5 * _SQUARE, cell_color=(170, 170, 170),
-            section_color=(140, 140, 140), plane_color=rgb(colour), plane_opacity=1.0, shadow_opacity=0.3, fade_distance=12.0,
-        )  # fmt: skip
-        self._colour = colour
-
-    def _lay(self, areas: list[marks.Area]) -> None:
-        for node in self._shown:
-            node.remove()
-        self._shown = [node for k, area in enumerate(areas) for node in self._area(k, area)]
-        self._areas = areas
 
     def _area(self, k: int, area: marks.Area) -> list[Any]:
         low, high, scene = np.array(area.low), np.array(area.high), self._server.scene

@@ -167,5 +167,5 @@ class Past:
 def curves_of(name: str, t: NDArray[np.float64], values: NDArray[np.float64]) -> list[Curve]:
     """Return the curves of a channel of the truth, or of one element of it."""
     elements = TRUTH_LAYOUT.channels[name].elements if name in TRUTH_LAYOUT.channels else [name]
-    places = [TRUTH_LAYOUT.elements.index(element) for element in elements[:_MOST]]
-    return [Curve(element, t, values[:, k], colour=n) for n, (element, k) in enumerate(zip(elements, places, strict=False))]
+    index = TRUTH_LAYOUT.elements.index
+    return [Curve(one, t, values[:, index(one)], colour=n) for n, one in enumerate(elements[:_MOST])]

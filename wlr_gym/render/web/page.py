@@ -56,21 +56,17 @@ class Address:
     def lines(self, environment: dict[str, str] | None = None) -> list[str]:
         """Return how to open the page, here and through ssh: that is told by ``SSH_CONNECTION``, as sshd sets it."""
         environment = dict(os.environ) if environment is None else environment
-        lines = [f"open {self.url} in a browser; Ctrl-C ends"]
+        try:
+            user = getpass.getuser()
+        except (OSError, KeyError):  # no name for this user id
+            user = "USER"
         here = environment.get("SSH_CONNECTION", "").split()
         machine = here[2] if len(here) == 4 else socket.gethostname()
         port = f" -p {here[3]}" if len(here) == 4 and here[3] != "22" else ""
-        lines.append(
-            f"from another machine: ssh{port} -N -L {self.port}:localhost:{self.port} {_user()}@{machine}, then the same"
-        )
-        return lines
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # no name for this user id
-        return "USER"
+        return [
+            f"open {self.url} in a browser; Ctrl-C ends",
+            f"from another machine: ssh{port} -N -L {self.port}:localhost:{self.port} {user}@{machine}, then the same",
+        ]
 
 
 def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> tuple[viser.ViserServer, Address]:

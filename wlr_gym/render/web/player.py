@@ -189,19 +189,15 @@ class Player:
             self._figures["robot"].point(arrows_of(stage, moment.truth, moment.parameters, 0, seen))
             self._ground.show(stage, moment.truth, moment.parameters, 0, view)
             self._ground.look(stage, moment.truth, moment.parameters, 0, view.camera)
-            self._draw_ghost(ghost, replace(view, slip=False, forces=view.forces and not moment.forces))
+            if ghost is None:
+                self._figures["ghost"].hide()
+            else:  # it has arrows only where the robot has none of its own
+                seen = replace(view, slip=False, forces=view.forces and not moment.forces)
+                stage = self._figures["ghost"].pose(ghost.truth, ghost.parameters)
+                self._figures["ghost"].point(arrows_of(stage, ghost.truth, ghost.parameters, 0, seen))
         if texts:
             lines = [*describe(moment.truth, moment.parameters, 0, time, None, recording.name, slip=moment.slip)]
             self._text.content = html_lines([*lines, *recording.lines(time), *legend(moment.parameters, 0, view)])
-
-    def _draw_ghost(self, ghost: Moment | None, view: View) -> None:
-        """Draw the ghost; the view has its arrows only where the robot has none of its own."""
-        figure = self._figures["ghost"]
-        if ghost is None:
-            figure.hide()
-            return
-        stage = figure.pose(ghost.truth, ghost.parameters)
-        figure.point(arrows_of(stage, ghost.truth, ghost.parameters, 0, view))
 
     def _plot(self, now: float, time: float) -> None:
         width = WINDOWS[str(self._window.value)]

@@ -77,19 +77,11 @@ def aligned(curves: Sequence[Curve], begin: float, end: float, now: float) -> tu
     margin = 0.05 * (high - low) or 1e-3
     t = np.unique(np.concatenate([[begin, now - _THIN, now, now + _THIN, end], *(piece for piece, _ in pieces)]))
     t = t[(t >= begin) & (t <= end)]
-    rows = [_between(t, *piece) for piece in pieces]
+    rows = [np.interp(t, *piece) if len(piece[0]) else np.zeros(len(t)) for piece in pieces]
     line = np.full(len(t), low - margin)
     place = int(np.searchsorted(t, now))
     line[place : place + 1] = high + margin
     return (t, *rows, line)
-
-
-def _is_in(curve: Curve, begin: float, end: float) -> bool:
-    return len(curve.t) > 0 and bool(curve.t[0] <= end and curve.t[-1] >= begin)
-
-
-def _between(t: Array, known: Array, values: Array) -> Array:
-    return np.interp(t, known, values) if len(known) else np.zeros(len(t))
 
 
 class Plots:
@@ -132,7 +124,7 @@ class Plots:
     def draw(self, curves: Mapping[str, Sequence[Curve]], begin: float, end: float, now: float) -> None:
         """Draw, from ``begin`` to ``end`` (s), the curves of what was chosen."""
         for k, name in enumerate(self.chosen):
-            mine = [curve for curve in curves.get(name, ()) if _is_in(curve, begin, end)]
+            mine = [one for one in curves.get(name, ()) if len(one.t) > 0 and one.t[0] <= end and one.t[-1] >= begin]
             drawn = (name, *(curve.label for curve in mine))
             if self._plots[k] is not None and drawn != self._drawn[k]:
                 self._plots[k].remove()
