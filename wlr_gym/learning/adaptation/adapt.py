@@ -186,7 +186,10 @@ def find_uncertainty(progress: Progress, robot: AdaptedRobot | None, own: Robot)
     _step(progress, "runs", lambda: record_runs(progress, robot, own))
     _step(progress, "gap", lambda: find_gap(progress, robot))
     decided = _decided(progress)
-    return decided, _model(progress, decided, own)
+    with progress.clock("model"):  # quick, and so made again where the step is done
+        record, found = state_uncertainty(progress, decided, own)
+    _step(progress, "model", lambda: record)
+    return decided, found
 
 
 def _step(progress: Progress, name: str, work: Callable[[], AdaptStep]) -> None:
@@ -208,11 +211,3 @@ def _decided(progress: Progress) -> Decided:
     folder = Path(progress.steps["gap"].numbers["folder"])
     result = read_result(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else None
     return Decided(parse_config(History, read_yaml(path), str(path)), result, folder)
-
-
-def _model(progress: Progress, decided: Decided, own: Robot) -> Uncertainty | None:
-    """State what is uncertain: quick, and so made again where the step is done."""
-    with progress.clock("model"):
-        record, found = state_uncertainty(progress, decided, own)
-    _step(progress, "model", lambda: record)
-    return found

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.data.excitations import excite
-from wlr_gym.data.read import read_dataset, read_run, run_files
+from wlr_gym.data.read import Run, read_dataset, read_run, run_files
 from wlr_gym.data.replay import robot_of
 from wlr_gym.learning.adaptation.plan import AdaptStep, Asked, Progress
 from wlr_gym.learning.adaptation.robots import AdaptedRobot, excite_robot, interrupted
@@ -89,17 +89,22 @@ def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> A
     folder = progress.folder("runs")
     noted = folder / "driven.json"
     done: dict[str, Any] = json.loads(noted.read_text(encoding="utf-8")) if noted.is_file() else {}
-    _drop_unnoted(folder, done)
+    for path in run_files(folder):  # that of a drive that was killed is not noted
+        if path.name not in {one["run"] for one in done.values()}:
+            path.unlink()
     for number, name in enumerate(asked.excitations):
         if name in done:
             continue
         progress.tell(f"robot: {name}", number / len(asked.excitations))
         recorded = excite_robot(robot, excite(name, asked.seed, own), folder, asked.seed + number)
-        seconds = 0.0 if recorded.run is None else _seconds(recorded.run)
-        if recorded.run is not None and seconds < SHORTEST:
-            recorded.run.unlink()
-        kept = recorded.run is not None and seconds >= SHORTEST
-        done[name] = {"run": recorded.run.name if kept and recorded.run else "", "seconds": seconds, "stopped": recorded.reason}
+        seconds, kept = 0.0, ""
+        if recorded.run is not None:
+            seconds = _seconds(read_run(recorded.run))
+            if seconds < SHORTEST:
+                recorded.run.unlink()
+            else:
+                kept = recorded.run.name
+        done[name] = {"run": kept, "seconds": seconds, "stopped": recorded.reason}
         write_json(noted, done)
     stopped = [f"The supervision stopped '{name}': {one['stopped']}" for name, one in done.items() if one["stopped"]]
     kept = [name for name, one in done.items() if one["run"]]
@@ -108,13 +113,6 @@ def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> A
         driving=sum(one["seconds"] for one in done.values()),
         command=f"wlr record --excitation {' '.join(asked.excitations)} --out {folder}{_emulated_words(progress)}",
     )
-
-
-def _drop_unnoted(folder: Path, done: Mapping[str, Any]) -> None:
-    """Remove the run of a drive that was killed."""
-    for path in run_files(folder):
-        if path.name not in {one["run"] for one in done.values()}:
-            path.unlink()
 
 
 def _given_runs(folder: Path, own: Robot) -> AdaptStep:
@@ -126,13 +124,12 @@ def _given_runs(folder: Path, own: Robot) -> AdaptStep:
                 f"{run.path}: of robot '{measured.name}' ({robot_hash(measured)}), and the policy is made for '{own.name}' "
                 f"({robot_hash(own)}); expected runs of the policy's robot"
             )
-    seconds = sum(float(run["t"][-1] - run["t"][0]) for run in runs)
+    seconds = sum(map(_seconds, runs))
     return AdaptStep(said=(f"{len(runs)} measured runs were given, {seconds:.0f} s in all.",), driving=seconds)
 
 
-def _seconds(run: Path) -> float:
-    t = read_run(run)["t"]
-    return float(t[-1] - t[0])
+def _seconds(run: Run) -> float:
+    return float(run["t"][-1] - run["t"][0])
 
 
 # ---- episodes --------------------------------------------------------------------------------------------------------

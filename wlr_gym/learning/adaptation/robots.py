@@ -15,7 +15,7 @@ from wlr_gym.data.format import RunMeta
 from wlr_gym.data.record import meta_of
 from wlr_gym.gap.decision import Recorded
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.driving import DriveResult, drive_robot
+from wlr_gym.hardware.driving import drive_robot
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
@@ -105,15 +105,11 @@ def excite_robot(robot: AdaptedRobot, motion: Motion, data: Path, seed: int = 0)
         drive = drive_robot(plant, motion)
     finally:
         plant.close()
-    _stop_if_asked(drive)
-    return Recorded(drive.run, drive.reason)
-
-
-def _stop_if_asked(drive: DriveResult) -> None:
     if interrupted(drive.reason):
         if drive.run is not None:
             drive.run.unlink(missing_ok=True)
         raise KeyboardInterrupt(drive.reason)
+    return Recorded(drive.run, drive.reason)
 
 
 def interrupted(reason: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,18 +74,20 @@ def uncertainty_of(result: Result, found: Patch, base: str | Mapping[str, Any], 
     found = Patch() if refuted else found
     named = [] if refuted else [one for one in result.effects if one.name in EFFECTS]
     effects = [dict(one.content()) for one in found.effects if one.name == UNKNOWN_EFFECT]
-    maker = _Maker(result, robot, folder)
-    base = _named_base(base, folder)
-    training = Family("training", maker.make("training", base, named, TRAINED_SHARE), effects)
-    families = [Family(STATED, maker.make(STATED, OWN_FLOOR, named), effects)]
+    make = partial(_family, result.model_dump(mode="json"), robot, folder)
+    if not isinstance(base, str):  # a result lies over files
+        write_yaml(folder / "base.yaml", dict(base))
+        base = str((folder / "base.yaml").resolve())
+    training = make("training", base, named, effects, TRAINED_SHARE)
+    families = [make(STATED, OWN_FLOOR, named, effects)]
     for end, name in enumerate(("lower ends", "upper ends")):
         if named and any(one.ci95 for entry in named for one in entry.parameters.values()):
-            families.append(Family(name, maker.make(name, OWN_FLOOR, [_at_end(one, end) for one in named]), effects))
-    floors = Family("other floors", maker.make("other floors", base, named), effects)
+            families.append(make(name, OWN_FLOOR, [_at_end(one, end) for one in named], effects))
+    floors = make("other floors", base, named, effects)
     families.append(floors)
     for one in _others(result, named):
         title = "nothing missing" if one.name == NOTHING else f"or {plain(one.name)}"
-        families.append(Family(title, maker.make(title, OWN_FLOOR, [_entry(effect) for effect in one.effects])))
+        families.append(make(title, OWN_FLOOR, [_entry(effect) for effect in one.effects]))
     save_patch(found, folder / "patch.yaml")
     write_yaml(folder / "randomization.yaml", dict(floors.randomization))
     return Uncertainty(found, training, tuple(families), _said(result, named, effects))
@@ -104,24 +107,26 @@ def makes_worse(result: Result) -> bool:
     return gap is not None and gap.reduction_signed is not None and gap.reduction_signed < 0.0
 
 
-class _Maker:
-    """Makes complete randomisations of a result, with these or those effects."""
-
-    def __init__(self, result: Result, robot: Robot, folder: Path) -> None:
-        self._content, self._robot, self._folder = result.model_dump(mode="json"), robot, folder
-
-    def make(self, name: str, base: str, entries: Sequence[EffectEntry], share: float = 1.0) -> dict[str, Any]:
-        """Make one; ``share``: of every interval."""
-        effects = [one.model_dump(mode="json") for one in entries]
-        for one in effects:
-            one["parameters"] = {key: _narrowed(number, "value", share) for key, number in one["parameters"].items()}
-        calibration = {key: _narrowed(number, "fitted", share) for key, number in self._content["calibration"].items()}
-        verdict = "effect_found" if effects else "nothing_missing"
-        content = {**self._content, "verdict": verdict, "effects": effects, "calibration": calibration}
-        path = self._folder / f"{name.replace(' ', '_')}.json"
-        write_json(path, content)
-        source = {"name": name, "base": base, "result": str(path.resolve())}
-        return load_randomization(source, self._robot).config.model_dump(mode="json", exclude_none=True)
+def _family(
+    content: Mapping[str, Any],
+    robot: Robot,
+    folder: Path,
+    name: str,
+    base: str,
+    entries: Sequence[EffectEntry],
+    formulas: Sequence[Mapping[str, Any]] = (),
+    share: float = 1.0,
+) -> Family:
+    """Robots as a result says, with these or those effects of the library, and formulas; ``share``: of every interval."""
+    effects = [one.model_dump(mode="json") for one in entries]
+    for one in effects:
+        one["parameters"] = {key: _narrowed(number, "value", share) for key, number in one["parameters"].items()}
+    calibration = {key: _narrowed(number, "fitted", share) for key, number in content["calibration"].items()}
+    verdict = "effect_found" if effects else "nothing_missing"
+    path = folder / f"{name.replace(' ', '_')}.json"
+    write_json(path, {**content, "verdict": verdict, "effects": effects, "calibration": calibration})
+    source = {"name": name, "base": base, "result": str(path.resolve())}
+    return Family(name, load_randomization(source, robot).config.model_dump(mode="json", exclude_none=True), formulas)
 
 
 def _narrowed(number: Mapping[str, Any], key: str, share: float) -> dict[str, Any]:
@@ -129,14 +134,6 @@ def _narrowed(number: Mapping[str, Any], key: str, share: float) -> dict[str, An
     interval = number.get("ci95")
     ends = None if interval is None else [number[key] + share * (end - number[key]) for end in interval]
     return {**number, "ci95": ends}
-
-
-def _named_base(base: str | Mapping[str, Any], folder: Path) -> str:
-    """Return a base by name or path: a result lies over files."""
-    if isinstance(base, str):
-        return base
-    write_yaml(folder / "base.yaml", dict(base))
-    return str((folder / "base.yaml").resolve())
 
 
 def _at_end(entry: EffectEntry, end: int) -> EffectEntry:

@@ -200,12 +200,11 @@ COLUMNS = ("against", "tracking error", "its tracking error", "loss (%)", "upper
 
 def acceptance_rows(result: Acceptance) -> list[list[str]]:
     """Return the table as text: a header, then one row per family of floors and reference."""
-    return [["floors", *COLUMNS], *(_row(loss, result.largest_loss) for loss in result.losses)]
-
-
-def _row(loss: Loss, largest: float) -> list[str]:
-    numbers = [f"{loss.error:.3f}", f"{loss.reference_error:.3f}", f"{loss.loss:.1f}", f"{loss.bound:.1f}"]
-    return [loss.floors, loss.reference, *numbers, "yes" if loss.bound <= largest else "no"]
+    table = [["floors", *COLUMNS]]
+    for loss in result.losses:
+        numbers = [f"{loss.error:.3f}", f"{loss.reference_error:.3f}", f"{loss.loss:.1f}", f"{loss.bound:.1f}"]
+        table.append([loss.floors, loss.reference, *numbers, "yes" if loss.bound <= result.largest_loss else "no"])
+    return table
 
 
 def write_acceptance(path: Path, result: Acceptance) -> None:

@@ -120,12 +120,9 @@ def seed_rows(card: Card, name: str, *, short: bool = False) -> Table:
     if seeds.interquartile_mean:
         table.append(row("interquartile mean", seeds.interquartile_mean))
     table.append(["median", *(_text(seeds.median(m.key), m.digits) for m in metrics)])
-    table.append(["(max - min) / median", *(_percent(seeds.spread(m.key)) for m in metrics)])
+    spreads = [seeds.spread(m.key) for m in metrics]
+    table.append(["(max - min) / median", *(f"{spread:.0f} %" if spread <= LARGEST else "-" for spread in spreads)])
     return table
-
-
-def _percent(value: float) -> str:
-    return f"{value:.0f} %" if value <= LARGEST else "-"
 
 
 def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
@@ -143,10 +140,8 @@ def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
     lines += _training_seeds(card)
     if len(card.names) > 1:
         lines += [f"## {ours} against the others, on the same episodes", ""]
-        lines += [
-            f"By how much {ours} is better (positive) or worse, paired episode by episode; bold: the interval excludes 0.",
-            "",
-        ]
+        how = "is better (positive) or worse, paired episode by episode; bold: the interval excludes 0."
+        lines += [f"By how much {ours} {how}", ""]
         lines += [*_table(comparison_rows(card)), "", *picture("improvement", "Paired improvements")]
     lines += picture("pareto", "Tracking error against slip, 95 % intervals")
     for index, sweep in enumerate(card.sweeps):
@@ -191,26 +186,32 @@ def _table(table: Table) -> list[str]:
 
 def content(card: Card) -> dict[str, Any]:
     """Return the card as plain types: what ``card.json`` holds."""
+    power = {name: [None if np.isnan(p) else float(p) for p in played.power] for name, played in card.main.items()}
     document: dict[str, Any] = {
         "format": FORMAT,
         "conditions": dict(card.conditions),
         "identities": dict(card.identities),
         "metrics": {m.key: {"unit": m.unit, "less_is_better": m.less_is_better, "doc": m.doc} for m in card.metrics},
-        "policies": _scores(card.scores[MAIN]),
-        "better_than": _scores(card.comparison[MAIN]),
+        **_policies(card, MAIN),
         "score_in_percent_of": {name: _numbers(estimate) for name, estimate in card.share_of.items()},
-        "sweeps": {sweep.name: [_point(card, sweep.label(p), p.label) for p in sweep.points] for sweep in card.sweeps},
-        "spectrum": _spectrum(card),
+        "sweeps": {
+            sweep.name: [{"at": point.label, **_policies(card, sweep.label(point))} for point in sweep.points]
+            for sweep in card.sweeps
+        },
+        "spectrum": {"frequency": card.main[card.names[0]].frequency.tolist(), "power": power},
     }
     if OTHER_PLANT in card.results:
         document["other_plant"] = {
-            "policies": _scores(card.scores[OTHER_PLANT]),
-            "better_than": _scores(card.comparison[OTHER_PLANT]),
+            **_policies(card, OTHER_PLANT),
             "score_kept": {name: _numbers(estimate) for name, estimate in card.kept.items()},
         }
     if card.training_seeds:
         document["training_seeds"] = {name: _seeds(seeds) for name, seeds in card.seed_scores.items()}
     return document
+
+
+def _policies(card: Card, label: str) -> dict[str, Any]:
+    return {"policies": _scores(card.scores[label]), "better_than": _scores(card.comparison[label])}
 
 
 def _scores(scores: Mapping[str, Scores]) -> dict[str, Any]:
@@ -235,21 +236,10 @@ def _numbers(estimate: Estimate) -> dict[str, float | None]:
     return {name: float(value) if np.isfinite(value) else None for name, value in vars(estimate).items()}
 
 
-def _point(card: Card, label: str, at: str) -> dict[str, Any]:
-    return {"at": at, "policies": _scores(card.scores[label]), "better_than": _scores(card.comparison[label])}
-
-
-def _spectrum(card: Card) -> dict[str, Any]:
-    first = card.main[card.names[0]]
-    power = {name: [None if np.isnan(p) else float(p) for p in played.power] for name, played in card.main.items()}
-    return {"frequency": first.frequency.tolist(), "power": power}
-
-
 def write_card(folder: Path, card: Card, pictures: Mapping[str, str] | None = None) -> None:
     """Write ``card.md`` and ``card.json`` into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = markdown(card, pictures)
-    write_text(folder / "card.md", text)
+    write_text(folder / "card.md", markdown(card, pictures))
     write_json(folder / "card.json", content(card))
 
 

@@ -97,16 +97,14 @@ class EpisodeRecorder:
             formulas=[effect.content() for effect in core.patch.effects if effect.name not in EFFECTS],
             start=self._start,
         )
-        return write_run(path, table, RunMeta(profile=self._profile(), notes=notes), simulation, core.task.robot)
-
-    def _profile(self) -> Profile:
         parameters = Parameters(self._parameters[None])
         velocity, acceleration = (parameters[f"servo.profile_{name}"][0] for name in ("velocity", "acceleration"))
-        return Profile(
+        profile = Profile(
             leg_velocity=float(velocity[0]),
             leg_acceleration=float(acceleration[0]),
             wheel_acceleration=float(acceleration[FIRST_WHEEL]),
         )
+        return write_run(path, table, RunMeta(profile=profile, notes=notes), simulation, core.task.robot)
 
 
 def record_episodes(core: Core, policy: Policy, folder: Path, first_seed: int = 0) -> list[Path]:

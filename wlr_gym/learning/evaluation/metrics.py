@@ -22,8 +22,6 @@ ACTION_AT_LIMIT = 0.99
 JITTER_FREQUENCY = 5.0
 #: Environment steps of one window of the spectrum; windows overlap by half.
 WINDOW = 128
-
-
 #: s after the start and after a change of a command in which a motion is not steady yet.
 SETTLING = 2.0
 
@@ -40,15 +38,12 @@ class Metric:
     quantile: float | None = None
 
 
+_AFTER = f"{SETTLING:g} s after start and changes of command"
 TRACKING = (
     Metric("tracking_error_median", "-", 3, True, "tracking_error of the episode in the middle", 0.5),
     Metric("tracking_error_p90", "-", 3, True, "tracking_error that one episode in ten exceeds", 0.9),
-    Metric(
-        "tracking_error_steady", "-", 3, True, f"tracking_error later than {SETTLING:g} s after start and changes of command"
-    ),
-    Metric(
-        "tracking_error_transient", "-", 3, True, f"tracking_error within {SETTLING:g} s after start and changes of command"
-    ),
+    Metric("tracking_error_steady", "-", 3, True, f"tracking_error later than {_AFTER}"),
+    Metric("tracking_error_transient", "-", 3, True, f"tracking_error within {_AFTER}"),
 )
 GENERAL = (
     Metric("falls", "%", 0, True, "episodes that a termination ended"),
@@ -76,14 +71,9 @@ def metrics_of(measures: Sequence[Measure]) -> tuple[Metric, ...]:
             own.append(Metric(m.name, m.unit, 4, True, f"rms over the episode: {m.doc}"))
         if m.max is not None:
             own.append(Metric(f"{m.name}_max", m.unit, 4, True, f"largest magnitude in the episode: {m.doc}"))
+    in_scales = f"rms over the measures in units of their scales ({', '.join(scales)}); a fall adds {FALL:g}"
     return (
-        Metric(
-            "tracking_error",
-            "-",
-            3,
-            True,
-            f"rms over the measures in units of their scales ({', '.join(scales)}); a fall adds {FALL:g}",
-        ),
+        Metric("tracking_error", "-", 3, True, in_scales),
         *TRACKING,
         *own,
         Metric("success", "%", 0, False, f"episodes without a fall and within every limit ({', '.join(limits)})"),
@@ -136,9 +126,8 @@ def summarise(rollouts: Iterable[Rollout], training_seeds: int = 1) -> Played:
     seen = power[np.isfinite(power[:, 0])]
     mean = seen.mean(axis=0) if len(seen) else np.full(frequency.size, np.nan)
     shape = (training_seeds, -1, *pairs[0]["success"].shape)
-    return Played(
-        measures, {key: np.stack([block[key] for block in pairs]).reshape(shape) for key in pairs[0]}, frequency, mean
-    )
+    kept = {key: np.stack([block[key] for block in pairs]).reshape(shape) for key in pairs[0]}
+    return Played(measures, kept, frequency, mean)
 
 
 def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, Array]:

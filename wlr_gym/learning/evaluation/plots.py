@@ -38,11 +38,7 @@ def learning_curve(curve: Sequence[Mapping[str, float]], references: Mapping[str
     left.plot(steps, [row["reward_per_second"] for row in curve], color=ACTUAL, label="PPO, with its exploration")
     for (name, value), style in zip(references.items(), ("--", ":", "-.", (0, (1, 4))), strict=False):
         left.axhline(value, color="0.3", linestyle=style, linewidth=1.2, label=name)
-    left.set(
-        xlabel="environment steps (millions)",
-        ylabel="reward per second",
-        title="Reward while training",
-    )
+    left.set(xlabel="environment steps (millions)", ylabel="reward per second", title="Reward while training")
     left.legend(fontsize=8)
     _draw_terms(right, steps, curve)
     for axes in (left, right):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
@@ -142,13 +143,9 @@ def _named(robot: RobotSource | None) -> str:
 
 def fitting_baselines(environment: str, names: Sequence[str] = BASELINES) -> tuple[str, ...]:
     """Return which agents without learning can drive an environment: a controller needs its task's commands."""
-    task = make_task(task_source_of(environment), read_settings({}))
-    return tuple(name for name in names if _fits(name, contract(task, {})))
-
-
-def _fits(agent: str, wanted: Mapping[str, Any]) -> bool:
-    try:
-        make_policy(agent, dict(wanted))
-    except InputError:
-        return False
-    return True
+    wanted, found = contract(make_task(task_source_of(environment), read_settings({})), {}), []
+    for name in names:
+        with suppress(InputError):
+            make_policy(name, wanted)
+            found.append(name)
+    return tuple(found)

@@ -59,15 +59,6 @@ def expansion(seeds: int) -> float:
     return float(np.sqrt(seeds / (seeds - 1.0)) * stdtrit(seeds - 1, tail) / ndtri(tail))
 
 
-@dataclass(frozen=True)
-class _Draws:
-    """A metric as measured, then resampled, (RESAMPLES + 1,): in its episodes only, and in its training seeds too."""
-
-    episodes: Array
-    both: Array
-    seeds: int
-
-
 class Bootstrap:
     """Resampling of blocks, of episodes within them (Davison and Hinkley 1997, section 3.8), and of training seeds.
 
@@ -133,23 +124,26 @@ class Bootstrap:
         """
         numbers = range(len(pairs)) if subjects is None else subjects
         drawn = [self._draw(pair, number, over_seeds, quantile) for pair, number in zip(pairs, numbers, strict=True)]
-        several = [draws.seeds for draws in drawn if draws.seeds > 1]
-        factor = expansion(min(several, default=1))
+        by_episodes, by_both, seeds = zip(*drawn, strict=True)
+        factor = expansion(min((count for count in seeds if count > 1), default=1))
         with np.errstate(divide="ignore", invalid="ignore"):
-            values = function(*(draws.episodes for draws in drawn))
-            values = values + factor * (function(*(draws.both for draws in drawn)) - values)
+            values = function(*by_episodes)
+            values = values + factor * (function(*by_both) - values)
         if not np.isfinite(values[0]):
             return Estimate(np.nan, np.nan, np.nan)
         tail = 50.0 * (1.0 - CONFIDENCE)
         low, high = np.nanpercentile(np.where(np.isfinite(values), values, np.nan)[1:], (tail, 100.0 - tail))
         return Estimate(float(values[0]), float(low), float(high))
 
-    def _draw(self, pairs: Array, subject: int, over_seeds: Callable[[Array], Array], quantile: float | None) -> _Draws:
+    def _draw(
+        self, pairs: Array, subject: int, over_seeds: Callable[[Array], Array], quantile: float | None
+    ) -> tuple[Array, Array, int]:
+        """Return a metric (RESAMPLES + 1,), as measured first: resampled in its episodes, in its seeds too; how many seeds."""
         scores = self.scores(pairs, quantile)
         seeds = scores.shape[1]
         chosen = np.random.default_rng([subject, seeds]).integers(0, seeds, (RESAMPLES, seeds))
         chosen = np.concatenate([np.arange(seeds)[None], chosen])
-        return _Draws(over_seeds(scores), over_seeds(np.take_along_axis(scores, chosen, axis=1)), seeds)
+        return over_seeds(scores), over_seeds(np.take_along_axis(scores, chosen, axis=1)), seeds
 
     def mean(self, pairs: Array, quantile: float | None = None) -> Estimate:
         """Return the metric itself, mean over training seeds."""

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 MakePolicy = Callable[[Mapping[str, Any], Mapping[str, Any]], Policy]
 #: Called with what is going on, and the share of the search that is done.
 TellSearch = Callable[[str, float], None]
-#: What a search has not: of a training, and how ``wlr train`` calls it.
-_OF_TRAINING = {"init": "--init", "max_seconds": "--max-minutes"}
 
 
 def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[PidConfig]) -> Path:
@@ -48,12 +46,15 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
 
     if training.resume:
         raise InputError(f"agent '{agent}' is tuned by a search of a few minutes, which cannot be resumed: start it anew")
-    for name, option in _OF_TRAINING.items():
+    for name, option in {"init": "--init", "max_seconds": "--max-minutes"}.items():  # what ``wlr train`` calls them
         if getattr(training, name) is not None:
             raise InputError(f"agent '{agent}' is tuned by a search of a few minutes: leave out '{name}' ({option})")
     config = dict(training.config)
     general = task_settings(model, {"task": ""}, config, agent)
-    _check_steps(general, agent)
+    tunable = [name for name, value in general if isinstance(value, float)]
+    for name in general.search.steps:
+        if name not in tunable:
+            raise unknown_name("setting", name, tunable, f"agent '{agent}': search.steps")
     episodes = general.search.episodes
     core = make_core(training.environment, episodes, config.get("environment", {}))
     try:
@@ -72,13 +73,6 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
     origin = {"environment": training.environment, "score": score, "episodes": episodes, "seed": start.seed}
     write_contract(folder, agent, best, contract, origin)
     return folder
-
-
-def _check_steps(settings: PidConfig, agent: str) -> None:
-    tunable = [name for name, value in settings if isinstance(value, float)]
-    for name in settings.search.steps:
-        if name not in tunable:
-            raise unknown_name("setting", name, tunable, f"agent '{agent}': search.steps")
 
 
 def search(core: Core, make_policy: MakePolicy, start: PidConfig, tell: TellSearch) -> tuple[dict[str, Any], float]:

@@ -60,10 +60,9 @@ class Meter(BaseCallback):
 
     def fail(self, reason: str) -> None:
         """Write the state to the dump file and raise :class:`TrainingError`."""
-        names = {"obs_tensor", "actions", "rewards", "new_obs"} & set(self.locals)
         arrays: dict[str, Any] = {}
-        for name in sorted(names):
-            arrays |= _arrays(name, self.locals[name])
+        for name in ("actions", "new_obs", "obs_tensor", "rewards"):
+            arrays |= _arrays(name, self.locals[name]) if name in self.locals else {}
         episodes = self.core.episodes
         arrays |= {"parameters": self.core.parameters.values, "robot_seeds": episodes.robot_seeds, "ticks": episodes.steps}
         replace_file(self.dump, lambda temporary: np.savez(temporary, **arrays))  # type: ignore[arg-type]
@@ -97,7 +96,11 @@ class CurveFile:
 
     def __init__(self, path: Path, steps: int) -> None:
         self.path = path
-        kept = _first_rows(path, steps) if path.is_file() else ""
+        kept = ""
+        if path.is_file():
+            count = sum(row["steps"] <= steps for row in read_curve(path))
+            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+            kept = "".join(lines[: count + 1]) if count else ""
         replace_file(path, lambda temporary: temporary.write_text(kept, encoding="utf-8"))
 
     def append(self, row: Mapping[str, float]) -> None:
@@ -107,13 +110,6 @@ class CurveFile:
             if file.tell() == 0:
                 writer.writeheader()
             writer.writerow(row)
-
-
-def _first_rows(path: Path, steps: int) -> str:
-    """Return header and rows up to ``steps`` as they are written; nothing where there are none."""
-    count = sum(row["steps"] <= steps for row in read_curve(path))
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    return "".join(lines[: count + 1]) if count else ""
 
 
 def losses(logged: dict[str, Any]) -> dict[str, float]:

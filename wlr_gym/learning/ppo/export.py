@@ -6,13 +6,9 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-
-if TYPE_CHECKING:
-    import onnx
-
 
 #: Before the names of weights that do not act.
 LEARNER = "learner."
@@ -38,7 +34,14 @@ def to_onnx(actor: torch.nn.Module, width: int) -> bytes:
             verbose=False,
         )
     assert program is not None
-    return _bare(program.model_proto).SerializeToString(deterministic=True)
+    model: Any = program.model_proto
+    graph = model.graph
+    # Without what the exporter notes about itself: source files, stack traces, intermediate shapes.
+    del model.metadata_props[:], graph.metadata_props[:], graph.value_info[:]
+    for part in [*graph.node, *graph.input, *graph.output, *graph.initializer]:
+        part.doc_string = ""
+        del part.metadata_props[:]
+    return model.SerializeToString(deterministic=True)
 
 
 def with_learner(graph: bytes, weights: Mapping[str, torch.Tensor]) -> bytes:
@@ -54,16 +57,6 @@ def with_learner(graph: bytes, weights: Mapping[str, torch.Tensor]) -> bytes:
     for name, value in weights.items():
         model.graph.initializer.append(numpy_helper.from_array(value.numpy(), LEARNER + name))
     return model.SerializeToString(deterministic=True)
-
-
-def _bare(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Drop what the exporter notes about itself: source files, stack traces, intermediate shapes."""
-    graph: Any = model.graph
-    del model.metadata_props[:], graph.metadata_props[:], graph.value_info[:]
-    for part in [*graph.node, *graph.input, *graph.output, *graph.initializer]:
-        part.doc_string = ""
-        del part.metadata_props[:]
-    return model
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from wlr_gym.learning.evaluation.metrics import summarise
@@ -43,6 +43,14 @@ class HeldOutEpisodes:
     def close(self) -> None:
         """Release the plant."""
         self.core.close()
+
+
+def best_of(rows: Iterable[Mapping[str, float]]) -> Mapping[str, float]:
+    """Return the best scores; empty where there are none."""
+    best: Mapping[str, float] = {}
+    for row in rows:
+        best = row if is_better(row, best) else best
+    return best
 
 
 def is_better(scores: Mapping[str, float], best: Mapping[str, float]) -> bool:

@@ -26,7 +26,6 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
 from wlr_gym.envs import Sb3VecEnv
-from wlr_gym.envs.core import Core
 from wlr_gym.learning.ppo import checkpoint
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.curve import Meter, losses
@@ -221,20 +220,16 @@ def _tell(training: Training, progress: TrainingProgress, log: TrainingLog) -> b
 
 
 def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:
-    """Start new episodes of all robots; seeds and the curriculum depend on the run's seed and the steps done only."""
+    """Start new episodes of all robots; seeds and the curriculum depend on the run's seed and the steps done only.
+
+    These episodes end evenly over the length of one. Otherwise all robots start anew in the same update, a start is in one
+    update of some thirty, and each update unlearns it.
+    """
     env.set_progress(model.num_timesteps)
     env.seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1, np.uint32)[0]))
     model._last_obs = env.reset()
-    spread_ends(env.core)
+    env.core.episodes.sooner[:] = np.arange(env.num_envs) * env.core.limit // env.num_envs
     model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
-
-
-def spread_ends(core: Core) -> None:
-    """Let the present episodes of N robots end evenly over the length of an episode.
-
-    Otherwise all robots start anew in the same update, a start is in one update of some thirty, and each update unlearns it.
-    """
-    core.episodes.sooner[:] = np.arange(core.count) * core.limit // core.count
 
 
 def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:

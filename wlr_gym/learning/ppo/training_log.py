@@ -14,7 +14,7 @@ from wlr_gym.learning.evaluation import read_curve
 from wlr_gym.learning.ppo import checkpoint
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.curve import LOSSES, CurveFile
-from wlr_gym.learning.ppo.held_out import HeldOutEpisodes, is_better
+from wlr_gym.learning.ppo.held_out import HeldOutEpisodes, best_of, is_better
 from wlr_gym.policy import Training
 
 if TYPE_CHECKING:
@@ -43,9 +43,7 @@ class TrainingLog:
         self._scores = CurveFile(folder / SCORES_FILE, steps) if config.evaluate_every else None
         rows = read_curve(folder / SCORES_FILE) if self._scores else []
         self.scores: Mapping[str, float] = rows[-1] if rows else {}
-        self.best: Mapping[str, float] = {}
-        for row in rows:
-            self.best = row if is_better(row, self.best) else self.best
+        self.best: Mapping[str, float] = best_of(rows)
         self._episodes = HeldOutEpisodes(training.environment, config) if config.evaluate_every else None
         model.set_logger(Logger(str(folder), [_ResumedTensorBoard(folder / "tensorboard", steps)]))
 

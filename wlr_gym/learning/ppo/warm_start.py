@@ -29,7 +29,6 @@ EPOCHS = 80
 BATCH_SIZE = 512
 #: At the start; it falls to zero: actions are met within 2 % of their range.
 LEARNING_RATE = 2e-3
-
 #: Control steps over which observations are gathered for their scales.
 GATHERED = 100
 
@@ -38,13 +37,11 @@ Observations = dict[str, NDArray[np.float32]]
 
 def gather_scales(model: PPO, env: Sb3VecEnv) -> None:
     """Let the untrained policy drive, and normalise observations by their mean and deviation there; the steps count."""
-    seen = []
+    groups = []
     for _ in range(GATHERED):
-        observation = model._last_obs
-        seen.append(observation)
-        actions, _ = model.predict(observation, deterministic=False)  # type: ignore[arg-type]
+        groups.append(_groups(model._last_obs))
+        actions, _ = model.predict(model._last_obs, deterministic=False)  # type: ignore[arg-type]
         model._last_obs = env.step(np.clip(actions, -1.0, 1.0))[0]  # type: ignore[assignment]
-    groups = [_groups(one) for one in seen]
     rows = {name: torch.as_tensor(np.concatenate([one[name] for one in groups])) for name in groups[0]}
     for normaliser in normalisers(model.policy):
         wide = normaliser.mean.shape[0] > rows["policy"].shape[1]
@@ -114,8 +111,9 @@ def _discounted(rewards: NDArray[np.float32], dones: NDArray[np.bool_], gamma: f
 
 def _fit(model: PPO, observations: Observations, actions: torch.Tensor | None, returns: torch.Tensor, seed: int) -> None:
     """Fit actor and critic to actions (M, 8) and returns (M,); without actions the critic alone, the actor stays."""
-    policy = model.policy
-    moved = policy.parameters() if actions is not None else _critic(policy)
+    policy: Any = model.policy
+    critic = [*policy.mlp_extractor.value_net.parameters(), *policy.value_net.parameters()]
+    moved = policy.parameters() if actions is not None else critic
     optimiser = torch.optim.Adam(moved, lr=LEARNING_RATE)
     tensors = {name: torch.as_tensor(values) for name, values in observations.items()}
     order = torch.Generator().manual_seed(seed)
@@ -125,16 +123,11 @@ def _fit(model: PPO, observations: Observations, actions: torch.Tensor | None, r
         for rows in torch.randperm(len(returns), generator=order).split(BATCH_SIZE):
             batch = {name: values[rows] for name, values in tensors.items()}
             seen = batch if len(batch) > 1 else batch["policy"]
-            value = policy.predict_values(seen).flatten()  # pyright: ignore[reportArgumentType]
+            value = policy.predict_values(seen).flatten()
             loss = nn.functional.mse_loss(value, returns[rows])
             if actions is not None:
-                mean = policy.get_distribution(seen).distribution.mean  # pyright: ignore[reportAttributeAccessIssue, reportArgumentType]
+                mean = policy.get_distribution(seen).distribution.mean
                 loss = nn.functional.mse_loss(mean, actions[rows]) + loss
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
-
-
-def _critic(policy: Any) -> list[torch.nn.Parameter]:
-    """Return the weights that only values depend on."""
-    return [*policy.mlp_extractor.value_net.parameters(), *policy.value_net.parameters()]

@@ -38,7 +38,8 @@ def curves(ranking: Sequence[Summary], names: Sequence[str], metric: str) -> Fig
         metric: that decides.
     """
     figure = new_figure(10.0, 4.6)
-    shown = [metric, *(name for name in ("success", "reward") if name != metric and _is_scored(ranking, name))][:2]
+    scored = {name for summary in ranking for one in summary.results for name in one.final}
+    shown = [metric, *(name for name in ("success", "reward") if name != metric and name in scored)][:2]
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
     for axes, name in zip(panels, shown, strict=True):
         for rank in reversed(range(len(ranking))):
@@ -56,10 +57,6 @@ def curves(ranking: Sequence[Summary], names: Sequence[str], metric: str) -> Fig
     best = slice(None, -len(COLOURS) - 1, -1)
     figure.legend(handles[best], labels[best], loc="outside lower center", ncols=2 if len(labels) > 2 else 1, fontsize=8)
     return figure
-
-
-def _is_scored(ranking: Sequence[Summary], name: str) -> bool:
-    return any(name in one.final for summary in ranking for one in summary.results)
 
 
 def _draw(axes: Axes, summary: Summary, label: str, metric: str, colour: str) -> None:

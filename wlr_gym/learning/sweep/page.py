@@ -110,10 +110,8 @@ def _tiles(results: Sequence[TrialResult], ranking: Sequence[Summary], metric: s
 
 def _failures(results: Sequence[TrialResult]) -> str:
     rows = [(one.trial.name, one.error) for one in results if one.status == FAILED]
-    return section("Failed", table(("trial", "error"), rows), _LOGS) if rows else ""
-
-
-_LOGS = '<p class="small">What a trial printed is in <code>logs/</code>. Resume the sweep to try them again.</p>'
+    logs = '<p class="small">What a trial printed is in <code>logs/</code>. Resume the sweep to try them again.</p>'
+    return section("Failed", table(("trial", "error"), rows), logs) if rows else ""
 
 
 def _best(plan: SweepPlan, ranking: Sequence[Summary]) -> str:

@@ -15,7 +15,7 @@ from wlr_gym.base.files import replace_file
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.learning.evaluation import read_curve
-from wlr_gym.learning.ppo.held_out import is_better
+from wlr_gym.learning.ppo.held_out import best_of
 from wlr_gym.learning.sweep.plan import METRICS, Trial
 
 if TYPE_CHECKING:
@@ -61,19 +61,15 @@ class TrialResult:
     @property
     def best(self) -> Scores:
         """Scores of the policy in ``best/``."""
-        best: Scores = {}
-        for row in self.scores:
-            best = row if is_better(row, best) else best
-        return best
+        return best_of(self.scores)
 
 
 def read_result(trial: Trial, folder: Path, status: str = UNFINISHED, error: str = "") -> TrialResult:
     """Return what the run folder of a trial says; ``status`` and ``error`` where it is not complete."""
     curve = read_curve(folder / "learning_curve.csv") if (folder / "learning_curve.csv").is_file() else []
-    complete = is_complete(folder)
     return TrialResult(
         trial,
-        DONE if complete and not error else status,
+        DONE if is_complete(folder) and not error else status,
         scores_of(folder),
         int(curve[-1]["steps"]) if curve else 0,
         _seconds(curve),
@@ -193,14 +189,13 @@ def summarise(results: Sequence[TrialResult], metric: str) -> list[Summary]:
     for one in results:
         if np.isfinite(one.final.get(metric, np.nan)):
             groups.setdefault(one.trial.label, []).append(one)
-    found = [_summary(group, metric) for group in groups.values()]
+    found = []
+    for group in groups.values():
+        ended = [one for one in group if one.status == DONE]
+        values = [one.final[metric] for one in ended or group]
+        found.append(Summary(group[0].trial.settings, group, values, bool(ended)))
     sign = 1.0 if METRICS[metric] else -1.0
     return sorted(found, key=lambda one: (not one.is_whole, sign * one.mean))
-
-
-def _summary(group: Sequence[TrialResult], metric: str) -> Summary:
-    ended = [one for one in group if one.status == DONE]
-    return Summary(group[0].trial.settings, group, [one.final[metric] for one in ended or group], bool(ended))
 
 
 #: Numbers of which more than this many were tried are put into as many groups.

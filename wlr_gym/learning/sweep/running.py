@@ -164,7 +164,6 @@ def resume_sweep(folder: str | Path, *, ray: str | None = None, workers: int | N
 
 
 def _check_machines(plan: SweepPlan, ray: str | None, workers: int | None) -> None:
-    """Refuse where nothing could run."""
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise InputError(f"workers = {workers!r}: expected 1 or more")
     if ray is not None or plan.needs_ray:
@@ -363,15 +362,12 @@ class _Book:
         try:
             self.write()
         except InputError as problem:
+            found = Counter(one.status for one in self.results())
+            count = ", ".join(f"{status}: {number}" for status, number in found.items())
             again = f"wlr sweep --resume {self.folder}"
-            raise InputError(f"{problem}; {self._count()}; when it can be written: {again}") from None
+            raise InputError(f"{problem}; trials {count}; when it can be written: {again}") from None
         results = self.results()
         return SweepResult(self.folder, results, summarise(results, self.plan.metric))
-
-    def _count(self) -> str:
-        """Return how many trials there are of each status, in words."""
-        found = Counter(one.status for one in self.results())
-        return f"trials {', '.join(f'{status}: {number}' for status, number in found.items())}"
 
     def write(self) -> None:
         """Write table and page; trials that were stopped early write their last checkpoint before they are read."""

@@ -40,7 +40,7 @@ def job_of(plan: SweepPlan, trial: Trial, out: Path, *, report: bool = False, tr
         report: let the job say each held-out score.
         train: False = say the scores that there are, no more.
     """
-    out = out.resolve()
+    out, module = out.resolve(), plan.environment.rpartition(":")[0]  # of an id such as ``my_tasks:WLR-Climb-v0``
     task = {
         "out": str(out),
         "name": trial.name,
@@ -48,7 +48,7 @@ def job_of(plan: SweepPlan, trial: Trial, out: Path, *, report: bool = False, tr
         "agent": plan.agent,
         "settings": whole_settings(plan, trial),
         "init": plan.init,
-        "imports": [*plan.imports, *_modules_of(plan.environment)],
+        "imports": [*plan.imports, *([module] if module else [])],
         "report": report,
         "train": train,
         "version": __version__,
@@ -62,12 +62,6 @@ def check_job(plan: SweepPlan, out: Path) -> Job:
     any_settings = draw(plan, np.random.default_rng(0))
     job = job_of(plan, trial_of(any_settings, plan.seed_list[0]), out)
     return replace(job, name="check", task={**job.task, "check": True}, log=str(out.resolve() / LOGS / "check.txt"))
-
-
-def _modules_of(environment: str) -> list[str]:
-    """Return the module of an id such as ``my_tasks:WLR-Climb-v0``."""
-    module = environment.rpartition(":")[0]
-    return [module] if module else []
 
 
 def train_trial(task: Mapping[str, Any], send: Send) -> None:
@@ -90,7 +84,7 @@ def train_trial(task: Mapping[str, Any], send: Send) -> None:
         reporter = _Reporter(folder, send if task["report"] else None)
         if task["train"] and not is_complete(folder):
             _train(task, folder, reporter)
-        reporter.finish()
+        reporter.catch_up()
 
 
 def _train(task: Mapping[str, Any], folder: Path, reporter: _Reporter) -> None:
@@ -102,7 +96,8 @@ def _train(task: Mapping[str, Any], folder: Path, reporter: _Reporter) -> None:
 
         def on_update(progress: TrainingProgress) -> None:
             if compiled is not None:
-                _note(compiled)
+                with contextlib.suppress(OSError):
+                    compiled.touch()
                 until_compiled.close()
             reporter.tell(progress.held_out)
 
@@ -126,7 +121,7 @@ class _Reporter:
 
     def __init__(self, folder: Path, send: Callable[[Mapping[str, Any]], None] | None) -> None:
         self._folder, self._send, self._told = folder, send, -1.0
-        self._rows()
+        self.catch_up()
 
     def tell(self, scores: Mapping[str, float]) -> None:
         """Say scores, if they are new."""
@@ -134,11 +129,8 @@ class _Reporter:
             self._told = scores["steps"]
             self._send(dict(scores))
 
-    def finish(self) -> None:
-        """Say what the end of the training added."""
-        self._rows()
-
-    def _rows(self) -> None:
+    def catch_up(self) -> None:
+        """Say what is new in the run folder, such as what the end of the training added."""
         for row in scores_of(self._folder):
             self.tell(row)
 
@@ -162,11 +154,6 @@ def _compiled(environment: str, keywords: Mapping[str, Any]) -> Path | None:
     texts = (environment, json.dumps(keywords, sort_keys=True), str(PACKAGE), str(git_commit()), __version__)
     key = hashlib.sha256("\0".join((fingerprint(*texts), str(llvmlite.binding.get_host_cpu_name()))).encode()).hexdigest()[:16]
     return cache_directory() / f"compiled_{key}.txt"
-
-
-def _note(compiled: Path) -> None:
-    with contextlib.suppress(OSError):
-        compiled.touch()
 
 
 if __name__ == "__main__":

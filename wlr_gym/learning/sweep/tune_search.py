@@ -148,13 +148,15 @@ def _optuna(plan: SweepPlan, begun: Sequence[Mapping[str, Any]]) -> Any:
 
     assert plan.search is not None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
+    choices = {name for name, values in plan.space.items() if isinstance(values, list)}  # Optuna gets them as JSON
+    points = [{name: json.dumps(value) if name in choices else value for name, value in one.items()} for one in begun]
     return OptunaSearch(
         space={name: _distribution(values) for name, values in plan.space.items()},
         metric=plan.search.metric,
         mode=_mode(plan.search.metric),
         # a resumed search draws other numbers than those that are known already
         sampler=optuna.samplers.TPESampler(seed=plan.search.seed + len(begun)),
-        points_to_evaluate=[_encoded(plan, one) for one in begun] or None,
+        points_to_evaluate=points or None,
     )
 
 
@@ -184,11 +186,6 @@ def _asha(plan: SweepPlan) -> Any:
         reduction_factor=REDUCTION,
         **keywords,
     )
-
-
-def _encoded(plan: SweepPlan, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings as Optuna takes them: choices as JSON."""
-    return {name: json.dumps(value) if isinstance(plan.space[name], list) else value for name, value in settings.items()}
 
 
 def _trial(plan: SweepPlan, config: Mapping[str, Any]) -> Trial:
