@@ -268,15 +268,12 @@ class Pid:
             return wanted, np.zeros(wanted.shape)
         if len(self._sent) != len(observations):
             self._sent = np.full(wanted.shape, np.nan)
-        before = np.where(np.isnan(self._sent), self._leg_error(observations), self._sent)
+        angle = self.leg_angle(observations)
+        error = angle - self.chassis.robot.home.leg_angle if self._sees_legs else np.zeros(angle.shape)
+        before = np.where(np.isnan(self._sent), error, self._sent)
         step = abs(config.legs_inward) * self._period / max(config.lean_time, self._period)
         change = np.clip(wanted - before, -step, step)
         return before + change, change / self._period
-
-    def _leg_error(self, observations: NDArray[np.floating]) -> Array:
-        """Return how far the legs stand from home (N, 4), rad; zeros where they are not observed."""
-        angle = self.leg_angle(observations)
-        return angle - self.chassis.robot.home.leg_angle if self._sees_legs else np.zeros(angle.shape)
 
     def motion(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
         """Return the forward velocity and turn (N,) to roll at: what is wanted, with corrections."""

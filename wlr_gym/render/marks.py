@@ -218,34 +218,29 @@ def add_marks(scene: mujoco.MjvScene, marks: Iterable[Mark]) -> None:
     for mark in marks:
         if scene.ngeom >= scene.maxgeom:
             return
-        _ADD[type(mark)](scene.geoms[scene.ngeom], mark)
+        _draw(scene.geoms[scene.ngeom], mark)
         scene.ngeom += 1
 
 
-def _add_piece(geom: mujoco.MjvGeom, piece: Piece) -> None:
-    _start(geom, "CAPSULE", [LINE, LINE, LINE], piece.start, piece.colour)
-    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, LINE, piece.start, piece.end)
-
-
-def _add_area(geom: mujoco.MjvGeom, area: Area) -> None:
-    low, high = np.array(area.low), np.array(area.high)
-    _start(geom, "BOX", [*(0.5 * (high - low)), area.height], [*(0.5 * (low + high)), 0.0], friction_colour(area.mu))
-
-
-def _add_squares(geom: mujoco.MjvGeom, squares: Squares) -> None:
-    _start(geom, "PLANE", [SQUARES_REACH, SQUARES_REACH, 0.0], [*squares.middle, SQUARES_HEIGHT], (1.0, 1.0, 1.0))
-    geom.matid = squares.material
-    geom.rgba[3] = 0.99  # only what is not quite opaque is blended with what lies below
-
-
-def _add_spot(geom: mujoco.MjvGeom, spot: Spot) -> None:
-    _start(geom, "CYLINDER", [0.06, LAYER * 5, 0.0], spot.centre * [1.0, 1.0, 0.0], friction_colour(spot.mu))
-
-
-def _add_arrow(geom: mujoco.MjvGeom, arrow: Arrow) -> None:
-    _start(geom, "ARROW", [SHAFT, SHAFT, SHAFT], arrow.start, arrow.colour)
-    mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, SHAFT, arrow.start, arrow.end)
-    geom.emission = 0.5
+def _draw(geom: mujoco.MjvGeom, mark: Mark) -> None:
+    match mark:
+        case Piece(start, end, colour):
+            _start(geom, "CAPSULE", [LINE, LINE, LINE], start, colour)
+            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, LINE, start, end)
+        case Area():
+            low, high = np.array(mark.low), np.array(mark.high)
+            size, middle = [*(0.5 * (high - low)), mark.height], [*(0.5 * (low + high)), 0.0]
+            _start(geom, "BOX", size, middle, friction_colour(mark.mu))
+        case Squares(middle, material):
+            _start(geom, "PLANE", [SQUARES_REACH, SQUARES_REACH, 0.0], [*middle, SQUARES_HEIGHT], (1.0, 1.0, 1.0))
+            geom.matid = material
+            geom.rgba[3] = 0.99  # only what is not quite opaque is blended with what lies below
+        case Spot(centre, mu):
+            _start(geom, "CYLINDER", [0.06, LAYER * 5, 0.0], centre * [1.0, 1.0, 0.0], friction_colour(mu))
+        case Arrow(start, end, colour):
+            _start(geom, "ARROW", [SHAFT, SHAFT, SHAFT], start, colour)
+            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, SHAFT, start, end)
+            geom.emission = 0.5
 
 
 def _start(geom: mujoco.MjvGeom, kind: str, size: Iterable[float], position: Iterable[float], colour: Colour) -> None:
@@ -255,6 +250,3 @@ def _start(geom: mujoco.MjvGeom, kind: str, size: Iterable[float], position: Ite
         geom, shape, np.fromiter(size, np.float64), place, np.eye(3).ravel(), np.array([*colour, 1.0], np.float32)
     )
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value
-
-
-_ADD = {Squares: _add_squares, Area: _add_area, Spot: _add_spot, Arrow: _add_arrow, Piece: _add_piece}

@@ -41,18 +41,13 @@ def font(height: int) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", height)
 
 
-def text_height(picture: Picture) -> int:
-    """Return the height of the letters for a picture, pixels."""
-    return max(9, round(picture.shape[0] / 34))
-
-
 def write(
     picture: Picture, lines: Sequence[str], legend: Sequence[str] = (), bar: bool = True, notes: Sequence[Note] = ()
 ) -> Picture:
     """Return the picture with lines at the top left, a friction bar and a legend at the bottom left, and notes in the scene."""
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
-    size = text_height(picture)
+    size = max(9, round(picture.shape[0] / 34))  # pixels; height of the letters
     for note in notes:
         _note(draw, note, image.size, size)
     if lines:

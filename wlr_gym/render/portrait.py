@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +35,15 @@ def draw_portrait(path: Path, robot: Robot) -> None:
     """
     low, high = robot.leg_limits
     home = robot.home.leg_angle
+    x, y, z = robot.body.size
+    sizes = [
+        f"{robot.name}: {robot.total_mass:.3g} kg",
+        f"body {x:g} x {y:g} x {z:g} m, {robot.body.mass:g} kg",
+        f"legs {robot.leg.length:g} m, wheels of radius {robot.wheel.radius:g} m",
+        "squares 0.2 m",
+    ]
     panels = (
-        _view(robot, "follow", home, _size_lines(robot)),
+        _view(robot, "follow", home, sizes),
         _view(robot, "side", home, [f"home: legs at {home:.3g} rad"]),
         _view(robot, "side", low, [f"lower limit: legs at {low:.3g} rad"]),
         _view(robot, "side", high, [f"upper limit: legs at {high:.3g} rad"]),
@@ -44,24 +52,11 @@ def draw_portrait(path: Path, robot: Robot) -> None:
     replace_file(path, lambda temporary: Image.fromarray(picture).save(temporary))
 
 
-def _size_lines(robot: Robot) -> list[str]:
-    x, y, z = robot.body.size
-    return [
-        f"{robot.name}: {robot.total_mass:.3g} kg",
-        f"body {x:g} x {y:g} x {z:g} m, {robot.body.mass:g} kg",
-        f"legs {robot.leg.length:g} m, wheels of radius {robot.wheel.radius:g} m",
-        "squares 0.2 m",
-    ]
-
-
 def _view(robot: Robot, camera: str, leg_angle: float, lines: list[str]) -> Picture:
     parameters = Parameters.nominal(robot)
     state = standing_state(robot, parameters, leg_angle)
     truth = Truth(np.zeros((1, TRUTH_LAYOUT.width)))
     for name in ("position", "quaternion", "joint_position"):
         truth[name][:] = getattr(state, name)
-    scene = Scene(robot, View(size=SIZE, camera=camera, friction=False, slip=False, text=False))
-    try:
+    with closing(Scene(robot, View(size=SIZE, camera=camera, friction=False, slip=False, text=False))) as scene:
         return overlay.write(scene.draw(truth, parameters), lines, bar=False)
-    finally:
-        scene.close()

@@ -138,17 +138,14 @@ class Gamepad:
         buttons = self._buttons()
         if buttons and buttons[0]:
             return dict.fromkeys(self._ranges, 0.0)
-        return stick_commands(self._ranges, self._axes())
+        pointer, count = self._joystick.get_joystick_axes(0)
+        return stick_commands(self._ranges, [float(pointer[index]) for index in range(count)])
 
     def wants_reset(self) -> bool:
         """Return whether the second button went down since the last call."""
         buttons = self._buttons()
         before, self._pressed = self._pressed, bool(len(buttons) > 1 and buttons[1])
         return self._pressed and not before
-
-    def _axes(self) -> Sequence[float]:
-        pointer, count = self._joystick.get_joystick_axes(0)
-        return [float(pointer[index]) for index in range(count)]
 
     def _buttons(self) -> Sequence[int]:
         pointer, count = self._joystick.get_joystick_buttons(0)

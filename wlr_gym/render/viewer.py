@@ -145,7 +145,10 @@ class Viewer:
         stage.pose(truth, parameters, row)
         if self._window is None:
             self._window = self._open(stage.model, stage.data, self._on_key)
-            self._aim_first(stage)
+            start, eye = CAMERAS[self.view.camera], self._window.cam
+            eye.type = mujoco.mjtCamera.mjCAMERA_FREE
+            eye.distance, eye.elevation = 1.2 * magnification(self.robot) * start.distance, np.degrees(start.elevation)
+            eye.azimuth = np.degrees(start.azimuth + (stage.yaw() if start.turns else 0.0))
         if not self._window.is_running():
             return False
         with self._window.lock():
@@ -166,10 +169,3 @@ class Viewer:
         if self._window is not None:
             self._window.close()
         self._window = None
-
-    def _aim_first(self, stage: Stage) -> None:
-        assert self._window is not None
-        start, eye = CAMERAS[self.view.camera], self._window.cam
-        eye.type = mujoco.mjtCamera.mjCAMERA_FREE
-        eye.distance, eye.elevation = 1.2 * magnification(self.robot) * start.distance, np.degrees(start.elevation)
-        eye.azimuth = np.degrees(start.azimuth + (stage.yaw() if start.turns else 0.0))

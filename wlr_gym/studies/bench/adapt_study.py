@@ -118,7 +118,9 @@ def run_adapt_study(study: AdaptStudy, say: Say = print) -> list[dict[str, Any]]
         InputError: a folder that cannot be written to, or one of a study of another size.
     """
     make_output_folder(study.out)
-    _check_size(study)
+    size = {"drives": study.drives, "seconds": study.seconds, "steps": study.steps, "episodes": study.episodes}
+    size |= {"excitations": list(study.excitations), "budget_runs": study.budget_runs}
+    keep_request(study.out / "size.json", size)
     there = read_lines(study.out / LINES_FILE)
     for case, contender in _order(study, there):
         began = time.monotonic()
@@ -150,13 +152,6 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
             raise InputError(f"{path}, line {number}: expected case, contender and errors")
         found.append(line)
     return found
-
-
-def _check_size(study: AdaptStudy) -> None:
-    """Refuse to add to a study of another size."""
-    size = {"drives": study.drives, "seconds": study.seconds, "steps": study.steps, "episodes": study.episodes}
-    size |= {"excitations": list(study.excitations), "budget_runs": study.budget_runs}
-    keep_request(study.out / "size.json", size)
 
 
 def _order(study: AdaptStudy, lines: Sequence[Mapping[str, Any]]) -> Iterator[tuple[AdaptCase, str]]:
@@ -261,7 +256,6 @@ def _wide(study: AdaptStudy, own: Robot) -> str:
 
 
 def _ours(progress: Progress, robot: EmulatedRobot, own: Robot) -> tuple[str, dict[str, Any]]:
-    """Return the policy that ``wlr adapt`` keeps."""
     decided, found = find_uncertainty(progress, robot, own)
     said: dict[str, Any] = {"verdict": "" if decided.result is None else decided.result.verdict}
     said |= {"found": [dict(one.content()) for one in found.patch.effects] if found is not None else []}
@@ -302,13 +296,8 @@ def calibration_alone(decided: Decided, data: Path) -> Result:
     calibration = {}
     for quantity, value, half in zip(problem.quantities, found.model.quantities, half_widths(problem, found), strict=False):
         interval = [value - half, value + half] if math.isfinite(half) else None
-        calibration[quantity.name] = {
-            "nominal": quantity.nominal,
-            "fitted": float(value),
-            "unit": quantity.unit,
-            "sigma": quantity.sigma,
-            "ci95": interval,
-        }
+        known = {"nominal": quantity.nominal, "fitted": float(value), "unit": quantity.unit, "sigma": quantity.sigma}
+        calibration[quantity.name] = known | {"ci95": interval}
     content = decided.result.model_dump(mode="json")
     content |= {"verdict": "nothing_missing", "effects": [], "evidence": [], "thresholds": [], "calibration": calibration}
     return Result.model_validate(content)

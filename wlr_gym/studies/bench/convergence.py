@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,18 +61,11 @@ def measure_convergence(size: Size) -> list[Deviation]:
 
 
 def _case(case: str, count: int, ticks: int, size: Size) -> list[Deviation]:
-    setpoints = _goals(case, ticks, count)
-
-    def travel(step: float, sweeps: int, precision: str = "float64") -> Array:
-        return _travel(case, setpoints, step, sweeps, precision)
-
-    found: list[Deviation] = []
+    travel = partial(_travel, case, _goals(case, ticks, count))
     reference = travel(REFERENCE_STEP if not size.quick else 1e-4, REFERENCE_SWEEPS)
-    for step in STEPS:
-        found.append(_deviation(case, "step", step, travel(step, SWEEPS) - reference))
+    found = [_deviation(case, "step", step, travel(step, SWEEPS) - reference) for step in STEPS]
     exact = travel(1e-3, MANY_SWEEPS)
-    for sweeps in SWEEP_COUNTS:
-        found.append(_deviation(case, "sweeps", sweeps, travel(1e-3, sweeps) - exact))
+    found += [_deviation(case, "sweeps", sweeps, travel(1e-3, sweeps) - exact) for sweeps in SWEEP_COUNTS]
     rounding = travel(1e-3, SWEEPS, "float32") - travel(1e-3, SWEEPS)
     return [*found, _deviation(case, "precision", "float32", rounding)]
 
@@ -99,7 +93,7 @@ def _pose(rng: np.random.Generator, count: int) -> Array:
     return np.c_[np.pi / 2 + rng.uniform(-0.3, 0.3, (count, 4)), rng.uniform(-6.0, 6.0, (count, 4))]
 
 
-def _travel(case: str, setpoints: list[Array], step: float, sweeps: int, precision: str) -> Array:
+def _travel(case: str, setpoints: list[Array], step: float, sweeps: int, precision: str = "float64") -> Array:
     """Return how far the body of every robot moved (N, 3)."""
     robot, count = load_robot(), len(setpoints[0])
     parameters = Parameters.nominal(robot, count)

@@ -54,7 +54,6 @@ FIRST_SEED = 9200
 NULL_EVERY = 6
 CASES = len(NAMED) + len(NAMED) // NULL_EVERY
 LINES_FILE = "decide.json"
-_MODULE = "wlr_gym.studies.bench.decide_study"
 
 Line = Mapping[str, Any]
 Say = Callable[[str], object]
@@ -173,13 +172,14 @@ def run_decide_study(
             raise unknown_name("contender", name, CONTENDERS)
     for folder in ("", "lines", "work"):
         make_output_folder(out / folder)
-    keep_request(out / "study.json", _request())
+    request = {"first_seed": FIRST_SEED, "severity": SEVERITY, "further": FURTHER, "start": list(START), "eight": list(EIGHT)}
+    keep_request(out / "study.json", request)
     asked = [(one, contender) for one in cases(count) for contender in dict.fromkeys(contenders)]
     left = {f"{one.name}_{contender}": (one, contender) for one, contender in asked if not _is_done(out, one, contender)}
-    jobs = [
-        Job(name, _MODULE, {"out": str(out.resolve()), "index": one.seed - FIRST_SEED, "contender": contender}, _log(out, name))
-        for name, (one, contender) in left.items()
-    ]
+    jobs = []
+    for name, (one, contender) in left.items():
+        task = {"out": str(out.resolve()), "index": one.seed - FIRST_SEED, "contender": contender}
+        jobs.append(Job(name, "wlr_gym.studies.bench.decide_study", task, str((out / "work" / f"{name}.log").resolve())))
     begin = time.monotonic()
     for done, ended in enumerate(spread(jobs, processes), 1):
         file = _file(out, *left[ended.name])
@@ -192,17 +192,8 @@ def run_decide_study(
     return lines
 
 
-def _request() -> dict[str, Any]:
-    """What makes robots and runs."""
-    return {"first_seed": FIRST_SEED, "severity": SEVERITY, "further": FURTHER, "start": list(START), "eight": list(EIGHT)}
-
-
 def _file(out: Path, one: DecideCase, contender: str) -> Path:
     return out / "lines" / f"{one.name}_{contender}.json"
-
-
-def _log(out: Path, name: str) -> str:
-    return str((out / "work" / f"{name}.log").resolve())
 
 
 def _is_done(out: Path, one: DecideCase, contender: str) -> bool:

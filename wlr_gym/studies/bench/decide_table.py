@@ -40,7 +40,7 @@ def markdown(lines: Sequence[Line]) -> str:
 def _row(name: str, lines: Sequence[Line]) -> str:
     hiding, nulls = [one for one in lines if one["hidden"]], [one for one in lines if not one["hidden"]]
     right = at_least(sum(one["right"] for one in hiding), len(hiding))
-    wrong = at_most(sum(map(_decided_wrongly, hiding)), len(hiding))
+    wrong = at_most(sum(one["ended"] == "decided" and not one["right"] for one in hiding), len(hiding))
     driving = sum(one.get("seconds", 0.0) for one in hiding)
     cells = (
         CONTENDERS[name],
@@ -52,10 +52,6 @@ def _row(name: str, lines: Sequence[Line]) -> str:
         str(sum(bool(one["found"]) for one in nulls)),
     )
     return f"| {' | '.join(cells)} |"
-
-
-def _decided_wrongly(one: Line) -> bool:
-    return one["ended"] == "decided" and not one["right"]
 
 
 def _pair(lines: Sequence[Line], other: str) -> str:

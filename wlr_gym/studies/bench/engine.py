@@ -204,8 +204,12 @@ def make_reference(
     chosen: list[BenchMotion], engine: tuple[float, float] = ENGINE_LIMIT, peer: tuple[float, float] = MUJOCO_LIMIT
 ) -> Reference:
     """Return the mean of the limits of both simulators; both are of first order in the step, which is halved once."""
-    coarse, fine = (_drive(_engine_plant(chosen, step), chosen) for step in engine)
-    peer_coarse, peer_fine = (_drive(_mujoco_limit_plant(chosen, step), chosen) for step in peer)
+    options = [PlantOptions(physics_step=step, sensor_noise=False) for step in (*engine, *peer)]
+    engines = [GibbsAppellPlant(load_robot(), len(chosen), one, sweeps=8) for one in options[:2]]
+    peers = [MujocoPlant(load_robot(), len(chosen), one) for one in options[2:]]
+    for plant in peers:  # less virtual mass at the contacts, whose push off the floor grows as the step shrinks
+        plant._batch.divide_virtual_mass(VIRTUAL_MASS_DIVISOR)
+    coarse, fine, peer_coarse, peer_fine = (_drive(plant, chosen) for plant in (*engines, *peers))
     ours, theirs = _extrapolated(coarse, fine), _extrapolated(peer_coarse, peer_fine)
     hip, pose = _hip(), _unit(0.5 * (ours + theirs))
     convergence = np.maximum(distance(fine, ours, hip), distance(peer_fine, theirs, hip))
@@ -226,17 +230,6 @@ def _extrapolated(coarse: Array, fine: Array) -> Array:
 def _unit(pose: Array) -> Array:
     pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
     return pose
-
-
-def _engine_plant(chosen: list[BenchMotion], step: float) -> Plant:
-    return GibbsAppellPlant(load_robot(), len(chosen), PlantOptions(physics_step=step, sensor_noise=False), sweeps=8)
-
-
-def _mujoco_limit_plant(chosen: list[BenchMotion], step: float) -> Plant:
-    """The MuJoCo plant with less virtual mass at its contacts, whose push off the floor grows as the step shrinks."""
-    plant = MujocoPlant(load_robot(), len(chosen), PlantOptions(physics_step=step, sensor_noise=False))
-    plant._batch.divide_virtual_mass(VIRTUAL_MASS_DIVISOR)
-    return plant
 
 
 def _drive(plant: Plant, chosen: list[BenchMotion]) -> Array:

@@ -205,12 +205,11 @@ def _ring_poses(tilt: float, count: int) -> tuple[Array, dict[str, Array]]:
             if found is not None:
                 # the method knows nothing of the height of the markers over the body's origin; held against the plate's middle
                 plate_middle = pose.position + pose.rotation[:, 2] * body.positions[0, 2]
-                paper[", legs at home" if home else ", legs moved"].append(
-                    pose_error(found, ScenePose(plate_middle, pose.rotation))
-                )
-    lost = [error for error in ours if not np.isfinite(error).all()]
+                error = pose_error(found, ScenePose(plate_middle, pose.rotation))
+                paper[", legs at home" if home else ", legs moved"].append(error)
+    lost = sum(not np.isfinite(error).all() for error in ours)
     if lost:
-        raise RuntimeError(f"{len(lost)} of {len(ours)} poses were not found at tilt {tilt:g} rad")
+        raise RuntimeError(f"{lost} of {len(ours)} poses were not found at tilt {tilt:g} rad")
     return np.array(ours), {name: np.array(errors) for name, errors in paper.items()}
 
 
@@ -302,8 +301,5 @@ def measure_drive(drive: FilmedDrive) -> list[VisionResult]:
         what = f"{drive.name}: accumulated {name} slip (up to {largest[axis]:.0f} mm)"
         for when, apart in (("worst wheel and time", error[:, :, axis]), ("worst wheel, end", error[-1, :, axis])):
             lines.append(VisionResult(f"{what}, {when}", "ours", float(apart.max()), "mm", 1.0, count=len(samples)))
-    late = 1e3 * abs(found.offset - TRUE_OFFSET)
-    return [
-        *lines,
-        VisionResult(f"{drive.name}: clock offset (± {1e3 * found.std:.1f})", "ours", late, "ms", 2.0, count=len(samples)),
-    ]
+    late, what = 1e3 * abs(found.offset - TRUE_OFFSET), f"{drive.name}: clock offset (± {1e3 * found.std:.1f})"
+    return [*lines, VisionResult(what, "ours", late, "ms", 2.0, count=len(samples))]

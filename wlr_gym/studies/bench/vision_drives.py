@@ -15,12 +15,13 @@ from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.perception.markers.targets import Target
-from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, plate_facet, robot_facets
+from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, plate_facet
 from wlr_gym.perception.vision.tracking import VideoFrame
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
+from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
+from wlr_gym.studies.bench.vision_scenes import shown_robot
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,10 @@ def paper_test(number: int, robot: Robot) -> FilmedDrive:
     low, high = math.radians(30), math.radians(150)
     start = [low] * 4 if number == 1 else [low, low, high, high]
     end = [low, low, high, high] if number == 1 else [high, high, low, low]
-    parameters = _paper_parameters(robot)
+    profile = Profile(wheel_acceleration=PAPER_ACCELERATION, leg_velocity=PAPER_LEG_SPEED)
+    parameters = profile_parameters(Parameters.nominal(robot), profile)
+    parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.3
+    parameters["servo.coulomb_friction"][:, 6:] = 0.07, 0.03
     ramp = PAPER_SPEED / PAPER_ACCELERATION
     stop = _REST + (8 * math.pi - PAPER_SPEED * ramp) / PAPER_SPEED + ramp
 
@@ -110,14 +114,6 @@ def lab_drive(robot: Robot, speed: float, spin: float, friction: float, seconds:
     return _drive("lab drive", robot, parameters, [math.pi / 2] * 4, setpoints, seconds, np.ones(8, bool), -0.15)
 
 
-def _paper_parameters(robot: Robot) -> Parameters:
-    profile = Profile(wheel_acceleration=PAPER_ACCELERATION, leg_velocity=PAPER_LEG_SPEED)
-    parameters = profile_parameters(Parameters.nominal(robot), profile)
-    parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.3
-    parameters["servo.coulomb_friction"][:, 6:] = 0.07, 0.03
-    return parameters
-
-
 def _drive(
     name: str,
     robot: Robot,
@@ -132,7 +128,11 @@ def _drive(
     from scipy.spatial.transform import Rotation
 
     plant = make_plant("gibbs_appell", robot, 1, PlantOptions(control_period=TICK, physics_step=0.001))
-    sensors = plant.reset(np.array([7], np.uint64), parameters, state=_start(robot, parameters, legs, x))
+    state = standing_state(robot, parameters, legs[0])  # sin is the same for all legs, so the body is level
+    state.joint_position[:, LEG_SLICE] = legs
+    state.reference_position[:, LEG_SLICE] = legs
+    state.position[:, 0] = x
+    sensors = plant.reset(np.array([7], np.uint64), parameters, state=state)
     for _ in range(int(_SETTLING / TICK)):
         leg_setpoints, wheel_setpoints = setpoints(0.0)
         sensors = plant.step(np.array([[*leg_setpoints, *wheel_setpoints]]), torque_on[None])
@@ -159,14 +159,6 @@ def _drive(
     return FilmedDrive(name, run, robot, time, found[:, :3], turns, found[:, 7:], slips)
 
 
-def _start(robot: Robot, parameters: Parameters, legs: list[float], x: float) -> PlantState:
-    state = standing_state(robot, parameters, legs[0])  # sin is the same for all legs, so the body is level
-    state.joint_position[:, LEG_SLICE] = legs
-    state.reference_position[:, LEG_SLICE] = legs
-    state.position[:, 0] = x
-    return state
-
-
 def film(
     drive: FilmedDrive,
     renderer: Renderer,
@@ -190,7 +182,8 @@ def film(
     shifts = exposure * ((np.arange(instants) + 0.5) / instants - 0.5)
     for index in range(int((drive.time[-1] - 2 * phase) * rate)):
         time = phase + index / rate
-        moving = [[*_robot_at(drive, time + shift, body), *(occluder(time) if occluder else [])] for shift in shifts]
+        shown = [shown_robot(drive.robot, plate_facet(body), pose_at(drive, time + shift)) for shift in shifts]
+        moving = [[*robot, *(occluder(time) if occluder else [])] for robot in shown]
         yield VideoFrame(index, time - offset, renderer.frame(moving, look, seed + index))
 
 
@@ -203,12 +196,6 @@ def pose_at(drive: FilmedDrive, time: float) -> ScenePose:
     turn = Slerp([0, 1], Rotation.from_matrix(drive.rotation[k : k + 2]))(part).as_matrix()
     position, legs = ((1 - part) * a[k] + part * a[k + 1] for a in (drive.position, drive.legs))
     return ScenePose(position, turn, legs)
-
-
-def _robot_at(drive: FilmedDrive, time: float, body: Target) -> list[Facet]:
-    pose = pose_at(drive, time)
-    facets = [*robot_facets(drive.robot, pose.legs), plate_facet(body)]
-    return [facet.moved(pose.position, pose.rotation) for facet in facets]
 
 
 def true_slip(drive: FilmedDrive, at: Array) -> Array:

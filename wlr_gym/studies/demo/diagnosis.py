@@ -132,14 +132,10 @@ def _held_out(gap: GapEntry | None) -> str:
 
 def _of_the_report(heldout: Sequence[RunGapEntry]) -> str:
     """Return the gap report's table of the held-out runs."""
-    rows = [
-        (
-            one.run,
-            *(error(_number(value)) for value in (one.before, one.calibrated, one.after)),
-            percent(_number(one.reduction)),
-        )
-        for one in heldout
-    ]
+    rows = []
+    for one in heldout:
+        errors = [error(_number(value)) for value in (one.before, one.calibrated, one.after)]
+        rows.append((one.run, *errors, percent(_number(one.reduction))))
     said = "The runs that no fit has seen: error of the gap report (1 = sensor noise), and what the effects remove of what is "
     said += "above the noise floor."
     return paragraph(said) + table(("held-out run", "as given", "calibrated", "with effects", "removed"), rows, range(1, 5))
@@ -326,26 +322,15 @@ def _revealed(hidden: PatchEffect, found: Sequence[EffectEntry], answer: Diagnos
     named = [plain(one.name) for one in found] or ["nothing"]
     at = [places(one.where) for one in found if one.name == hidden.name] or [places(one.where) for one in found] or ["-"]
     rows = [
-        ("effect", plain(hidden.name), ", ".join(named), _yes(answer.named)),
-        ("place", places(hidden.where), ", ".join(at), _yes(answer.placed)),
+        ("effect", plain(hidden.name), ", ".join(named), "yes" if answer.named else "no"),
+        ("place", places(hidden.where), ", ".join(at), "yes" if answer.placed else "no"),
     ]
     for parameter, (truth, value, low, high) in answer.sizes.items():
         unit = unit_of(EFFECTS[hidden.name].parameters[parameter].unit)
         interval = f" (95 % interval {number(low)} to {number(high)})" if np.isfinite(low) else ""
         inside = "the interval holds it" if low <= truth <= high else "outside the interval"
-        rows.append(
-            (
-                parameter,
-                f"{number(truth)}{unit}",
-                f"{number(value)}{unit}{interval}",
-                f"{round(100.0 * (value / truth - 1.0)):+d} %; {inside}",
-            )
-        )
-    extra = (
-        paragraph(f"Named beside it, but not there: {', '.join(plain(name) for name in answer.extra)}.") if answer.extra else ""
-    )
+        off = f"{round(100.0 * (value / truth - 1.0)):+d} %; {inside}"
+        rows.append((parameter, f"{number(truth)}{unit}", f"{number(value)}{unit}{interval}", off))
+    names = ", ".join(plain(name) for name in answer.extra)
+    extra = paragraph(f"Named beside it, but not there: {names}.") if names else ""
     return table(("", "hidden in the robot", "found by the gap workflow", "right?"), rows) + extra
-
-
-def _yes(right: bool) -> str:
-    return "yes" if right else "no"

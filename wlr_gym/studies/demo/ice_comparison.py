@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
-from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import heading, table
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.gap.report.text import listed, unit_of
 from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
-from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, paragraph, picture
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, filmed, paragraph
 
 TITLE = "2. On ice"
 OURS = "velocity_slip_aware"
@@ -47,6 +47,10 @@ class ScoreColumn:
         """Return a value of the metric, without unit."""
         return f"{self.scale * value:.{self.digits}f}"
 
+    def cell(self, estimate: Estimate) -> str:
+        """Return mean and half of the interval."""
+        return f"{self.text(estimate.mean)} ± {self.text(0.5 * (estimate.high - estimate.low))}"
+
 
 _COLUMNS = (
     ScoreColumn("tracking_error", "tracking error"),
@@ -66,9 +70,6 @@ FLOORS = {
 _WHERE = {MAIN: "on ice", SPLIT: "on split floors"}
 #: The film: astride a line between two frictions, then a turn to the right.
 SCHEDULE = "0:0.1,0; 4:0.1,-0.3"
-PICTURES_PER_SECOND = 10.0
-#: Pixels.
-SIZE = (400, 330)
 
 
 def compare(demo: Demo, tell: Tell) -> Section:
@@ -104,14 +105,8 @@ def _play(demo: Demo, tell: Tell) -> Card:
 
 
 def _table(card: Card, label: str) -> str:
-    rows = [
-        (name, _WHO[name], *(_cell(own[column.key], column) for column in _COLUMNS)) for name, own in card.scores[label].items()
-    ]
+    rows = [(name, _WHO[name], *(one.cell(own[one.key]) for one in _COLUMNS)) for name, own in card.scores[label].items()]
     return table(("policy", "", *(column.heading for column in _COLUMNS)), rows, range(2, 2 + len(_COLUMNS)))
-
-
-def _cell(estimate: Estimate, column: ScoreColumn) -> str:
-    return f"{column.text(estimate.mean)} ± {column.text(0.5 * (estimate.high - estimate.low))}"
 
 
 def falls_short(card: Card) -> list[str]:
@@ -125,12 +120,9 @@ def falls_short(card: Card) -> list[str]:
             better = [column for column in _COLUMNS if own[column.key].high < 0.0]
             said += [f"{where}, {other} has the better {_listed(card, label, (other, OURS), better)}"] if better else []
         blind = card.comparison[label][BLIND]
-        equal = [column for column in _COLUMNS if not blind[column.key].excludes_zero]
-        said += (
-            [f"{where}, {OURS} is not measurably better than {BLIND} in {_listed(card, label, (OURS, BLIND), equal)}"]
-            if equal
-            else []
-        )
+        if equal := [column for column in _COLUMNS if not blind[column.key].excludes_zero]:
+            names = _listed(card, label, (OURS, BLIND), equal)
+            said.append(f"{where}, {OURS} is not measurably better than {BLIND} in {names}")
         failed = 100.0 - card.scores[label][OURS]["success"].mean
         said += [f"{where}, {OURS} fails in {failed:.0f} % of the episodes"] if failed > _MANY else []
     return said
@@ -144,12 +136,9 @@ def _listed(card: Card, label: str, policies: tuple[str, str], columns: Iterable
 
 
 def _against(card: Card, label: str) -> str:
-    others = [f"{name} by {_percent(own['tracking_error'])}" for name, own in card.comparison[label].items()]
+    errors = {name: own["tracking_error"] for name, own in card.comparison[label].items()}
+    others = [f"{name} by {e.mean:.0f} % (95 % interval {e.low:.0f} to {e.high:.0f})" for name, e in errors.items()]
     return f"Paired episode by episode, the tracking error of {OURS} is lower (minus: higher) than that of {'; '.join(others)}."
-
-
-def _percent(better: Estimate) -> str:
-    return f"{better.mean:.0f} % (95 % interval {better.low:.0f} to {better.high:.0f})"
 
 
 def _headline(card: Card) -> str:
@@ -164,30 +153,14 @@ def _lower(better: Estimate) -> str:
 
 
 def _film(demo: Demo, tell: Tell) -> str:
-    from wlr_gym.learning.evaluation.film import Picture, film_beside
-    from wlr_gym.render.view import View
-
-    def watch(pictures: Iterable[Picture], count: int) -> Iterator[Picture]:
+    def watch(pictures: Iterable[Any], count: int) -> Iterator[Any]:
         for index, one in enumerate(pictures):
             tell(f"on ice: film, picture {index + 1} of {count}", 0.5 + 0.5 * index / count)
             yield one
 
-    try:
-        path = film_beside(
-            demo.out / "ice.webp",
-            ENVIRONMENT,
-            [Subject(name, (name,)) for name in (OURS, "pid")],
-            FIRST_SEED + demo.seed,
-            demo.film_seconds,
-            {"randomization": SPLIT, **NO_CAMERA},
-            view=View(size=SIZE, path=True),
-            schedule=SCHEDULE,
-            fps=PICTURES_PER_SECOND,
-            watch=watch,
-        )
-    except InputError as error:
-        return paragraph(f"No film: {error}.")
-    return picture(path, _CAPTION)
+    subjects, floor = [Subject(name, (name,)) for name in (OURS, "pid")], {"randomization": SPLIT, **NO_CAMERA}
+    path = demo.out / "ice.webp"
+    return filmed(path, demo, subjects, demo.film_seconds, floor, _CAPTION, schedule=SCHEDULE, watch=watch)
 
 
 _CAPTION = (

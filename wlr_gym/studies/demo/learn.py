@@ -72,11 +72,8 @@ def train(demo: Demo, tell: Tell) -> Section:
 def behind(reward: float, references: Mapping[str, float]) -> list[str]:
     """Return which references earn more than the new policy, in whole episodes."""
     better = [f"{name} ({value:.2f})" for name, value in references.items() if value > reward]
-    return (
-        [f"in whole episodes, {listed(better)} gets more reward per second than the new policy ({reward:.2f})"]
-        if better
-        else []
-    )
+    said = f"in whole episodes, {listed(better)} gets more reward per second than the new policy ({reward:.2f})"
+    return [said] if better else []
 
 
 @contextmanager
@@ -93,10 +90,8 @@ def _watched(demo: Demo, tell: Tell) -> Iterator[None]:
             except (InputError, IndexError):
                 continue
             reward = f"reward {done['reward_per_second']:.2f} per second"
-            tell(
-                f"training: {done['steps'] / 1e6:.1f} of {demo.steps / 1e6:.1f} million steps, {reward}",
-                0.93 * done["steps"] / demo.steps,
-            )
+            said = f"training: {done['steps'] / 1e6:.1f} of {demo.steps / 1e6:.1f} million steps, {reward}"
+            tell(said, 0.93 * done["steps"] / demo.steps)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

@@ -46,8 +46,7 @@ _DOCS = (
 
 def write_page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> Path:
     """Write the page and return its path."""
-    text = page(demo, sections, interrupted)
-    write_text(demo.page, text)
+    write_text(demo.page, page(demo, sections, interrupted))
     return demo.page
 
 
@@ -56,27 +55,25 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
     worst = max((one.verdict for one in sections), key=_ORDER.index, default=SKIPPED)
     title = "wlr_gym: learn, drive, find what the simulator lacks, train on"
     lines = "".join(_line(one) for one in sections)
+    words = f"{'. '.join(f'{term.capitalize()}: {meaning}' for term, meaning in TERMS.items())}. {_MEASURES}"
     stopped = "<p><b>Stopped before it was over: the page has what was made until then.</b></p>" if interrupted else ""
     header = (
         f'<header>\n<p class="label">wlr demo</p>\n<h1>{escape(title)}</h1>\n</header>\n{stopped}'
         f'<ul style="list-style: none; padding: 0">{lines}</ul>\n{_files(demo)}'
-        f'<p class="small">{escape(_words())}</p>\n<p class="small">{escape(_DOCS)}</p>\n'
+        f'<p class="small">{escape(words)}</p>\n<p class="small">{escape(_DOCS)}</p>\n'
         '<p class="small">Everything here is simulated or emulated; no hardware was driven.</p>'
     )
     footer = (
         f"<footer><p>wlr_gym {escape(__version__)}, seed {demo.seed}: the same seed gives the same numbers on one machine. "
         f"Another hidden fault: <code>wlr demo --seed {demo.seed + 1}</code>.</p></footer>"
     )
-    return document(
-        title, _COLOURS[worst], [header, *(section(one.title, _not_good(one), one.html) for one in sections), footer]
-    )
+    body = [section(one.title, _not_good(one), one.html) for one in sections]
+    return document(title, _COLOURS[worst], [header, *body, footer])
 
 
 def _line(one: Section) -> str:
-    text = escape(one.headline or _WITHOUT[one.verdict])
-    return (
-        f'<li>{_MARKS[one.verdict]} <a href="#{anchor(one.title)}"><b>{escape(one.title)}</b></a> {text}{_not_good(one)}</li>'
-    )
+    title, text = f"<b>{escape(one.title)}</b>", escape(one.headline or _WITHOUT[one.verdict])
+    return f'<li>{_MARKS[one.verdict]} <a href="#{anchor(one.title)}">{title}</a> {text}{_not_good(one)}</li>'
 
 
 def _not_good(one: Section) -> str:
@@ -84,13 +81,8 @@ def _not_good(one: Section) -> str:
 
 
 def _files(demo: Demo) -> str:
-    """Return links to what lies beside the page."""
     links = [link(demo, demo.out / path, text) for path, text in _FILES.items() if (demo.out / path).exists()]
     return f'<p class="small">Files: {", ".join(links)}.</p>\n' if links else ""
-
-
-def _words() -> str:
-    return f"{'. '.join(f'{term.capitalize()}: {meaning}' for term, meaning in TERMS.items())}. {_MEASURES}"
 
 
 _WITHOUT = {SHOWN: "", NOT_SHOWN: "Not shown.", SKIPPED: "Left out.", FAILED: "Failed."}

@@ -10,10 +10,10 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import commands, table
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.gap.report.text import listed, places, plain
-from wlr_gym.learning.evaluation import FIRST_SEED, Subject
+from wlr_gym.learning.evaluation import Subject
 from wlr_gym.studies.demo.hidden_fault import POLICY
 from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
-from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell, paragraph, picture
+from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell, filmed, paragraph
 
 if TYPE_CHECKING:
     from wlr_gym.learning.adaptation.plan import Progress
@@ -23,9 +23,6 @@ TITLE = "6. What training on wins back"
 OLD, NEW = "old policy", "trained on"
 #: The film: drive on, turn both ways, stop.
 SCHEDULE = "0:0.1,0; 1:0.1,-0.4; 3:0.1,0.4; 5:0,0"
-PICTURES_PER_SECOND = 10.0
-#: Pixels.
-SIZE = (400, 330)
 #: Shares of the stage: training, driving with the fault and without it; the film is the rest.
 _TRAINING, _DRIVING, _WITHOUT = 0.5, 0.2, 0.1
 
@@ -157,28 +154,14 @@ def _episodes(numbers: dict[str, Any]) -> str:
 
 def _film(demo: Demo, hidden: Any, numbers: dict[str, Any], tell: Tell) -> str:
     from wlr_gym.learning.adaptation.retraining import TRAINING
-    from wlr_gym.learning.evaluation.film import film_beside
-    from wlr_gym.render.view import View
 
     sources = ((OLD, POLICY, "old"), (NEW, str(demo.adapted / TRAINING / "policy"), "new"))
     fault = listed([f"{plain(one.name)}, {places(one.where)}" for one in hidden.effects])
     tell("film: the old policy beside the new one", _TRAINING + _DRIVING + _WITHOUT)
-    try:
-        path = film_beside(
-            demo.out / "trained_on.webp",
-            ENVIRONMENT,
-            [Subject(f"{name}: tracking error {_mean(numbers[key]):.3f}", (source,)) for name, source, key in sources],
-            FIRST_SEED + demo.seed,
-            0.5 * demo.film_seconds,
-            {"randomization": "none", "effects": hidden, **having(())},
-            view=View(size=SIZE, path=True),
-            schedule=SCHEDULE,
-            title=f"fault: {fault}",
-            fps=PICTURES_PER_SECOND,
-        )
-    except InputError as error:
-        return paragraph(f"No film: {error}.")
-    return picture(path, _CAPTION)
+    subjects = [Subject(f"{name}: tracking error {_mean(numbers[key]):.3f}", (source,)) for name, source, key in sources]
+    path, robot = demo.out / "trained_on.webp", {"randomization": "none", "effects": hidden, **having(())}
+    options = {"schedule": SCHEDULE, "title": f"fault: {fault}"}
+    return filmed(path, demo, subjects, 0.5 * demo.film_seconds, robot, _CAPTION, **options)
 
 
 _CAPTION = (

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.plots import save
-from wlr_gym.studies.demo.settings import Demo
+from wlr_gym.studies.demo.settings import ENVIRONMENT, Demo
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from wlr_gym.learning.evaluation import Subject
 
 #: Told of what is going on and of the share of the stage that is done.
 Tell = Callable[[str, float], None]
@@ -77,6 +80,32 @@ def picture(path: Path, caption: str) -> str:
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     source = f"data:{_MEDIA[path.suffix]};base64,{data}"
     return f'<figure><img alt="{escape(path.stem)}" src="{source}"><figcaption>{escape(caption)}</figcaption></figure>'
+
+
+def filmed(
+    path: Path,
+    demo: Demo,
+    subjects: Sequence[Subject],
+    seconds: float,
+    keywords: Mapping[str, Any],
+    caption: str,
+    **options: Any,
+) -> str:
+    """Film two subjects beside each other and return the film for the page, or why there is none.
+
+    Args:
+        path, subjects, seconds, keywords, options: of :func:`wlr_gym.learning.evaluation.film.film_beside`. caption: below it.
+    """
+    from wlr_gym.learning.evaluation.conditions import FIRST_SEED
+    from wlr_gym.learning.evaluation.film import film_beside
+    from wlr_gym.render.view import View
+
+    view = View(size=(400, 330), path=True)
+    try:
+        film_beside(path, ENVIRONMENT, subjects, FIRST_SEED + demo.seed, seconds, keywords, view=view, fps=10.0, **options)
+    except InputError as error:
+        return paragraph(f"No film: {error}.")
+    return picture(path, caption)
 
 
 def drawn(figure: Figure, path: Path, caption: str) -> str:

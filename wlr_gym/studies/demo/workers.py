@@ -66,7 +66,13 @@ def run_workers(demo: Demo, tell: TellWorker) -> Outcome:
     try:
         while running:
             try:
-                _take(inbox, running, found, tell)
+                worker, message = inbox.get()
+                if message is None:
+                    running.pop(worker).wait()
+                elif "section" in message:
+                    found[worker].append(Section(**message["section"]))
+                elif "text" in message:
+                    tell(worker, message["text"], message["share"])
             except KeyboardInterrupt:
                 interrupted = True
                 _interrupt(running)
@@ -88,22 +94,6 @@ def _start(worker: str, demo: Demo, inbox: queue.Queue[Any]) -> Any:
 
     threading.Thread(target=read, daemon=True).start()
     return process
-
-
-def _take(
-    inbox: queue.Queue[tuple[str, dict[str, Any] | None]],
-    running: dict[str, Any],
-    found: dict[str, list[Section]],
-    tell: TellWorker,
-) -> None:
-    """Take one message of a worker."""
-    worker, message = inbox.get()
-    if message is None:
-        running.pop(worker).wait()
-    elif "section" in message:
-        found[worker].append(Section(**message["section"]))
-    elif "text" in message:
-        tell(worker, message["text"], message["share"])
 
 
 def _interrupt(running: Mapping[str, Any]) -> None:

@@ -93,10 +93,7 @@ def _slip_error(test: str, paper: float) -> Callable[[PaperEvidence], tuple[str,
 
 
 def _wording(e: PaperEvidence) -> tuple[str, str]:
-    return (
-        "abstract: error of neglecting slip; conclusion: of a constant slip coefficient. One number cannot be both",
-        FAILS,
-    )
+    return "abstract: error of neglecting slip; conclusion: of a constant slip coefficient. One number cannot be both", FAILS
 
 
 def _lateral(e: PaperEvidence) -> tuple[str, str]:
@@ -152,10 +149,8 @@ def _centre_of_mass(e: PaperEvidence) -> tuple[str, str]:
     labels = ("centre of mass 3 cm back", "drag", "centre of mass 3 cm ahead")
     errors = [100 * e.variant_error("test_1", label) for label in labels]
     at_centre_least = abs(errors[1]) < min(abs(errors[0]), abs(errors[2]))
-    return (
-        f"first test, 3 cm back, centred, 3 cm ahead: {errors[0]:.1f}, {errors[1]:.1f}, {errors[2]:.1f} %",
-        _graded(at_centre_least),
-    )
+    said = f"first test, 3 cm back, centred, 3 cm ahead: {errors[0]:.1f}, {errors[1]:.1f}, {errors[2]:.1f} %"
+    return said, _graded(at_centre_least)
 
 
 def _coefficient(e: PaperEvidence) -> tuple[str, str]:
@@ -194,10 +189,8 @@ def _rear_stops(e: PaperEvidence) -> tuple[str, str]:
     record = e.plant["test_2"]
     at = _after(record, 6.5)
     speed = float(record.joint_velocity[at, 0, 6]) * _RPM
-    return (
-        f"{speed:.1f} rpm at 6.5 s; they stop with the front wheels at {duration():.1f} s",
-        _graded(abs(speed) < 1.0),
-    )
+    said = f"{speed:.1f} rpm at 6.5 s; they stop with the front wheels at {duration():.1f} s"
+    return said, _graded(abs(speed) < 1.0)
 
 
 def _legs_stop(e: PaperEvidence) -> tuple[str, str]:
@@ -287,10 +280,8 @@ def _heavier(e: PaperEvidence) -> tuple[str, str]:
 def _grip(e: PaperEvidence) -> tuple[str, str]:
     errors = [100 * e.variant_error("test_1", label) for label in ("mu 0.3", "drag", "mu 0.9")]
     less = abs(errors[2]) < abs(errors[1]) < abs(errors[0])
-    return (
-        f"first test with drag, mu 0.3, 0.6, 0.9: {errors[0]:.1f}, {errors[1]:.1f}, {errors[2]:.1f} %",
-        _graded(less),
-    )
+    said = f"first test with drag, mu 0.3, 0.6, 0.9: {errors[0]:.1f}, {errors[1]:.1f}, {errors[2]:.1f} %"
+    return said, _graded(less)
 
 
 def _oversteer(e: PaperEvidence) -> tuple[str, str]:
@@ -321,44 +312,29 @@ def _fewer(e: PaperEvidence) -> tuple[str, str]:
 
 CLAIMS: tuple[Claim, ...] = (
     Claim(
-        1,
-        "ignoring slip gives an error, first test",
-        "11.5 %",
-        "error within 1.5 points, either sign",
+        1, "ignoring slip gives an error, first test", "11.5 %", "error within 1.5 points, either sign",
         _slip_error("test_1", 11.5),
     ),
     Claim(2, "the same, second test", "5 %", "the same", _slip_error("test_2", 5.0)),
     Claim(3, "the error is that of neglecting slip", "-", "one of the two is meant", _wording),
     Claim(4, "lateral displacement", "1.1 and 5.2 cm", "both within 5 mm", _lateral),
     Claim(
-        5,
-        "first test: lateral displacement at the beginning, when the wheels slip",
-        "-",
-        "half of it in the first third of the path; partly: front axle below a quarter of the weight",
-        _early_drift,
+        5, "first test: lateral displacement at the beginning, when the wheels slip", "-",
+        "half of it in the first third of the path; partly: front axle below a quarter of the weight", _early_drift,
     ),
     Claim(
-        6,
-        "second test: large lateral displacement at the end of the path",
-        "-",
-        "half of it in the last third of the path",
+        6, "second test: large lateral displacement at the end of the path", "-", "half of it in the last third of the path",
         _late_drift,
     ),
     Claim(
-        7,
-        "posture strongly changes slip",
-        "-",
-        "first test's error over three times the second's, and a point",
+        7, "posture strongly changes slip", "-", "first test's error over three times the second's, and a point",
         _posture_and_slip,
     ),
     Claim(8, "equipment at the body's centre reduces slip", "-", "least error when centred", _centre_of_mass),
     Claim(9, "leg angles reduce the friction coefficient", "-", "mu depends on the legs", _coefficient),
     Claim(
-        10,
-        "four wheel turns; 18.32 rpm, 214.58 rev/min2, 3.44 rpm",
-        "4 turns",
-        "every wheel within 0.05 of four turns; partly: the front ones",
-        _four_turns,
+        10, "four wheel turns; 18.32 rpm, 214.58 rev/min2, 3.44 rpm", "4 turns",
+        "every wheel within 0.05 of four turns; partly: the front ones", _four_turns,
     ),
     Claim(11, "rear wheel speed grows with the body's", "-", "grows, never backwards; partly: grows", _rear_speed),
     Claim(12, "second test: motors 5 and 8 stop when the legs are done", "0", "below 1 rpm at 6.5 s", _rear_stops),
@@ -367,10 +343,7 @@ CLAIMS: tuple[Claim, ...] = (
         14, "leg torque falls as the body stabilises", "-", "less at the end than at the start; partly: one axle", _leg_torque
     ),
     Claim(
-        15,
-        "a small torque on the free rear wheels from legs and surface",
-        "small",
-        "below 2 % of the stall torque",
+        15, "a small torque on the free rear wheels from legs and surface", "small", "below 2 % of the stall torque",
         _free_wheel_torque,
     ),
     Claim(16, "wheel motors need little torque", "small", "below 5 % of the stall torque", _wheel_torque),
@@ -385,4 +358,4 @@ CLAIMS: tuple[Claim, ...] = (
     ),
     Claim(24, "motors stay within Table II", "7.3 / 1.5 N m, 66 / 61 rpm", "below stall torque and 12 V speed", _limits),
     Claim(25, "Gibbs-Appell needs fewer equations: twelve independent coordinates", "12", "twelve are independent", _fewer),
-)
+)  # fmt: skip

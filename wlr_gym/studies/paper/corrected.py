@@ -180,14 +180,6 @@ eq18_generalised_force = printed.eq18_generalised_force
 # ---- equations of motion ---------------------------------------------------------------------------------------------
 
 
-def _k1(c: PaperConstants) -> Value:
-    return (c.lam * c.m_l + c.m_w) * c.l
-
-
-def _k2(c: PaperConstants) -> Value:
-    return (c.lam**2 * c.m_l + c.m_w) * c.l**2
-
-
 def _leg_torque(c: PaperConstants, s: State, f: Forces, right: str, left: str) -> Value:
     """(19), (20): sum of both hip motors of an axle, N m: inertia, gravity, normal forces and traction.
 
@@ -195,7 +187,7 @@ def _leg_torque(c: PaperConstants, s: State, f: Forces, right: str, left: str) -
     """
     phi, _, _ = s.absolute_leg(right)
     angle, _, leg_dd = s.leg(right)
-    k1, k2, sigma = _k1(c), _k2(c), ahead(right)
+    k1, k2, sigma = (c.lam * c.m_l + c.m_w) * c.l, (c.lam**2 * c.m_l + c.m_w) * c.l**2, ahead(right)
     about_hip = 2 * (c.I_ly + k2 + c.I_o)
     a_x, _, a_z = eq11_acceleration_of_the_body(s)
     inertia = (
@@ -247,10 +239,15 @@ eq27_force_on_the_right_rear_wheel = partial(_longitudinal_force, wheel="rr")
 eq28_force_on_the_left_rear_wheel = partial(_longitudinal_force, wheel="lr")
 
 
-def lateral_balance(c: PaperConstants, s: State) -> tuple[Value, Value]:
-    """Inertia in the rows of y and yaw: the force to the left and the moment about the vertical that the floor must give."""
+def _lateral(c: PaperConstants, s: State, f: Forces) -> tuple[Value, Value]:
+    """Inertia in the rows of y and yaw: the force to the left and the moment about the vertical that the floor must give.
+
+    The moment of the forces along the wheels, x_i at y_i: -y_i x_i, is taken off.
+    """
     _, a_y, _ = eq11_acceleration_of_the_body(s)
-    force, moment = c.M_G * a_y, body_yaw_moment(c, s)
+    inertia = c.I_Gx * sin(s.psi) ** 2 + c.I_Gz * cos(s.psi) ** 2
+    of_body = inertia * s.yaw_dd + 2 * (c.I_Gx - c.I_Gz) * sin(s.psi) * cos(s.psi) * s.psi_d * s.yaw_d  # dS_3/dtheta''
+    force, moment = c.M_G * a_y, of_body
     for wheel in WHEELS:
         for mass, distance in ((c.m_l, c.lam * c.l), (c.m_w, c.l)):
             p_x, p_y, _ = point_acceleration(c, s, wheel, distance)
@@ -260,13 +257,7 @@ def lateral_balance(c: PaperConstants, s: State) -> tuple[Value, Value]:
         phi, phi_d, _ = s.absolute_leg(wheel)
         inertia = c.I_along * sin(phi) ** 2 + c.I_lx * cos(phi) ** 2 + c.I_t
         moment = moment + inertia * s.yaw_dd + 2 * along * sin(phi) * cos(phi) * phi_d * s.yaw_d
-    return force, moment
-
-
-def body_yaw_moment(c: PaperConstants, s: State) -> Value:
-    """dS_3/dtheta'': moment that the platform's own inertia takes, N m."""
-    inertia = c.I_Gx * sin(s.psi) ** 2 + c.I_Gz * cos(s.psi) ** 2
-    return inertia * s.yaw_dd + 2 * (c.I_Gx - c.I_Gz) * sin(s.psi) * cos(s.psi) * s.psi_d * s.yaw_d
+    return force, moment - sum(to_the_right(wheel) * c.l_y / 2 * f.x[wheel] for wheel in WHEELS)
 
 
 def eq29_lateral_force_in_front(c: PaperConstants, s: State, f: Forces) -> Value:
@@ -279,9 +270,3 @@ def eq30_lateral_force_behind(c: PaperConstants, s: State, f: Forces) -> Value:
     """(30): on both rear wheels, likewise."""
     force, moment = _lateral(c, s, f)
     return (lever(c, s, "rf") * force - moment) / wheelbase(c, s)
-
-
-def _lateral(c: PaperConstants, s: State, f: Forces) -> tuple[Value, Value]:
-    """Balance with the moment of the forces along the wheels, x_i at y_i: -y_i x_i, taken off."""
-    force, moment = lateral_balance(c, s)
-    return force, moment - sum(to_the_right(wheel) * c.l_y / 2 * f.x[wheel] for wheel in WHEELS)

@@ -30,13 +30,6 @@ def _with(name: str, where: Sequence[str], **parameters: float) -> dict[str, obj
     return {"name": name, "where": list(where), "parameters": parameters}
 
 
-_AXLES = (("wheel_lr", "wheel_rr"), ("wheel_lf", "wheel_rf"))
-
-
-def _unequal(left: str, right: str) -> Patch:
-    return load_patch([_with("wheel_radius_error", [wheel], scale=scale) for wheel, scale in ((left, 0.95), (right, 1.05))])
-
-
 #: Robots of the side experiments: label -> patch. "drag" is what each of the others is compared with.
 VARIANTS: Mapping[str, Patch] = {
     "drag": load_patch(_drag()),
@@ -82,7 +75,11 @@ def gather(robot: Robot, plant: Mapping[str, Record], threads: int = 1) -> Paper
     nominal = Parameters.nominal(robot)
     rows = Parameters(np.concatenate([apply_patch(patch, nominal).values for patch in VARIANTS.values()]))
     variants = {name: drive("gibbs_appell", test, robot, rows, threads=threads) for name, test in TESTS.items()}
-    uneven = Parameters(np.concatenate([apply_patch(_unequal(*axle), nominal).values for axle in _AXLES]))
+    unequal = [
+        load_patch([_with("wheel_radius_error", [left], scale=0.95), _with("wheel_radius_error", [right], scale=1.05)])
+        for left, right in (("wheel_lr", "wheel_rr"), ("wheel_lf", "wheel_rf"))
+    ]
+    uneven = Parameters(np.concatenate([apply_patch(patch, nominal).values for patch in unequal]))
     yaw = []
     for rear_driven in (False, True):
         record = drive("gibbs_appell", replace(_STRAIGHT, rear_driven=rear_driven), robot, uneven, threads=threads)

@@ -51,8 +51,6 @@ AFTER = 1.0
 #: :data:`wlr_gym.physics.plants.BACKENDS`.
 REDUCED = "reduced"
 MODELS = (REDUCED, *SIMULATORS, *REAL)
-#: One motor of each pair of legs, and all wheels.
-PAIRS = [0, 2, 4, 5, 6, 7]
 
 
 @dataclass(frozen=True)
@@ -311,7 +309,9 @@ def _drive_reduced(tests: list[PaperTest], robot: Robot, parameters: Parameters,
     """All tests side by side, one block of robots each: a batch costs hardly more than one robot."""
     count, blocks = len(parameters), len(tests)
     model = reduced.ReducedModel(robot, Parameters(np.tile(parameters.values, (blocks, 1))), step)
-    setpoints = np.concatenate([np.repeat(test.motion().setpoints[:, None, PAIRS], count, axis=1) for test in tests], axis=1)
+    setpoints = np.concatenate(
+        [np.repeat(test.motion().setpoints[:, None, reduced.PAIRS], count, axis=1) for test in tests], axis=1
+    )
     starts = np.repeat([test.start for test in tests], count, axis=0)
     rows, path, last = [], np.zeros((count * blocks, 4, 2)), np.zeros((count * blocks, 4, 2))
     state = model.standing(*starts.T)

@@ -25,9 +25,9 @@ from wlr_gym.studies.paper.slip_search import SearchFinding
 Array = NDArray[np.float64]
 
 _STYLES: dict[str, dict[str, Any]] = {
-    REDUCED: {"color": ORANGE, "linewidth": 2.4, "alpha": 0.7},
-    "gibbs_appell": {"color": BLUE, "linewidth": 1.2},
-    "mujoco": {"color": "black", "linewidth": 1.0, "linestyle": (0, (4, 3))},
+    REDUCED: {"label": "reduced model", "color": ORANGE, "linewidth": 2.4, "alpha": 0.7},
+    "gibbs_appell": {"label": "Gibbs-Appell", "color": BLUE, "linewidth": 1.2},
+    "mujoco": {"label": "MuJoCo", "color": "black", "linewidth": 1.0, "linestyle": (0, (4, 3))},
 }
 _IDEAL: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
 #: s; what is before, the robot settling on its legs, is not drawn.
@@ -49,7 +49,7 @@ Series = Callable[[Record], Array]
 
 
 def _style(model: str) -> dict[str, Any]:
-    return _STYLES.get(model, {"color": GREEN, "linewidth": 1.0})
+    return _STYLES.get(model, {"label": model, "color": GREEN, "linewidth": 1.0})
 
 
 def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[Figure, Panels]:
@@ -75,13 +75,9 @@ def _over_time(figure: Figure, axes: Panels) -> Figure:
 def _draw(axes: Axes, records: Sequence[Record], series: Series, title: str, label: str) -> None:
     for record in records:
         shown = record.time > _FROM
-        axes.plot(record.time[shown], series(record)[shown], label=_label(record.model), **_style(record.model))
+        axes.plot(record.time[shown], series(record)[shown], **_style(record.model))
     axes.set_title(title, fontsize=9)
     axes.set_ylabel(label)
-
-
-def _label(model: str) -> str:
-    return {REDUCED: "reduced model", "gibbs_appell": "Gibbs-Appell", "mujoco": "MuJoCo"}.get(model, model)
 
 
 def _draw_ideal(axes: Axes, ideal: IdealMotion, values: Array) -> None:
@@ -140,14 +136,11 @@ def torque_figure(records: Sequence[Record], ideal: IdealMotion, measured: FromM
                 continue
             right = measured.right.leg_torque[:, k] / 2 if row == 0 else measured.right.wheel_torque[:, joint - 4]
             as_printed = measured.leg_torque_printed[:, k] / 2 if row == 0 else measured.wheel_torque_printed[:, joint - 4]
-            axes[row, k].plot(
-                source.time,
-                right,
-                color=WINE,
-                linewidth=0.8,
-                label="corrected (19)-(24) from the motion: behind the gears",
-            )
-            axes[row, k].plot(source.time, as_printed, color=GREEN, linewidth=0.8, label="printed (19)-(24)")
+            for values, colour, label in (
+                (right, WINE, "corrected (19)-(24) from the motion: behind the gears"),
+                (as_printed, GREEN, "printed (19)-(24)"),
+            ):
+                axes[row, k].plot(source.time, values, color=colour, linewidth=0.8, label=label)
     return _over_time(figure, axes)
 
 
@@ -168,9 +161,8 @@ def body_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
         _draw(axes[2, k], records, lambda r, j=k: np.degrees(r.attitude[:, 0, j]), "", f"{name} (degrees)")
     for panel in (axes[0, 1], axes[2, 0], axes[2, 2], axes[1, 1]):
         low, high = panel.get_ylim()
-        least = 0.5
-        if high - low < 2 * least:
-            panel.set_ylim(-least, least)  # numerical noise is not to be blown up
+        if high - low < 1.0:
+            panel.set_ylim(-0.5, 0.5)  # numerical noise is not to be blown up
     return _over_time(figure, axes)
 
 
@@ -186,7 +178,7 @@ def path_figure(records: Sequence[Record], variants: Mapping[str, Array], test: 
     figure.set_size_inches(8.5, 4.2)
     panel = axes[0, 0]
     for record in records:
-        panel.plot(record.position[:, 0, 0], 100 * record.position[:, 0, 1], label=_label(record.model), **_style(record.model))
+        panel.plot(record.position[:, 0, 0], 100 * record.position[:, 0, 1], **_style(record.model))
     for (label, path), colour in zip(variants.items(), _UNEVEN, strict=True):
         panel.plot(path[:, 0], 100 * path[:, 1], linewidth=1.4, color=colour, label=f"Gibbs-Appell, {label}")
     for sign in (1, -1):
@@ -200,10 +192,8 @@ def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
     """Slip velocity and accumulated slip of the left wheels, and normal forces beside (16) and (17)."""
     figure, axes = _panels(f"{ideal.test.title}: slip of the wheels, and load on them", 3, 2, 2.1)
     s = ideal.state()
-    static = (
-        printed.eq16_normal_force_in_front(ideal.constants, s),
-        printed.eq17_normal_force_behind(ideal.constants, s),
-    )
+    c = ideal.constants
+    static = printed.eq16_normal_force_in_front(c, s), printed.eq17_normal_force_behind(c, s)
     for k, (wheel, title) in enumerate(((0, "left front"), (2, "left rear"))):
         _draw(axes[0, k], records, lambda r, j=wheel: 1e3 * r.slip[:, 0, j, 0], f"{title} wheel", "longitudinal slip (mm/s)")
         _draw(axes[1, k], records, lambda r, j=wheel: 1e3 * r.slip_path[:, 0, j, 0], "", "accumulated slip (mm)")

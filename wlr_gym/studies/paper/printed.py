@@ -128,15 +128,9 @@ def eq14_coulomb_friction(mu: Value, f_n: Value, velocity: Value) -> Value:
 
 def eq15_dissipation(c: PaperConstants, s: State, f_nf: Value, f_nr: Value) -> Value:
     """(15), whose bracket after mu_dx is never closed: it would take the lateral part in, times mu_dx."""
-    return c.mu_dx * (_along(s, f_nf, f_nr) + 2 * c.mu_dy * _across(s, f_nf, f_nr))
-
-
-def _along(s: State, f_nf: Value, f_nr: Value) -> Value:
-    return sum((f_nf if is_front(w) else f_nr) * s.x_s_d[w] * sign(s.x_s_d[w]) for w in WHEELS)
-
-
-def _across(s: State, f_nf: Value, f_nr: Value) -> Value:
-    return f_nf * s.y_f_d * sign(s.y_f_d) + f_nr * s.y_r_d * sign(s.y_r_d)
+    along = sum((f_nf if is_front(w) else f_nr) * s.x_s_d[w] * sign(s.x_s_d[w]) for w in WHEELS)
+    across = f_nf * s.y_f_d * sign(s.y_f_d) + f_nr * s.y_r_d * sign(s.y_r_d)
+    return c.mu_dx * (along + 2 * c.mu_dy * across)
 
 
 def _squared(vector: Vector) -> Value:

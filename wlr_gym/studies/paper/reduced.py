@@ -30,10 +30,10 @@ Array = NDArray[np.float64]
 
 VX, VY, YAW, VZ, PITCH, FRONT, REAR = range(7)  # indices of u11; the wheels follow
 _WHEELS = slice(7, 11)
-#: Columns of u9 in u11, and where legs and wheels stand in u9.
+#: Columns of u9 in u11.
 _KEPT = [VX, VY, YAW, FRONT, REAR, 7, 8, 9, 10]
-_LEGS9 = slice(3, 5)
-_WHEELS9 = slice(5, 9)
+#: One motor of each pair of legs, and all wheels.
+PAIRS = [0, 2, 4, 5, 6, 7]
 #: The paper's wheels in the order lf, rf, lr, rr.
 ORDER = {"lf": 0, "rf": 1, "lr": 2, "rr": 3}
 #: Of the corners lf, rf, lr, rr: ahead, to the left, and which leg.
@@ -299,19 +299,18 @@ class ReducedModel:
         self.step, self.constants = step, constants_of(parameters)
         self.parameters = parameters
         nominal = robot.servo.supply_voltage
-        pair = [0, 2, 4, 5, 6, 7]  # one leg of each axle, all wheels
         self._many = many = np.array([2.0, 2.0, 1.0, 1.0, 1.0, 1.0])
         self._constant, self._resistance = servo.motor_constants(
-            parameters["servo.stall_torque"][:, pair], parameters["servo.no_load_speed"][:, pair], nominal
+            parameters["servo.stall_torque"][:, PAIRS], parameters["servo.no_load_speed"][:, PAIRS], nominal
         )
-        self._kp, self._kd = servo.position_gains(parameters)[:, pair], parameters["servo.kd"][:, pair]
+        self._kp, self._kd = servo.position_gains(parameters)[:, PAIRS], parameters["servo.kd"][:, PAIRS]
         self._supply = parameters["servo.supply_voltage"][:, None]
-        self._viscous = many * parameters["servo.viscous_friction"][:, pair]
-        self._dry = many * parameters["servo.coulomb_friction"][:, pair]
+        self._viscous = many * parameters["servo.viscous_friction"][:, PAIRS]
+        self._dry = many * parameters["servo.coulomb_friction"][:, PAIRS]
         velocity, acceleration = servo.profile_limits(
             parameters["servo.profile_velocity"], parameters["servo.profile_acceleration"]
         )
-        self._speed, self._ramp = velocity[:, pair], acceleration[:, pair]
+        self._speed, self._ramp = velocity[:, PAIRS], acceleration[:, PAIRS]
         self._radius = parameters["wheel.radius"]
         self._mu = np.stack([parameters["ground.mu_x"], parameters["ground.mu_y"]], axis=2)
 
@@ -367,8 +366,8 @@ class ReducedModel:
         half, (vx, vy, w) = 0.5 * self.step, state.u.T[:3]
         yaw = state.pose[:, 2] + 0.5 * half * w
         state.pose += half * np.stack([vx * np.cos(yaw) - vy * np.sin(yaw), vx * np.sin(yaw) + vy * np.cos(yaw), w], axis=1)
-        state.legs += half * state.u[:, _LEGS9]
-        state.wheels += half * state.u[:, _WHEELS9]
+        state.legs += half * state.u[:, 3:5]
+        state.wheels += half * state.u[:, 5:]
 
     def _motors(self, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Torque at rest (N, 6) and implicit damping (N, 6) of both motors of a leg pair and of each wheel's."""

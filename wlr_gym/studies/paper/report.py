@@ -119,8 +119,7 @@ def write_report(
     if findings:
         lines += ["## What could explain the paper's slip", "", *question_lines(findings, decisive), ""]
     lines += ["## Equations", "", *verdict_table()]
-    text = "\n".join(lines) + "\n"
-    write_text(folder / "report.md", text)
+    write_text(folder / "report.md", "\n".join(lines) + "\n")
 
 
 def _ends_table(robot: Robot, records: Records) -> list[str]:

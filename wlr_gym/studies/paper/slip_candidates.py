@@ -14,13 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
-from wlr_gym.robot import Robot
+from wlr_gym.robot import LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
-
-#: Floor: the paper gives no coefficient; every draw has one of its own.
-FLOOR = (0.3, 0.9)
 
 
 @dataclass(frozen=True)
@@ -91,7 +88,6 @@ def _each(effect: str, parameter: str, places: Sequence[str], low: float, high: 
 _FRONT = ("wheel_lf", "wheel_rf")
 _REAR = ("wheel_lr", "wheel_rr")
 _ALL = (*_FRONT, *_REAR)
-_PAIRWISE = ("leg_lf", "leg_rf", "leg_lr", "leg_rr")
 CANDIDATES: tuple[SlipCandidate, ...] = (
     SlipCandidate(
         "rear drag", "gears of the free rear wheels, each its own", _each("coulomb_friction", "torque", _REAR, 0.0, 0.2)
@@ -102,7 +98,7 @@ CANDIDATES: tuple[SlipCandidate, ...] = (
     SlipCandidate(
         "rolling", "rolling resistance, each wheel its own", _each("rolling_resistance", "coefficient", _ALL, 0.0, 0.15)
     ),
-    SlipCandidate("zeros", "zeros of the leg encoders", _each("joint_zero_offset", "angle", _PAIRWISE, -0.1, 0.1)),
+    SlipCandidate("zeros", "zeros of the leg encoders", _each("joint_zero_offset", "angle", LEGS, -0.1, 0.1)),
     SlipCandidate(
         "load",
         "centre of mass, and the power source that the paper's 3 kg leave out",
@@ -140,7 +136,14 @@ CANDIDATES: tuple[SlipCandidate, ...] = (
         ),
     ),
 )
-FLOOR_DIAL = Dial("friction_level", ("ground",), "mu", *FLOOR)
+#: The paper gives no coefficient of the floor; every draw has one of its own.
+FLOOR_DIAL = Dial("friction_level", ("ground",), "mu", 0.3, 0.9)
+
+
+def scaled(dials: Sequence[Dial], unit: Array) -> Array:
+    """Return values of dials (N, dials) for numbers from 0 (low) to 1 (high)."""
+    low, high = (np.array([getattr(dial, end) for dial in dials]) for end in ("low", "high"))
+    return low + unit * (high - low)
 
 
 def make_parameters(robot: Robot, dials: Sequence[Dial], values: Array) -> Parameters:

@@ -11,7 +11,7 @@ from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import no_slip_error
 from wlr_gym.studies.paper.experiments import TESTS, PaperTest, Record, drive, no_slip_travel, select
-from wlr_gym.studies.paper.slip_candidates import CANDIDATES, PaperReading, make_parameters
+from wlr_gym.studies.paper.slip_candidates import CANDIDATES, PaperReading, make_parameters, scaled
 
 Array = NDArray[np.float64]
 
@@ -84,8 +84,7 @@ def measure(robot: Robot, parameters: Parameters, test: PaperTest, threads: int 
 def _everything(robot: Robot) -> Parameters:
     """One robot with every dial of every candidate a tenth on its way."""
     dials = [dial for candidate in CANDIDATES for dial in candidate.dials]
-    low, high = (np.array([[getattr(dial, end) for dial in dials]]) for end in ("low", "high"))
-    return make_parameters(robot, dials, low + 0.1 * (high - low))
+    return make_parameters(robot, dials, scaled(dials, np.full((1, len(dials)), 0.1)))
 
 
 def _seen_by_camera(record: Record, parameters: Parameters) -> tuple[Array, Array]:

@@ -27,6 +27,7 @@ from wlr_gym.studies.paper.slip_candidates import (
     PaperReading,
     SlipCandidate,
     make_parameters,
+    scaled,
 )
 from wlr_gym.studies.paper.slip_outcomes import Outcomes, measure, outcomes
 
@@ -192,12 +193,12 @@ class _Trial:
 
     def finding(self) -> SearchFinding:
         """Return all there is so far."""
-        return SearchFinding(self.names, self.dials, _scaled(self.dials, self.seen), _joined(self.parts))
+        return SearchFinding(self.names, self.dials, scaled(self.dials, self.seen), _joined(self.parts))
 
 
 def _drive_all(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
     """Drive the waiting draws of all trials in one batch."""
-    rows = [make_parameters(robot, trial.dials, _scaled(trial.dials, trial.waiting)).values for trial in trials]
+    rows = [make_parameters(robot, trial.dials, scaled(trial.dials, trial.waiting)).values for trial in trials]
     every = outcomes(robot, Parameters(np.concatenate(rows)), threads, exact=False)
     ends = np.cumsum([len(trial.waiting) for trial in trials])
     for trial, end in zip(trials, ends, strict=True):
@@ -220,7 +221,7 @@ def _drive_again(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
     if not any(map(len, near)):
         return
     rows = [
-        make_parameters(robot, trial.dials, _scaled(trial.dials, trial.seen[rows])).values
+        make_parameters(robot, trial.dials, scaled(trial.dials, trial.seen[rows])).values
         for trial, rows in zip(trials, near, strict=True)
         if len(rows)
     ]
@@ -229,11 +230,6 @@ def _drive_again(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
         for name, values in vars(found).items():
             values[rows] = getattr(exact, name)[start : start + len(rows)]
         trial.parts, start = [found], start + len(rows)
-
-
-def _scaled(dials: Sequence[Dial], unit: Array) -> Array:
-    low, high = (np.array([getattr(dial, end) for dial in dials]) for end in ("low", "high"))
-    return low + unit * (high - low)
 
 
 def _joined(parts: Sequence[Outcomes]) -> Outcomes:
