@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -146,11 +146,8 @@ def _id_of(bare: Any) -> str:
 def _driven(bare: Any, env_id: str, network: torch.nn.Module) -> NDArray[np.float32]:
     """Return observations (M, D) of robots that the network drives."""
     source = (bare.spec and bare.spec.kwargs.get("definition")) or task_source_of(env_id)
-    core = Core(source, bare.core.settings, ROBOTS)
-    try:
+    with closing(Core(source, bare.core.settings, ROBOTS)) as core:
         return seen_observations(core, ModulePolicy(network), SECONDS)
-    finally:
-        core.close()
 
 
 def _check(network: _Whole, width: int, actions: int) -> None:

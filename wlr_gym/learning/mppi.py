@@ -8,7 +8,7 @@ setting ``knows`` has it plan for a nominal robot or a nominal floor instead: wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -98,7 +98,8 @@ class Mppi:
         self._owner = np.repeat(np.arange(core.count), self.config.samples)
         self._imagined = _imagined(core, len(self._owner))
         self._nominal = Parameters.nominal(core.task.robot).values
-        self._known = known_parameters(self.config.knows)
+        floor = np.array([name.startswith(("ground.", "patch.")) for name in ELEMENTS])
+        self._known = np.where(floor, "floor" in self.config.knows, "robot" in self.config.knows)
         knots = -(-self.config.horizon // self.config.hold)
         self._plan = np.zeros((core.count, knots, len(JOINTS)))
         self._noise = np.full(len(JOINTS), self.config.leg_noise)
@@ -168,11 +169,6 @@ class Mppi:
 def make_planner(contract: Mapping[str, Any], config: Mapping[str, Any]) -> Mppi:
     """Return the planner for an environment's contract: the ``make_policy`` of its agents."""
     return Mppi(contract, parse_settings(config, contract["task"]))
-
-
-def known_parameters(knows: Collection[str]) -> NDArray[np.bool_]:
-    """Return which columns (P,) of the parameter table belong to what is known: ``robot``, ``floor``."""
-    return np.array([("floor" if name.startswith(("ground.", "patch.")) else "robot") in knows for name in ELEMENTS])
 
 
 def _imagined(core: Core, count: int) -> Core:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,7 +91,9 @@ def adapt(
     """
     require_package("torch", "train")
     require_package("onnxscript", "export")
-    chosen = environment or _environment(policy)
+    if not environment and str(policy) in agent_names():
+        raise InputError(f"'{policy}' is an agent: expected a policy that PPO trained, such as velocity_slip_aware")
+    chosen = environment or trained_environment(policy) or "WLR-Velocity-v0"
     own = load_robot(robot if robot is not None else policy_environment(policy).get("robot") or "nominal")
     patch = load_patch(effects)
     if backend not in SIMULATORS:
@@ -134,17 +137,6 @@ def adapt(
         return run_steps(progress, driven, own)
 
 
-def _environment(policy: str | Path) -> str:
-    """Return the environment that a policy was trained in.
-
-    Raises:
-        InputError: nothing that can be trained on.
-    """
-    if str(policy) in agent_names():
-        raise InputError(f"'{policy}' is an agent: expected a policy that PPO trained, such as velocity_slip_aware")
-    return trained_environment(policy) or "WLR-Velocity-v0"
-
-
 def _fitting(policy: str | Path, environment: str, own: Robot) -> str:
     """Return the robot's fingerprint; refuse a policy that does not fit the environment, before anything is driven."""
     from wlr_gym.learning.evaluation.rollout import make_core
@@ -156,11 +148,8 @@ def _fitting(policy: str | Path, environment: str, own: Robot) -> str:
     trained = trained_environment(policy)
     if trained is not None and task_name_of(trained) != task_name_of(environment):
         raise InputError(f"--env {environment}: '{policy}' was made for another environment, {trained}; leave --env out")
-    core = make_core(environment, 1, environment_for(policy, {"robot": own}))
-    try:
+    with closing(make_core(environment, 1, environment_for(policy, {"robot": own}))) as core:
         make_policy(str(policy), core.contract())
-    finally:
-        core.close()
     return robot_hash(own)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -188,11 +189,8 @@ def trained_policy(progress: Progress) -> str:
 def export_trained(progress: Progress) -> str:
     """Write the trained policy as one file, which runs without torch, and return its path."""
     source, path = trained_policy(progress), progress.out / POLICY_FILE
-    core = make_core(progress.asked.environment, EXPORT_ROBOTS, policy_environment(source))
-    try:
+    with closing(make_core(progress.asked.environment, EXPORT_ROBOTS, policy_environment(source))) as core:
         seen = seen_observations(core, make_policy(source, core.contract()), EXPORT_SECONDS)
-    finally:
-        core.close()
     export_policy(source, path, seen)
     return str(path)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -100,11 +101,8 @@ def excite_robot(robot: AdaptedRobot, motion: Motion, data: Path, seed: int = 0)
     Raises:
         KeyboardInterrupt: somebody stopped the drive; its run is removed.
     """
-    plant, _ = robot.start(data, seed, meta_of(motion, robot.robot))
-    try:
+    with closing(robot.start(data, seed, meta_of(motion, robot.robot))[0]) as plant:
         drive = drive_robot(plant, motion)
-    finally:
-        plant.close()
     if interrupted(drive.reason):
         if drive.run is not None:
             drive.run.unlink(missing_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,10 @@ def stopped_episodes(policy: str, environment: str, keywords: Mapping[str, Any],
         episodes: N. seed: of the first one; the others count up from it.
     """
     core, player = make_player(environment, policy, episodes, keywords)
-    try:
+    with closing(core):
         watched = _Watched(core)
         roll_out(core, player, seed, on_tick=watched.look)
         return watched.stopped
-    finally:
-        core.close()
 
 
 def may_stop_more(new: NDArray[np.bool_], old: NDArray[np.bool_]) -> bool:

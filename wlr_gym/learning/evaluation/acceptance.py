@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.envs.tasks.task_config import read_task
 from wlr_gym.learning.evaluation.card import MAIN
-from wlr_gym.learning.evaluation.scoring import evaluate, randomization_said
+from wlr_gym.learning.evaluation.scoring import Tell, evaluate, randomization_said
 from wlr_gym.learning.evaluation.subjects import Source, identity, read_subjects
 from wlr_gym.learning.evaluation.sweeps import FLOORS
 from wlr_gym.policy import policy_environment, shipped_names, trained_environment
@@ -36,8 +36,6 @@ PRECISION = "float32"
 #: Name of the file, and its version.
 ACCEPTANCE_FILE = "acceptance.json"
 FORMAT = 1
-
-Tell = Callable[[str, float], object]
 
 
 @dataclass(frozen=True)

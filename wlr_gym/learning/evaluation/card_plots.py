@@ -110,25 +110,20 @@ def _draw_subject(axes: Axes, card: Card, sweep: Sweep, metric: Metric, name: st
 
 def improvements(card: Card) -> Figure:
     """Draw by how much the first subject is better than each baseline that achieves something, in %, with intervals."""
-    metrics = [m for m in card.metrics if m.key not in (*BY_DIFFERENCE, *UNDRAWN) and _comparable(card, m)]
     others = _rivals(card)
+    better = [card.comparison[MAIN][name] for name in others]
+    drawn = [m for m in card.metrics if m.key not in (*BY_DIFFERENCE, *UNDRAWN)]
+    metrics = [m for m in drawn if any(np.isfinite(own[m.key].mean) for own in better)]
     figure = new_figure(9.0, 0.9 + 0.12 * len(metrics) * (len(others) + 1))
     axes = figure.subplots()
     height = 0.8 / len(others)
     for rank, name in enumerate(others):
-        estimates = [card.comparison[MAIN][name][metric.key] for metric in metrics]
+        estimates = [better[rank][metric.key] for metric in metrics]
         y = np.arange(len(metrics)) + (rank - (len(others) - 1) / 2) * height
         mean = np.array([e.mean for e in estimates])
         ends = np.maximum(0.0, np.array([[e.mean - e.low, e.high - e.mean] for e in estimates]).T)
-        axes.barh(
-            y,
-            mean,
-            height=0.9 * height,
-            xerr=ends,
-            color=_style(card, name)["color"],
-            label=f"against {name}",
-            error_kw={"linewidth": 1},
-        )
+        style = {"color": _style(card, name)["color"], "label": f"against {name}", "error_kw": {"linewidth": 1}}
+        axes.barh(y, mean, height=0.9 * height, xerr=ends, **style)
     axes.axvline(0.0, color="black", linewidth=1)
     axes.set_yticks(range(len(metrics)), [metric.key.replace("_", " ") for metric in metrics])
     axes.set_ylim(len(metrics) - 0.5, -0.5)
@@ -158,10 +153,6 @@ def pareto(card: Card) -> Figure:
 
 def _rivals(card: Card) -> list[str]:
     return [name for name in card.names[1:] if name not in REFERENCES]
-
-
-def _comparable(card: Card, metric: Metric) -> bool:
-    return any(np.isfinite(card.comparison[MAIN][name][metric.key].mean) for name in _rivals(card))
 
 
 def spectra(card: Card) -> Figure:

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 FIRST_SEED = 100_000
 #: Distance between the first seeds of two blocks of episodes.
 BLOCK = 10_000
-#: One environment step on MuJoCo takes as long as so many on the engine: for the progress bar only.
-TICK_COST = {"mujoco": 40}
 
 
 @dataclass(frozen=True)
@@ -54,8 +52,8 @@ class Condition:
 
     @property
     def cost(self) -> int:
-        """Relative cost of an environment step of all episodes of a block."""
-        return self.episodes * TICK_COST.get(str(self.keywords.get("backend")), 1)
+        """Relative cost of an environment step of all episodes of a block, for the progress bar only."""
+        return self.episodes * (40 if self.keywords.get("backend") == "mujoco" else 1)
 
 
 #: condition -> subject -> what is kept.

@@ -15,9 +15,8 @@ from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task_config import having
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
-from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, work
-from wlr_gym.learning.evaluation.rollout import Rollout
-from wlr_gym.learning.evaluation.subjects import Source, Subject, common_robot, identity, read_subjects
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, Watch, play, work
+from wlr_gym.learning.evaluation.subjects import Source, common_robot, identity, read_subjects
 from wlr_gym.learning.evaluation.sweeps import read_sweep
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.policy import make_policy, trained_environment
@@ -31,7 +30,6 @@ SWEEP_EPISODES = 64
 OTHER_EPISODES = 64
 
 Tell = Callable[[str, float], object]
-Watch = Callable[[Condition, Subject, int, Rollout], object]
 
 
 def evaluate(
@@ -134,7 +132,6 @@ def randomization_said(given: Any) -> str | dict[str, Any]:
 
 
 def _named(robot: RobotSource | None) -> str:
-    """Return a robot's name and fingerprint."""
     if robot is None:
         return "the task's"
     loaded = load_robot(robot)

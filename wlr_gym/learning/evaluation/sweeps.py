@@ -80,24 +80,12 @@ def _paper_sweep(front: tuple[float, float], rear: tuple[float, float]) -> dict[
 PAPER_LEGS = {"test 1": ((30.0, 30.0), (30.0, 150.0)), "test 2": ((30.0, 150.0), (150.0, 30.0))}
 #: In the order of the command ``path_shape``: below 1, below 2, above.
 SHAPES = ("line", "S-curve", "circle")
-#: Friction coefficients of an even floor.
-FRICTION = (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)
 #: Friction coefficient under the left wheels of split floors.
 LEFT_FRICTION = 0.25
-#: Friction under the right wheels over it. Beyond about 2 a robot standing square cannot turn: see docs/physics.md.
-SPLIT_RATIO = (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
 #: Friction coefficient of the slopes.
 SLOPE_FRICTION = 0.4
-#: Degrees by which the slopes stay below its limit.
-DEGREES_BELOW_LIMIT = (10.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
-#: Friction coefficients of slopes near their limit.
-GRIP_FRICTION = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7)
-#: Degrees by which these stay below their limits.
+#: Degrees by which slopes of any friction stay below their limits.
 GRIP_DEGREES = 2.0
-#: s.
-DELAY = (0.0, 0.01, 0.02, 0.04, 0.06)
-#: kg.
-PAYLOAD = (0.0, 0.25, 0.5, 1.0, 2.0)
 #: m, body frame: ahead, to the left and above the middle, so that the wheels carry unequal loads.
 PAYLOAD_PLACE = {"payload.position[x]": 0.05, "payload.position[y]": 0.03, "payload.position[z]": 0.05}
 #: No training and no choice of a setting has seen the last two.
@@ -108,21 +96,22 @@ SWEEPS: dict[str, Sweep] = {
     for sweep in (
         Sweep(
             "friction", "friction coefficient of the floor", "the same friction everywhere, from ice to rubber",
-            tuple(Point(f"{mu:g}", mu, _even_floor(mu)) for mu in FRICTION),
+            tuple(Point(f"{mu:g}", mu, _even_floor(mu)) for mu in (0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0)),
             tasks=("velocity", "path", "posture"),
         ),
         Sweep(
             "slope", f"slope below the friction limit (degrees; friction {SLOPE_FRICTION:g})",
             "ever closer to the steepest slope that friction can hold, atan(mu)",
             tuple(
-                Point(f"{degrees:g}", degrees, _degrees_below_limit(SLOPE_FRICTION, degrees)) for degrees in DEGREES_BELOW_LIMIT
+                Point(f"{degrees:g}", degrees, _degrees_below_limit(SLOPE_FRICTION, degrees))
+                for degrees in (10.0, 6.0, 4.0, 3.0, 2.0, 1.5, 1.0, 0.5)
             ),
             tasks=("slope",),
         ),
         Sweep(
             "grip", f"friction coefficient (slope {GRIP_DEGREES:g} degrees below atan of it)",
             "slopes near the friction limit, from ice to rubber",
-            tuple(Point(f"{mu:g}", mu, _degrees_below_limit(mu, GRIP_DEGREES)) for mu in GRIP_FRICTION),
+            tuple(Point(f"{mu:g}", mu, _degrees_below_limit(mu, GRIP_DEGREES)) for mu in (0.1, 0.15, 0.2, 0.3, 0.45, 0.7)),
             tasks=("slope",),
         ),
         Sweep(
@@ -130,7 +119,8 @@ SWEEPS: dict[str, Sweep] = {
             "astride a line along the start heading, ever more friction right of it (randomization split)",
             tuple(
                 Point(f"{ratio:g}", ratio, {**_even_floor(ratio * LEFT_FRICTION), "patch.mu[patch_1]": LEFT_FRICTION}, "split")
-                for ratio in SPLIT_RATIO
+                # Beyond about 2 a robot standing square cannot turn: see docs/physics.md.
+                for ratio in (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
             ),
             tasks=("velocity", "path"),
         ),
@@ -151,11 +141,11 @@ SWEEPS: dict[str, Sweep] = {
         ),
         Sweep(
             "latency", "delay of every command (s)", "commands act this much later than written",
-            tuple(Point(f"{delay:g}", delay, {"command.delay": delay}) for delay in DELAY),
+            tuple(Point(f"{delay:g}", delay, {"command.delay": delay}) for delay in (0.0, 0.01, 0.02, 0.04, 0.06)),
         ),
         Sweep(
             "payload", "payload (kg)", "a mass on the body, off its middle",
-            tuple(Point(f"{mass:g}", mass, {"payload.mass": mass, **PAYLOAD_PLACE}) for mass in PAYLOAD),
+            tuple(Point(f"{mass:g}", mass, {"payload.mass": mass, **PAYLOAD_PLACE}) for mass in (0.0, 0.25, 0.5, 1.0, 2.0)),
         ),
     )
 }  # fmt: skip

@@ -9,6 +9,7 @@ much of each limit of the task's success is reached; a fall counts like errors o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,16 +57,13 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
         if name not in tunable:
             raise unknown_name("setting", name, tunable, f"agent '{agent}': search.steps")
     episodes = general.search.episodes
-    core = make_core(training.environment, episodes, config.get("environment", {}))
-    try:
+    with closing(make_core(training.environment, episodes, config.get("environment", {}))) as core:
         contract = core.contract()
         if not has_limits(measures_of(core)):
             raise InputError(f"agent '{agent}' is tuned by the limits of a task's success, and '{contract['task']}' has none")
         start = task_settings(model, contract, config, agent)
         with output_folder(training.folder), progress(Console(), shown=training.progress) as tell:
             best, score = search(core, make_policy, start, partial(tell, ""))
-    finally:
-        core.close()
     settings = {"environment": training.environment, "agent": agent, "settings": config}
     record_provenance(training.folder, settings, start.seed)
     folder = training.folder / "policy"

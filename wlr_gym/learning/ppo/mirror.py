@@ -18,7 +18,6 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.envs.tasks.describe import column_name
-from wlr_gym.learning.ppo.config import PpoConfig
 
 #: Terms whose numbers have no direction, whatever their labels say.
 _UNSIGNED = ("_sigma", "effective_friction", "_quality", "_age", "_present", "_is_new", "friction_demand")
@@ -110,13 +109,6 @@ class MirroredBuffer(_MirroredSamples, RolloutBuffer):
 
 class MirroredDictBuffer(_MirroredSamples, DictRolloutBuffer):
     """For observations in groups."""
-
-
-def mirrored_samples(config: PpoConfig, *, asymmetric: bool) -> dict[str, Any]:
-    """Return the keywords of PPO that choose the buffer of samples."""
-    if not config.mirror:
-        return {}
-    return {"rollout_buffer_class": MirroredDictBuffer if asymmetric else MirroredBuffer}
 
 
 def set_mirror(buffer: Any, env: Sb3VecEnv) -> None:

@@ -29,11 +29,10 @@ from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo import checkpoint
 from wlr_gym.learning.ppo.config import PpoConfig
 from wlr_gym.learning.ppo.curve import Meter, losses
-from wlr_gym.learning.ppo.fine_tuning import start_from
-from wlr_gym.learning.ppo.mirror import mirrored_samples, set_mirror
+from wlr_gym.learning.ppo.mirror import MirroredBuffer, MirroredDictBuffer, set_mirror
 from wlr_gym.learning.ppo.policy import parse_settings, policy_class, policy_keywords, with_network_of
 from wlr_gym.learning.ppo.training_log import TrainingLog
-from wlr_gym.learning.ppo.warm_start import gather_scales, imitate
+from wlr_gym.learning.ppo.warm_start import gather_scales, imitate, start_from
 from wlr_gym.policy import Training, TrainingProgress
 
 #: Factor by which an adapting learning rate changes after an update, and where it stays.
@@ -83,7 +82,6 @@ def torch_threads(count: int) -> Iterator[None]:
 
 
 def _begin(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> None:
-    """Start from nothing, a teacher or a trained policy."""
     if training.resume:
         print(f"{training.folder}: no checkpoint yet; training starts from the beginning", flush=True)
     begin_episodes(model, env, config.seed)
@@ -138,7 +136,7 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
         policy_kwargs=policy_keywords(config, env.contract()),
         seed=config.seed,
         device="cpu",
-        **mirrored_samples(config, asymmetric=asymmetric),
+        rollout_buffer_class=(MirroredDictBuffer if asymmetric else MirroredBuffer) if config.mirror else None,
     )
     with torch.no_grad():
         model.policy.get_parameter("log_std").copy_(torch.tensor(config.initial_log_stds()))
@@ -199,24 +197,18 @@ def _updates(session: Session, stop: StopRequest, show: Callable[[TrainingProgre
             log.save_checkpoint()
         progress = TrainingProgress(training.folder, model.num_timesteps, config.total_steps, row, log.scores)
         show(progress)
-        stopped = _tell(training, progress, log)
+        if training.on_update is not None:
+            try:
+                training.on_update(progress)
+            except BaseException:
+                log.save_checkpoint()
+                raise
+            stopped = progress.stop_requested
 
 
 def crossed(every: int, before: int, now: int) -> bool:
     """Return whether a multiple of ``every`` steps was reached."""
     return now // every > before // every
-
-
-def _tell(training: Training, progress: TrainingProgress, log: TrainingLog) -> bool:
-    """Tell ``on_update`` how far the training is; return whether it asks to stop."""
-    if training.on_update is None:
-        return False
-    try:
-        training.on_update(progress)
-    except BaseException:
-        log.save_checkpoint()
-        raise
-    return progress.stop_requested
 
 
 def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:

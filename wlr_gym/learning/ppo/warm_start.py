@@ -1,11 +1,13 @@
-"""A start from a policy that works: actor and critic imitate it, or the critic alone, and PPO continues from there.
+"""A start from a policy that works: its weights where it was trained before, and a critic that knows how it does.
 
-The policy drives all robots for a while, with noise on its actions so that it is seen to correct errors. The actor
-learns its actions (without the noise), the critic its discounted rewards. Own random numbers: nothing else is shifted.
+What is not known is imitated, the whole policy or the critic alone: the policy drives all robots for a while, with noise on its
+actions so that it is seen to correct errors. The actor learns its actions (without the noise), the critic its discounted
+rewards. Own random numbers: nothing else is shifted.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,13 @@ from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from torch import nn
 
+from wlr_gym.base.errors import require_package
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.learning.ppo.layers import normalisers
-from wlr_gym.policy import Policy, make_policy
+from wlr_gym.learning.ppo.export import LEARNER
+from wlr_gym.learning.ppo.layers import normalisers, scale_residual
+from wlr_gym.learning.ppo.policy import ACTOR, actor, contract_to_start_from, load_actor, parse_settings, saved_weights
+from wlr_gym.policy import Policy, check_contract, find_policy, load_policy, make_policy
 
 #: 1 sigma of the noise on the controller's actions.
 NOISE = 0.03
@@ -55,6 +60,41 @@ def imitate(model: PPO, env: Sb3VecEnv, config: PpoConfig) -> None:
     teacher = make_policy(config.teacher, env.contract())
     observations, actions, returns = _demonstrate(env, teacher, config, env.core.limit)
     _fit(model, observations, torch.as_tensor(actions), torch.as_tensor(returns), config.seed)
+
+
+def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path) -> None:
+    """Put a trained policy into ``model``, so that the finished one would act as it does.
+
+    Where its critic is not known, a critic is fitted; the steps of that count.
+
+    Raises:
+        InputError: a policy that does not fit the environment, naming the first difference.
+    """
+    place, contract = find_policy(source), contract_to_start_from(source)
+    check_contract(contract["environment"], env.contract(), str(source))
+    acting, learner = _file_weights(place) if place.is_file() else (None, saved_weights(place))
+    if acting is None:
+        load_actor(model.policy, learner)
+    else:
+        actor(model.policy).load_state_dict(acting)
+    scale_residual(model.policy, parse_settings(contract["config"]).residual_share / config.residual_share)
+    own = model.policy.state_dict()
+    needed = [name for name in own if not name.startswith(ACTOR)]
+    if all(name in learner and learner[name].shape == own[name].shape for name in needed):
+        model.policy.load_state_dict({**own, **{name: learner[name] for name in needed}})
+    else:
+        fit_critic(model, env, config, load_policy(source, env.contract()))
+
+
+def _file_weights(place: Path) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Return the weights of a policy file: those that act, as the graph names them, and those that a training needs."""
+    require_package("onnx", "export")
+    import onnx
+    from onnx import numpy_helper
+
+    constants = {one.name: torch.from_numpy(numpy_helper.to_array(one).copy()) for one in onnx.load(place).graph.initializer}
+    acting = {name: value for name, value in constants.items() if name[0].isdigit()}
+    return acting, {name.removeprefix(LEARNER): value for name, value in constants.items() if name.startswith(LEARNER)}
 
 
 def fit_critic(model: PPO, env: Sb3VecEnv, config: PpoConfig, policy: Policy) -> None:

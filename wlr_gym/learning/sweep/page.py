@@ -91,7 +91,6 @@ def _header(plan: SweepPlan, ranking: Sequence[Summary], title: str) -> str:
 
 
 def _mean(one: Summary) -> str:
-    """Return mean and range over the seeds."""
     if len(one.values) == 1:
         return f"{number(one.mean)} (one seed)"
     return f"{number(one.mean)} ({number(min(one.values))} to {number(max(one.values))}, {len(one.values)} seeds)"

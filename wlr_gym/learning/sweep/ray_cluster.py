@@ -42,7 +42,9 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
         if address == LOCAL:
             ray.init(address="local", num_cpus=workers, include_dashboard=False, _node_ip_address="127.0.0.1", **quiet)
         else:
-            _require_answer(address)
+            host, _, port = address.rpartition(":")
+            if host and port.isdigit():  # where nothing listens, Ray itself would wait for minutes
+                socket.create_connection((host, int(port)), timeout=5.0).close()
             ray.init(address=address, **quiet)
     except Exception as error:  # Ray raises that itself where a node takes more than 30 s to start
         what = "Ray cannot be started" if address == LOCAL else "no Ray cluster answers"
@@ -52,13 +54,6 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
             yield
     finally:
         ray.shutdown()
-
-
-def _require_answer(address: str) -> None:
-    """Raise OSError where nothing listens at ``host:port``; Ray itself would wait for minutes."""
-    host, _, port = address.rpartition(":")
-    if host and port.isdigit():
-        socket.create_connection((host, int(port)), timeout=5.0).close()
 
 
 @contextmanager

@@ -204,7 +204,6 @@ def usable_cores() -> int:
 
 @contextmanager
 def _sigterm_interrupts() -> Iterator[None]:
-    """Let SIGTERM end the block as Ctrl-C does."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -233,17 +232,13 @@ def _search_with_tune(book: _Book, nodes: Mapping[str, str], at_once: int | None
     from wlr_gym.learning.sweep.tune_search import search_with_tune
 
     known = known_settings(book.plan)
-    begun = read_begun(book.folder)
+    file = book.folder / BEGUN_FILE
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    # Oldest first, each once; a last line may be cut short.
+    begun = list({line: json.loads(line) for line in lines if line.endswith("}")}.values())
     for settings in known if known is not None else begun:
         book.enter(trial_of(settings, book.plan.seed_list[0]))
     search_with_tune(book.plan, book.folder, begun, book.stopped, nodes, at_once, book.begin, book.end)
-
-
-def read_begun(folder: Path) -> list[dict[str, Any]]:
-    """Return the settings that a search has begun, oldest first, each once."""
-    file = folder / BEGUN_FILE
-    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
-    return list({line: json.loads(line) for line in lines if line.endswith("}")}.values())  # a last line may be cut short
 
 
 # ---- what is known of the trials -------------------------------------------------------------------------------------

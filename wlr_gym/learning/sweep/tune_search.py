@@ -175,9 +175,9 @@ def _asha(plan: SweepPlan) -> Any:
 
     assert plan.search is not None
     total = plan.settings["total_steps"]
-    keywords: dict[str, Any] = (
-        {} if plan.search.method != "optuna" else {"metric": plan.search.metric, "mode": _mode(plan.search.metric)}
-    )
+    keywords: dict[str, Any] = {}
+    if plan.search.method == "optuna":
+        keywords = {"metric": plan.search.metric, "mode": _mode(plan.search.metric)}
     return ASHAScheduler(
         time_attr="steps",
         max_t=total - 1,  # no rung at the end: a trial that gets there writes its policy
@@ -189,7 +189,6 @@ def _asha(plan: SweepPlan) -> Any:
 
 
 def _trial(plan: SweepPlan, config: Mapping[str, Any]) -> Trial:
-    """Return the trial that Tune's ``config`` means."""
     if "settings" in config:
         settings = json.loads(config["settings"])
     else:
