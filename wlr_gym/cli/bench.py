@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: Measurement -> function. Imported when it is run.
 MEASUREMENTS = {
     "engine": "wlr_gym.studies.bench.engine:measure_engine",
-    "mujoco": "wlr_gym.studies.bench.mujoco_plant:measure_mujoco",
+    "mujoco": "wlr_gym.studies.bench.speed:measure_mujoco",
     "env_step": "wlr_gym.studies.bench.speed:measure_env_step",
     "ppo": "wlr_gym.studies.bench.training:measure_ppo",
     "learning": "wlr_gym.studies.bench.training:measure_learning",

@@ -73,20 +73,18 @@ def run(options: DemoOptions) -> int:
         "the policy trains on."
     )
     with progress(console, tuple(WORKERS), options.progress) as tell:
-        outcome = run_workers(demo, tell)
-    write_page(demo, outcome.sections, outcome.interrupted)
-    for one in outcome.sections:
+        sections, interrupted = run_workers(demo, tell)
+    write_page(demo, sections, interrupted)
+    for one in sections:
         console.print(f"{one.title}: {one.headline or one.verdict}", markup=False)
-    console.print(f"{'stopped' if outcome.interrupted else 'done'} after {duration(time.monotonic() - began)}; the page:")
+    console.print(f"{'stopped' if interrupted else 'done'} after {duration(time.monotonic() - began)}; the page:")
     console.print(str(demo.page), markup=False)
     if options.json:
-        found = [
-            {name: getattr(one, name) for name in ("title", "headline", "verdict", "not_good")} for one in outcome.sections
-        ]
-        print_json({"page": demo.page, "interrupted": outcome.interrupted, "sections": found})
-    if outcome.interrupted:
+        found = [{name: getattr(one, name) for name in ("title", "headline", "verdict", "not_good")} for one in sections]
+        print_json({"page": demo.page, "interrupted": interrupted, "sections": found})
+    if interrupted:
         return INTERRUPTED
-    return FAILED if any(one.verdict == stage.FAILED for one in outcome.sections) else OK
+    return FAILED if any(one.verdict == stage.FAILED for one in sections) else OK
 
 
 def _demo(options: DemoOptions) -> Demo:

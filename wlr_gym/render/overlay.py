@@ -51,7 +51,7 @@ def write(
     for note in notes:
         _note(draw, note, image.size, size)
     if lines:
-        _box(draw, lines, (MARGIN, MARGIN), size)
+        _box(draw, lines, size)
     if bar or legend:
         _legend(draw, legend, bar, image.size, size)
     return np.asarray(image)
@@ -67,13 +67,12 @@ def banner(width: int, text: str, height: int) -> Picture:
     return np.asarray(image)
 
 
-def _box(draw: ImageDraw.ImageDraw, lines: Sequence[str], corner: tuple[int, int], size: int) -> None:
+def _box(draw: ImageDraw.ImageDraw, lines: Sequence[str], size: int) -> None:
     step = round(1.35 * size)
     wide = max(font(size).getlength(line) for line in lines)
-    left, top = corner
-    draw.rounded_rectangle((left, top, left + wide + 2 * MARGIN, top + step * len(lines) + MARGIN), 4, fill=PAPER)
+    draw.rounded_rectangle((MARGIN, MARGIN, wide + 3 * MARGIN, step * len(lines) + 2 * MARGIN), 4, fill=PAPER)
     for index, line in enumerate(lines):
-        draw.text((left + MARGIN, top + MARGIN / 2 + step * index), line, font=font(size), fill=INK)
+        draw.text((2 * MARGIN, 1.5 * MARGIN + step * index), line, font=font(size), fill=INK)
 
 
 def _legend(draw: ImageDraw.ImageDraw, lines: Sequence[str], bar: bool, size: tuple[int, int], height: int) -> None:

@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 BEFORE, AFTER = 300_000, 400_000
 #: s; shorter runs say nothing.
 SHORTEST = 3.0
-EPISODES_FILE = "episodes.json"
 _NO_ROBOT = "No robot to drive: measured runs were given."
 
 
@@ -148,7 +147,7 @@ def episodes_of(
     Raises:
         KeyboardInterrupt: somebody stopped the robot.
     """
-    asked, path = progress.asked, progress.folder(step) / EPISODES_FILE
+    asked, path = progress.asked, progress.folder(step) / "episodes.json"
     content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     done = {name: [RobotEpisode(**one) for one in content.get(name, [])] for name in policies}
     total = len(seeds) * len(policies)

@@ -44,13 +44,9 @@ STUCK_WHEELS = {"stuck_wheels": {"weight": -6.0}}
 WATCHED, WATCHED_SECONDS = 512, 10.0
 #: Environment steps between scores on held-out episodes, and between checkpoints, as shares of the training.
 _SCORES = 4
-#: Name of the settings of the training.
-SETTINGS_FILE = "training.yaml"
 TRAINING, AGAIN = "training", "training_again"
 #: Folder of what both policies do on simulated robots.
 ACCEPTANCE = "acceptance"
-#: Name of the policy that is kept, where it is the new one.
-POLICY_FILE = "policy.onnx"
 #: Robots, and s of their episodes, on whose observations the file is compared with the policy.
 EXPORT_ROBOTS, EXPORT_SECONDS = 8, 4.0
 
@@ -128,7 +124,7 @@ def train_in(progress: Progress, folder: Path, config: Path, family: Family, rew
 def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
     """Train on from the policy with what was found."""
     asked, folder = progress.asked, progress.out / TRAINING
-    config = progress.folder("model") / SETTINGS_FILE
+    config = progress.folder("model") / "training.yaml"
     train_in(progress, folder, config, found.training)
     return AdaptStep(
         said=(
@@ -188,7 +184,7 @@ def trained_policy(progress: Progress) -> str:
 
 def export_trained(progress: Progress) -> str:
     """Write the trained policy as one file, which runs without torch, and return its path."""
-    source, path = trained_policy(progress), progress.out / POLICY_FILE
+    source, path = trained_policy(progress), progress.out / "policy.onnx"
     with closing(make_core(progress.asked.environment, EXPORT_ROBOTS, policy_environment(source))) as core:
         seen = seen_observations(core, make_policy(source, core.contract()), EXPORT_SECONDS)
     export_policy(source, path, seen)

@@ -29,9 +29,6 @@ COUNT = 8
 _COLUMNS, _BLOCKS = 4, 3
 #: m from the start that is shown.
 _REACH = 1.3
-#: Friction coefficients at the ends of the colours.
-_LOWEST = 0.05
-_HIGHEST = 1.0
 _COLOURS = "viridis"
 
 
@@ -45,7 +42,7 @@ def draw_floors(path: Path, randomizations: Sequence[Randomization], first_seed:
     size = 2.2 if beside == 1 else 1.2
     height = (size * rows + 0.2) * below + 0.3
     figure = new_figure(size * (columns + 0.2) * beside + 0.4, height + 0.7)
-    norm = LogNorm(_LOWEST, _HIGHEST, clip=True)
+    norm = LogNorm(0.05, 1.0, clip=True)  # friction coefficients at the ends of the colours
     floors, foot = figure.add_gridspec(2, 1, height_ratios=(height, 0.6))
     widths = [*([1.0] * columns + [0.2]) * beside][:-1]  # a gap between blocks
     grid = floors.subgridspec(rows * below, len(widths), width_ratios=widths)

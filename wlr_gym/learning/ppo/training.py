@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -145,18 +144,6 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
     return model
 
 
-@dataclass(frozen=True)
-class Session:
-    """What takes part in a training: the request, its settings, robots, learner, what watches it and what writes."""
-
-    training: Training
-    config: PpoConfig
-    env: Sb3VecEnv
-    model: PPO
-    meter: Meter
-    log: TrainingLog
-
-
 def _train(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> Path:
     with StopRequest() as stop:  # before the first file: who sees one and presses Ctrl-C finds a checkpoint
         log = TrainingLog(training, config, env, model)
@@ -166,7 +153,7 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) ->
             with _progress(training, config, model.num_timesteps) as show:
                 if not log.scores:
                     log.score()
-                _updates(Session(training, config, env, model, meter, log), stop, show)
+                _updates(log, meter, stop, show)
             place = log.save_checkpoint()
             if stop.requested:
                 raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {training.folder}")
@@ -177,17 +164,17 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) ->
             log.close()
 
 
-def _updates(session: Session, stop: StopRequest, show: Callable[[TrainingProgress], None]) -> None:
+def _updates(log: TrainingLog, meter: Meter, stop: StopRequest, show: Callable[[TrainingProgress], None]) -> None:
     """Update until the steps or the time are over, or somebody asks to stop."""
-    training, config, model, log = session.training, session.config, session.model, session.log
+    training, config, model = log.training, log.config, log.model
     began, first = time.monotonic(), model.num_timesteps
     stopped = False
     while model.num_timesteps < config.total_steps and not (stop.requested or stopped):
         if training.max_seconds is not None and time.monotonic() - began > training.max_seconds:
             return
         before = model.num_timesteps
-        session.env.set_progress(before)
-        row = update(model, session.meter, config)
+        log.env.set_progress(before)
+        row = update(model, meter, config)
         seconds = time.monotonic() - began
         row |= {"seconds": seconds, "steps_per_second": (model.num_timesteps - first) / seconds}
         log.update(row)

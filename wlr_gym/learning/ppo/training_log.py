@@ -32,12 +32,13 @@ class TrainingLog:
         training, config, env, model: what is being trained; ``model`` is where the run (re)starts.
 
     Attributes:
+        training, config, env, model: as given.
         scores: newest row of ``held_out.csv``; empty before the first.
         best: that of the policy in ``best/``.
     """
 
     def __init__(self, training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> None:
-        self._training, self._config, self._env, self._model = training, config, env, model
+        self.training, self.config, self.env, self.model = training, config, env, model
         folder, steps = training.folder, model.num_timesteps
         self._curve = CurveFile(folder / CURVE_FILE, steps)
         self._scores = CurveFile(folder / SCORES_FILE, steps) if config.evaluate_every else None
@@ -49,7 +50,7 @@ class TrainingLog:
 
     def close(self) -> None:
         """Release the plant of the held-out episodes; the files are complete at any time."""
-        self._model.logger.close()
+        self.model.logger.close()
         if self._episodes is not None:
             self._episodes.close()
 
@@ -59,40 +60,40 @@ class TrainingLog:
         for name, value in row.items():
             if name != "steps" and name not in LOSSES:  # Stable-Baselines3 records the losses itself
                 group = "reward" if name.startswith("term.") else "training"
-                self._model.logger.record(f"{group}/{name.removeprefix('term.')}", value)
-        self._model.logger.dump(step=self._model.num_timesteps)
+                self.model.logger.record(f"{group}/{name.removeprefix('term.')}", value)
+        self.model.logger.dump(step=self.model.num_timesteps)
 
     def score(self) -> None:
         """Score the present policy on the held-out episodes, once per step count; keep it where it is the best so far."""
-        steps = self._model.num_timesteps
+        steps = self.model.num_timesteps
         if self._episodes is None or self._scores is None or self.scores.get("steps") == steps:
             return
-        self.scores = {"steps": steps, **self._episodes.score(self._model)}
+        self.scores = {"steps": steps, **self._episodes.score(self.model)}
         self._scores.append(self.scores)
         for name, value in self.scores.items():
             if name != "steps":
-                self._model.logger.record(f"held_out/{name}", value)
-        self._model.logger.dump(step=steps)
+                self.model.logger.record(f"held_out/{name}", value)
+        self.model.logger.dump(step=steps)
         if is_better(self.scores, self.best):
             self.best = self.scores
-            self._save(self._training.folder / BEST)
+            self._save(self.training.folder / BEST)
 
     def save_checkpoint(self) -> Path:
         """Write a checkpoint that the training can be resumed from; drop the oldest."""
-        checkpoints = self._training.folder / "checkpoints"
-        place = self._save(checkpoints / checkpoint.name_of(self._model.num_timesteps), to_resume=True)
-        checkpoint.drop_old(checkpoints, self._config.keep_checkpoints)
+        checkpoints = self.training.folder / "checkpoints"
+        place = self._save(checkpoints / checkpoint.name_of(self.model.num_timesteps), to_resume=True)
+        checkpoint.drop_old(checkpoints, self.config.keep_checkpoints)
         return place
 
     def save_policy(self) -> Path:
         """Write the present policy as that of the run."""
-        return self._save(self._training.folder / "policy")
+        return self._save(self.training.folder / "policy")
 
     def _save(self, place: Path, *, to_resume: bool = False) -> Path:
-        notes = {"environment": self._training.environment}
-        if self.scores.get("steps") == self._model.num_timesteps:
+        notes = {"environment": self.training.environment}
+        if self.scores.get("steps") == self.model.num_timesteps:
             notes |= {"held_out": {name: value for name, value in self.scores.items() if name != "steps"}}
-        return checkpoint.save(place, self._model, self._config, self._env, notes, to_resume=to_resume)
+        return checkpoint.save(place, self.model, self.config, self.env, notes, to_resume=to_resume)
 
 
 class _ResumedTensorBoard(TensorBoardOutputFormat):

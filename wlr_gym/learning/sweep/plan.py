@@ -131,18 +131,14 @@ class SweepPlan(SettingsModel):
         return self
 
     @model_validator(mode="after")
-    def _values_are_json(self) -> SweepPlan:
-        lists = {name: values for name, values in self.space.items() if isinstance(values, list)}
-        for where, values in [("space", lists), *((f"variants: {name}", changes) for name, changes in self.variants.items())]:
+    def _complete(self) -> SweepPlan:
+        groups = {"space": self.space, **{f"variants: {name}": changes for name, changes in self.variants.items()}}
+        for where, values in groups.items():
             for key, value in values.items():
                 try:
-                    json.dumps(value)
+                    json.dumps(None if isinstance(value, NumberRange) else value)
                 except TypeError as error:
                     raise InputError(f"{where}: {key}: {value!r} is no setting: {error}; put words into quotes") from None
-        return self
-
-    @model_validator(mode="after")
-    def _complete(self) -> SweepPlan:
         ranges = [name for name, values in self.space.items() if isinstance(values, NumberRange)]
         if ranges and (self.search is None or self.search.method == "grid"):
             raise InputError(f"space: {', '.join(ranges)} is a range: give a list, or search with 'random' or 'optuna'")
@@ -150,7 +146,7 @@ class SweepPlan(SettingsModel):
             raise InputError("search: there is no 'space' to search")
         if "seed" in self.space:
             raise InputError("space: 'seed' is none of its settings; give 'seeds'")
-        for where, names in [("space", self.space), *((f"variants: {name}", own) for name, own in self.variants.items())]:
+        for where, names in groups.items():
             if late := [name for name in names if name.partition(".")[0] == "tasks"]:
                 raise InputError(f"{where}: '{late[0]}' comes too late: 'tasks' is read with the file; name the setting itself")
         return self

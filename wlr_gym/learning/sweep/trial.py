@@ -92,7 +92,7 @@ def _train(task: Mapping[str, Any], folder: Path, reporter: _Reporter) -> None:
     keywords = task["settings"].get("environment") or {}
     with contextlib.ExitStack() as until_compiled:
         if (compiled := _compiled(task["environment"], keywords)) is not None and not compiled.is_file():
-            until_compiled.enter_context(locked(compiled.with_suffix(".lock"), _LONGEST_COMPILATION))
+            until_compiled.enter_context(locked(compiled.with_suffix(".lock"), 900.0))  # longer than a compilation takes
 
         def on_update(progress: TrainingProgress) -> None:
             if compiled is not None:
@@ -136,9 +136,6 @@ class _Reporter:
 
 
 # ---- kernels ---------------------------------------------------------------------------------------------------------
-
-#: s that a trial waits for another one of its machine to compile.
-_LONGEST_COMPILATION = 900.0
 
 
 def _compiled(environment: str, keywords: Mapping[str, Any]) -> Path | None:

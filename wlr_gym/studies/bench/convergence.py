@@ -25,11 +25,6 @@ CASES = {
     "random": "new random setpoints every tick",
 }
 STEPS = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
-SWEEP_COUNTS = (2, 3, 4, 6, 8)
-#: s, and sweeps of it: the reference of steps; sweeps of the reference of sweeps.
-REFERENCE_STEP = 1e-5
-REFERENCE_SWEEPS = 8
-MANY_SWEEPS = 300
 
 
 @dataclass(frozen=True)
@@ -62,10 +57,10 @@ def measure_convergence(size: Size) -> list[Deviation]:
 
 def _case(case: str, count: int, ticks: int, size: Size) -> list[Deviation]:
     travel = partial(_travel, case, _goals(case, ticks, count))
-    reference = travel(REFERENCE_STEP if not size.quick else 1e-4, REFERENCE_SWEEPS)
+    reference = travel(1e-4 if size.quick else 1e-5, 8)
     found = [_deviation(case, "step", step, travel(step, SWEEPS) - reference) for step in STEPS]
-    exact = travel(1e-3, MANY_SWEEPS)
-    found += [_deviation(case, "sweeps", sweeps, travel(1e-3, sweeps) - exact) for sweeps in SWEEP_COUNTS]
+    exact = travel(1e-3, 300)
+    found += [_deviation(case, "sweeps", sweeps, travel(1e-3, sweeps) - exact) for sweeps in (2, 3, 4, 6, 8)]
     rounding = travel(1e-3, SWEEPS, "float32") - travel(1e-3, SWEEPS)
     return [*found, _deviation(case, "precision", "float32", rounding)]
 

@@ -16,7 +16,6 @@ LEVELS = (1e-4, 5e-4, 2e-3, 2.5e-2)
 #: m: up to this error MuJoCo's setting counts as comparable.
 COMPARABLE = 1e-3
 COMPARABLE_BARS = {"float64": 50.0, "float32": 100.0}
-NOT_MEASURED = "Not measured, for want of a GPU: MuJoCo Warp, MJX, Isaac Sim, Genesis."
 UNIT = "x real time"
 AT_DEFAULTS = "both at 1 ms, MuJoCo's defaults"
 #: What is compared at 1 ms: in words, how MuJoCo is called, threads, bars.
@@ -80,7 +79,7 @@ def reference_text(report: dict[str, Any]) -> str:
     return (
         f"The limits of both simulators differ by {1e6 * apart['median']:.2g} µm (median) and {1e6 * apart['max']:.2g} µm "
         f"(largest) and lie {1e6 * rest['max']:.2g} µm at most beyond the finest step. Distance driven, reference minus the "
-        f"closed form of a rigid robot: {closed}. {NOT_MEASURED}"
+        f"closed form of a rigid robot: {closed}. Not measured, for want of a GPU: MuJoCo Warp, MJX, Isaac Sim, Genesis."
     )
 
 

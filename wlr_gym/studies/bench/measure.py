@@ -22,17 +22,13 @@ Name = TypeVar("Name", bound=Hashable)
 TellShare = Callable[[float], None]
 
 
-def _untold(share: float) -> None:
-    """Nobody wants to know."""
-
-
 @dataclass(frozen=True)
 class Size:
     """How much work: ``rounds`` per contender; ``quick`` shrinks everything to see that it runs; ``tell``: how far it is."""
 
     rounds: int = 5
     quick: bool = False
-    tell: TellShare = _untold
+    tell: TellShare = lambda share: None
 
     def __call__(self, full: int, quick: int) -> int:
         """Return the amount of work to do."""
@@ -96,7 +92,7 @@ def summary(values: Sequence[float]) -> dict[str, Any]:
 
 
 def interleave(
-    contenders: Mapping[Name, Contender], rounds: int, *, warm_up: bool = True, tell: TellShare = _untold
+    contenders: Mapping[Name, Contender], rounds: int, *, warm_up: bool = True, tell: TellShare = lambda share: None
 ) -> dict[Name, tuple[float, ...]]:
     """Run every contender once unmeasured (compilation, caches), then ``rounds`` times in turn; return their values."""
     unmeasured = len(contenders) if warm_up else 0

@@ -94,7 +94,6 @@ def measure_learning(size: Size) -> list[Measurement]:
 
 
 def _details(name: str, runs: Sequence[_Run]) -> list[Measurement]:
-    """Return what a contender took for it, for information."""
     given_up = sum(not run.solved for run in runs)
     who = f"{name}, not learnt in {given_up} of {len(runs)}" if given_up else name
     return [

@@ -131,7 +131,6 @@ def _held_out(gap: GapEntry | None) -> str:
 
 
 def _of_the_report(heldout: Sequence[RunGapEntry]) -> str:
-    """Return the gap report's table of the held-out runs."""
     rows = []
     for one in heldout:
         errors = [error(_number(value)) for value in (one.before, one.calibrated, one.after)]
@@ -142,7 +141,6 @@ def _of_the_report(heldout: Sequence[RunGapEntry]) -> str:
 
 
 def _risen(heldout: Sequence[RunGapEntry]) -> list[str]:
-    """Return which held-out runs the effects make worse."""
     worse = [one.run for one in heldout if _number(one.after) > _number(one.calibrated)]
     return [f"the effects make the error of {listed(worse)} larger"] if worse else []
 

@@ -103,7 +103,6 @@ def _watched(demo: Demo, tell: Tell) -> Iterator[None]:
 
 
 def _play(source: str | Path, demo: Demo) -> Rollout:
-    """Let a policy play whole episodes of the task."""
     from wlr_gym.learning.evaluation import FIRST_SEED, make_player, roll_out
 
     core, policy = make_player(ENVIRONMENT, source, demo.episodes, {"precision": "float32"})

@@ -11,7 +11,7 @@ import signal
 import threading
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -46,19 +46,14 @@ WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
 TellWorker = Callable[[str, str, float], None]
 
 
-@dataclass
-class Outcome:
-    """Sections in the order of the page, and whether somebody stopped the demo."""
-
-    sections: list[Section]
-    interrupted: bool
-
-
 # ---- the parent ------------------------------------------------------------------------------------------------------
 
 
-def run_workers(demo: Demo, tell: TellWorker) -> Outcome:
-    """Run all workers at once and return what they found; Ctrl-C ends them in good order."""
+def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
+    """Run all workers at once; return sections in the order of the page, and whether somebody stopped the demo.
+
+    Ctrl-C ends the workers in good order.
+    """
     inbox: queue.Queue[tuple[str, dict[str, Any] | None]] = queue.Queue()
     found: dict[str, list[Section]] = {worker: [] for worker in WORKERS}
     interrupted = False
@@ -79,7 +74,7 @@ def run_workers(demo: Demo, tell: TellWorker) -> Outcome:
     finally:
         for process in running.values():
             process.kill()
-    return Outcome([section for worker in WORKERS for section in _complete(worker, found[worker], interrupted)], interrupted)
+    return [section for worker in WORKERS for section in _complete(worker, found[worker], interrupted)], interrupted
 
 
 def _start(worker: str, demo: Demo, inbox: queue.Queue[Any]) -> Any:

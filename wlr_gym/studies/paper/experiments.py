@@ -33,15 +33,11 @@ from wlr_gym.studies.paper import reduced
 
 Array = NDArray[np.float64]
 
-#: Register counts of the paper's commands: 18.32 rpm, 214.577 rev/min2, 3.435 rpm.
-WHEEL_SPEED_COUNTS = 80
-WHEEL_ACCELERATION_COUNTS = 1
-LEG_SPEED_COUNTS = 15
 TURNS = 4
-#: rad/s, rad/s2, rad/s.
-WHEEL_SPEED = load_table("XL430-W250-T").per_count("profile_velocity") * WHEEL_SPEED_COUNTS
-WHEEL_ACCELERATION = load_table("XL430-W250-T").per_count("profile_acceleration") * WHEEL_ACCELERATION_COUNTS
-LEG_SPEED = load_table("XM540-W150-R").per_count("profile_velocity") * LEG_SPEED_COUNTS
+#: rad/s, rad/s2, rad/s: 80, 1 and 15 register counts, the paper's commands: 18.32 rpm, 214.577 rev/min2, 3.435 rpm.
+WHEEL_SPEED = load_table("XL430-W250-T").per_count("profile_velocity") * 80
+WHEEL_ACCELERATION = load_table("XL430-W250-T").per_count("profile_acceleration")
+LEG_SPEED = load_table("XM540-W150-R").per_count("profile_velocity") * 15
 PROFILE = Profile(wheel_acceleration=WHEEL_ACCELERATION, leg_velocity=LEG_SPEED, leg_acceleration=0.0)
 #: s per tick; s of rest before the commands, in which the robot settles on its gears, and after the wheels stopped.
 PERIOD = 0.02
