@@ -114,11 +114,9 @@ def start(job: Job) -> Any:
             env={**os.environ, **ONE_THREAD},
             start_new_session=True,
         )
-    try:
+    with contextlib.suppress(BrokenPipeError):  # it died at once; its log says why
         process.stdin.write(json.dumps(job.task) + "\n")
         process.stdin.flush()
-    except BrokenPipeError:
-        pass  # it died at once; its log says why
     return process
 
 

@@ -73,12 +73,8 @@ def _faults(model: type[BaseModel], data: object, problems: Iterable[Any]) -> li
     by_place: dict[tuple[str, ...], list[Any]] = {}
     for problem in problems:
         by_place.setdefault(_place(problem, data), []).append(problem)
-    deepest = [place for place in by_place if not any(_is_within(other, place) for other in by_place)]
-    return [_fault(model, place, by_place[place]) for place in deepest]
-
-
-def _is_within(place: tuple[str, ...], other: tuple[str, ...]) -> bool:
-    return bool(other) and len(place) > len(other) and place[: len(other)] == other
+    inside = {place[:depth] for place in by_place for depth in range(1, len(place))}
+    return [_fault(model, place, by_place[place]) for place in by_place if place not in inside]
 
 
 def _place(problem: Any, data: object) -> tuple[str, ...]:

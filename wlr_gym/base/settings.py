@@ -39,6 +39,18 @@ def overlay(base: Any, changes: Mapping[str, Any]) -> Any:
     return merged
 
 
+def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Return dotted key -> value as mappings in mappings: ``{"body.mass": 1.0}`` becomes ``{"body": {"mass": 1.0}}``."""
+    whole: dict[str, Any] = {}
+    for key, value in flat.items():
+        *groups, last = key.split(".")
+        place = whole
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = value
+    return whole
+
+
 def merge_changes(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
     """Return the changes that say what ``first`` says and, over it, ``second``: mappings merge key by key, None stays."""
     merged = {**first, **second}

@@ -227,7 +227,14 @@ def physical_faults(robot: Robot) -> list[str]:
     A body's inertia is bounded below by plausibility (5 % of a uniform box of the given size: all mass within a fifth
     of the half-width) and by the triangle inequality. Paper audit, Table I: I_Gy and I_Gz are 1000 times too small.
     """
-    faults = [f"{path} is missing" for path, value in _missing_candidates(robot) if value is None]
+    optional = {
+        **{f"body.inertia {axis}": value for axis, value in zip("xyz", robot.body.inertia, strict=True)},
+        "leg.mass": robot.leg.mass,
+        **{f"leg.inertia {axis}": value for axis, value in zip("xyz", robot.leg.inertia, strict=True)},
+        "wheel.mass": robot.wheel.mass,
+        "wheel.transverse_inertia": robot.wheel.transverse_inertia,
+    }
+    faults = [f"{key} is missing" for key, value in optional.items() if value is None]
     x, y, z = robot.body.size
     box = [robot.body.mass / 12 * s for s in (y * y + z * z, x * x + z * z, x * x + y * y)]
     for axis, value, uniform in zip("xyz", robot.body.inertia, box, strict=True):
@@ -245,20 +252,9 @@ def physical_faults(robot: Robot) -> list[str]:
     return faults
 
 
-def _missing_candidates(robot: Robot) -> list[tuple[str, float | None]]:
-    candidates: list[tuple[str, float | None]] = [
-        (f"body.inertia {axis}", value) for axis, value in zip("xyz", robot.body.inertia, strict=True)
-    ]
-    candidates += [("leg.mass", robot.leg.mass)]
-    candidates += [(f"leg.inertia {axis}", value) for axis, value in zip("xyz", robot.leg.inertia, strict=True)]
-    return [*candidates, ("wheel.mass", robot.wheel.mass), ("wheel.transverse_inertia", robot.wheel.transverse_inertia)]
-
-
 def _triangle_faults(name: str, inertia: tuple[float | None, ...]) -> list[str]:
-    if any(value is None for value in inertia):
-        return []
     values = [float(value) for value in inertia if value is not None]
-    if min(values) > 0 and 2 * max(values) <= sum(values) * (1 + 1e-9):
+    if len(values) < len(inertia) or (min(values) > 0 and 2 * max(values) <= sum(values) * (1 + 1e-9)):
         return []
     return [f"{name} = {values} breaks the triangle inequality every rigid body obeys"]
 

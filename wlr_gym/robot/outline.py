@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from wlr_gym.base.errors import InputError, nearest, unknown_name
+from wlr_gym.base.settings import nested
 from wlr_gym.robot.description import Motor, Robot
 from wlr_gym.robot.tolerance import UNITS
 
 Answers = dict[str, Any]
 
-#: Units of an answer beside those of tolerances: symbol -> size in SI, SI unit.
-_MORE_UNITS = {
+#: Units of an answer, those of tolerances and more: symbol -> size in SI, SI unit.
+_UNITS = UNITS | {
     "N m": (1.0, "N m"),
     "mN m": (1e-3, "N m"),
     "N cm": (1e-2, "N m"),
@@ -53,7 +54,9 @@ class Question:
         words = text.replace(",", " ").split()
         split = next((index for index, word in enumerate(words) if not _is_number(word)), len(words))
         values, unit = [float(word) for word in words[:split]], " ".join(words[split:])
-        size, dimension = self._unit(unit, text)
+        if unit and unit not in _UNITS:
+            raise InputError(f"{self.key} = '{text}': unknown unit '{unit}'{nearest(unit, _UNITS)}; expected {self.expected}")
+        size, dimension = _UNITS[unit] if unit else (1.0, self.unit)
         if len(values) != self.count or dimension != self.unit or not all(map(math.isfinite, values)):
             raise InputError(f"{self.key} = '{text}': expected {self.expected}")
         if self.positive and min(values) <= 0.0:
@@ -61,18 +64,10 @@ class Question:
         scaled = [float(f"{value * size:.12g}") for value in values]
         return scaled if self.count > 1 else scaled[0]
 
-    def _unit(self, unit: str, text: str) -> tuple[float, str]:
-        known = UNITS | _MORE_UNITS
-        if not unit:
-            return 1.0, self.unit
-        if unit not in known:
-            raise InputError(f"{self.key} = '{text}': unknown unit '{unit}'{nearest(unit, known)}; expected {self.expected}")
-        return known[unit]
-
     @property
     def expected(self) -> str:
         """What is expected, in words."""
-        units = [unit for unit, (_, dimension) in (UNITS | _MORE_UNITS).items() if dimension == self.unit]
+        units = [unit for unit, (_, dimension) in _UNITS.items() if dimension == self.unit]
         return f"{'a number' if self.count == 1 else f'{self.count} numbers'} in {', '.join(units)}"
 
     def shown(self, value: Any) -> str:
@@ -165,14 +160,7 @@ def derived_numbers(answers: Mapping[str, Any], base: Robot) -> tuple[dict[str, 
     comments = {key: f"[given] {question.unit}; {question.words}" for key, question in _BY_KEY.items()}
     comments |= {key: _DERIVED[key.replace("servo.leg", "servo.*").replace("servo.wheel", "servo.*")]
                  for key in flat if key not in answers}  # fmt: skip
-    nested: dict[str, Any] = {}
-    for key in sorted(flat, key=_place):
-        *groups, last = key.split(".")
-        place = nested
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = flat[key]
-    return nested, comments
+    return nested({key: flat[key] for key in sorted(flat, key=_place)}), comments
 
 
 _ORDER = ("body", "hip_position", "leg", "wheel", "leg_limits", "servo", "ground")

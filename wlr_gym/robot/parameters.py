@@ -14,10 +14,7 @@ from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, TABLE, range_in_words
 Array = NDArray[np.float64]
 
 _COLUMN = {element: column for column, element in enumerate(ELEMENTS)}
-_SLICES: dict[str, slice] = {}
-for _spec in TABLE:
-    _start = _COLUMN[_spec.elements[0]]
-    _SLICES[_spec.name] = slice(_start, _start + _spec.size)
+_SLICES = {spec.name: slice(_COLUMN[spec.elements[0]], _COLUMN[spec.elements[-1]] + 1) for spec in TABLE}
 #: Bounds of every element, in the order of the table.
 LOW = np.array([spec.low for spec in TABLE for _ in spec.elements])
 HIGH = np.array([spec.high for spec in TABLE for _ in spec.elements])

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.settings import nested
 from wlr_gym.robot.interchange.links import LinkShape, LinkTree, RigidLink, fuse_fixed
 from wlr_gym.robot.interchange.topology import Assembly, find_assemblies
 from wlr_gym.robot.joints import CORNER_SIGNS, LEGS, WHEELS
@@ -62,13 +63,8 @@ class _Reader:
 
     def put(self, key: str, value: Any) -> None:
         """Take a number, a list of them, or None, which is not stated; ``key`` is dotted."""
-        if value is None:
-            return
-        *groups, last = key.split(".")
-        place = self.numbers
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = [rounded(one) for one in value] if isinstance(value, list | tuple) else rounded(value)
+        if value is not None:
+            self.numbers[key] = [rounded(one) for one in value] if isinstance(value, list | tuple) else rounded(value)
 
     def one(self, what: str, values: Sequence[float | None], unit: str, scale: float | None = None) -> float | None:
         """Return the number that four are; their mean where they differ a little.
@@ -144,7 +140,7 @@ def recognise(tree: LinkTree, *, idealise: bool = False) -> ImportedRobot:
               for ours, one, angle in zip(LEGS, assemblies, offsets, strict=True)]  # fmt: skip
     joints += [JointMapping(ours, one.wheel_joint.name, one.wheel_sign, 0.0)
                for ours, one in zip(WHEELS, assemblies, strict=True)]  # fmt: skip
-    return ImportedRobot(tree.name, reader.numbers, joints, reader.notes)
+    return ImportedRobot(tree.name, nested(reader.numbers), joints, reader.notes)
 
 
 # --- body -------------------------------------------------------------------------------------------------------------
