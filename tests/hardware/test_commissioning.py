@@ -234,7 +234,7 @@ def test_torque_comes_on_where_the_hand_holds_the_joint(stood, monkeypatch):
     class Mover(EmulatedPerson):
         def brake(self, joint, trouble=""):
             for leg in LEGS if joint in LEGS else ():
-                emulated.turn(leg, 0.3 if leg == joint else -0.1)
+                emulated.machine.turn(leg, 0.3 if leg == joint else -0.1)
             super().brake(joint, trouble)
 
     def note(joints):
@@ -586,9 +586,9 @@ class Human:
         joint = text.split()[0]
         if turned := re.search(r"(swing its foot to the|roll it) (back|front|forward|backward) by about (\d+) deg", text):
             way = 1 if turned.group(2) in ("back", "forward") else -1
-            self.emulated.turn(joint, way * np.deg2rad(float(turned.group(3))))
+            self.emulated.machine.turn(joint, way * np.deg2rad(float(turned.group(3))))
         elif "straight down" in text and joint in LEGS:
-            self.emulated.straighten(joint)
+            self.emulated.machine.straighten(joint)
         elif "hold the tyre" in text or "hold its end" in text:
             self.emulated.brake(joint)
         elif "let go" in text:

@@ -95,6 +95,7 @@ def deploy(
         policy.act(core.observation)
     policy.reset(core.everyone)
     inference: list[float] = []
+    columns = [*(f"command_{name}" for name in core.task.commands), *(f"action_{joint}" for joint in JOINTS)]
     with _no_garbage_collection():
         try:
             held = {**(command or {}), **(steer() if steer else {})}
@@ -106,7 +107,7 @@ def deploy(
                 action = policy.act(core.observation)
                 inference.append(time.perf_counter() - start)
                 row = np.concatenate([core.command[0], np.asarray(action, np.float64)[0]])
-                loop.recorder.policy(policy_columns(core), row)
+                loop.recorder.policy(columns, row)
                 if steer is not None:
                     core.set_command(steer())
                 followed = core.command.copy()
@@ -120,11 +121,6 @@ def deploy(
         finally:
             loop.stop("exception")
     return Deployment(loop.reason, loop.ended_well, len(inference), loop.recorder.run, loop.statistics(), np.array(inference))
-
-
-def policy_columns(core: Core) -> list[str]:
-    """Return the columns of ``run_<n>.policy.csv``."""
-    return [*(f"command_{name}" for name in core.task.commands), *(f"action_{joint}" for joint in JOINTS)]
 
 
 @contextmanager

@@ -64,28 +64,22 @@ class NumberedFrames:
 
     def take(self, data: bytes) -> list[tuple[tuple[Any, ...], bool]]:
         """Take bytes; return the content of the frames they complete, after the sync, and whether it is the last one again."""
-        return [self._count(self._layout.unpack(raw)[1:]) for raw in self._completed(data)]
-
-    def _completed(self, data: bytes) -> list[bytes]:
-        """Take bytes; return the frames they complete, without their CRC."""
         self._buffer += data
         frames = []
         while (place := self._buffer.find(self._sync)) >= 0 and len(self._buffer) >= place + self._size:
             raw = bytes(self._buffer[place : place + self._size])
-            if crc16(raw[:-CRC_SIZE]) == int.from_bytes(raw[-CRC_SIZE:], "little"):
-                frames.append(raw[:-CRC_SIZE])
-                del self._buffer[: place + self._size]
-            else:
+            if crc16(raw[:-CRC_SIZE]) != int.from_bytes(raw[-CRC_SIZE:], "little"):
                 self.crc_errors += 1
                 del self._buffer[: place + 1]
+                continue
+            del self._buffer[: place + self._size]
+            content = self._layout.unpack(raw[:-CRC_SIZE])[1:]
+            sequence, last, self._last = content[0], self._last, content[0]
+            is_repeated = sequence == last
+            self.lost += 0 if last is None or is_repeated else (sequence - last - 1) % 65536
+            frames.append((content, is_repeated))
         del self._buffer[: max(0, len(self._buffer) - 2 * self._size)]  # noise without a start never piles up
         return frames
-
-    def _count(self, content: tuple[Any, ...]) -> tuple[tuple[Any, ...], bool]:
-        sequence, last, self._last = content[0], self._last, content[0]
-        is_repeated = sequence == last
-        self.lost += 0 if last is None or is_repeated else (sequence - last - 1) % 65536
-        return content, is_repeated
 
 
 class StreamClock:

@@ -30,7 +30,9 @@ def real_time(priority: int) -> Iterator[None]:
     except PermissionError as error:
         raise _refused(f"SCHED_FIFO, priority {priority}", error, priority) from None
     try:
-        _lock_memory(priority)
+        if ctypes.CDLL(None, use_errno=True).mlockall(_CURRENT | _FUTURE) != 0:
+            number = ctypes.get_errno()
+            raise _refused("mlockall", OSError(number, os.strerror(number)), priority)
         yield
     finally:
         ctypes.CDLL(None).munlockall()
@@ -44,12 +46,6 @@ def require_priority(name: str, priority: int) -> None:
     lowest, highest = os.sched_get_priority_min(os.SCHED_FIFO), os.sched_get_priority_max(os.SCHED_FIFO)
     if not lowest <= priority <= highest:
         raise InputError(f"{name} {priority}: expected {lowest} to {highest}")
-
-
-def _lock_memory(priority: int) -> None:
-    if ctypes.CDLL(None, use_errno=True).mlockall(_CURRENT | _FUTURE) != 0:
-        number = ctypes.get_errno()
-        raise _refused("mlockall", OSError(number, os.strerror(number)), priority)
 
 
 def _refused(what: str, error: OSError, priority: int) -> InputError:

@@ -119,7 +119,8 @@ class RenderedCamera:
         scene = self.file.emulated
         blur = self._faults("camera_blurred")
         look = Look(blur=scene.blur if blur is None else blur, noise=scene.noise)
-        image = self.renderer().frame(moving, look, hash_seed(scene.seed, exposure.number))
+        seed = int(np.random.default_rng([scene.seed, 4, exposure.number]).integers(2**62))
+        image = self.renderer().frame(moving, look, seed)
         self._last = self._spoilt(image)
         return self._last
 
@@ -157,11 +158,6 @@ class RenderedCamera:
         if self._faults("camera_rotated") is not None:
             image = np.ascontiguousarray(image[::-1, ::-1])
         return image
-
-
-def hash_seed(seed: int, number: int) -> int:
-    """Return the seed of a frame's noise."""
-    return int(np.random.default_rng([seed, 4, number]).integers(2**62))
 
 
 def _glaring(image: Image) -> Image:

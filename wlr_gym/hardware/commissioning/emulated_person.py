@@ -17,11 +17,11 @@ class EmulatedPerson:
 
     def turn(self, joint: str, angle: float) -> None:
         """Turn it."""
-        self._stand.turn(joint, angle)
+        self._stand.machine.turn(joint, angle)
 
     def straighten(self, leg: str) -> None:
         """Hold it straight."""
-        self._stand.straighten(leg)
+        self._stand.machine.straighten(leg)
 
     def tilt(self, seconds: float, **angles: float) -> None:
         """Tilt the body; it is there in about 2 s."""

@@ -239,13 +239,9 @@ class PlantCoupling:
 
     # ---- a hand ----
 
-    def set_parameter(self, name: str, place: int, value: float) -> None:
-        """Let the plant have another parameter from now on: what a hand does that holds a wheel.
-
-        Raises:
-            InputError: a value beyond the parameter's bounds.
-        """
-        self._parameters[name][0, place] = value
+    def set_friction(self, joint: str, torque: float) -> None:
+        """Let a joint's dry friction be ``torque`` (N m) from now on: what a hand does that holds it."""
+        self._parameters["servo.coulomb_friction"][0, JOINTS.index(joint)] = torque
         self.plant.set_parameters(self._parameters)
 
     def turn(self, joint: str, angle: float) -> None:

@@ -108,6 +108,7 @@ class Server:
     Attributes:
         slipped: s of emulated time given up because the computer was too busy.
         failure: what ended serving, if it was not :meth:`stop`.
+        origin: this computer's monotonic clock minus emulated time, s; grows when emulated time slips.
 
     Raises:
         InputError: links or control cannot be made.
@@ -131,7 +132,7 @@ class Server:
         self._sent = 0
         self._thread: threading.Thread | None = None
         self._running = False
-        self._origin = 0.0
+        self.origin = 0.0
 
     def _make_ports(self, links: Path | None) -> dict[str, Port]:
         names = [*self.machine.hardware.buses, *self.machine.sensors]
@@ -146,11 +147,6 @@ class Server:
     def ports(self) -> dict[str, str]:
         """Bus name, ``imu`` or ``flow`` -> path to open; changes when an adapter was unplugged and is back."""
         return {name: port.path for name, port in self._ports.items()}
-
-    @property
-    def origin(self) -> float:
-        """This computer's monotonic clock minus emulated time, s; grows when emulated time slips."""
-        return self._origin
 
     # ---- life ----
 
@@ -212,7 +208,7 @@ class Server:
     def serve(self) -> None:
         """Serve until :meth:`stop`."""
         self._running = True
-        self._origin = time.monotonic() - self.machine.time
+        self.origin = time.monotonic() - self.machine.time
         try:
             while self._running:
                 ready = self._wait()
@@ -222,16 +218,13 @@ class Server:
         except Exception as error:
             with self._lock:
                 self.failure = error
-            self._fail_requests(error)
+            for _, future in self._requests:
+                future.set_exception(error)
             if self._thread is None:
                 raise
 
-    def _fail_requests(self, error: Exception) -> None:
-        for _, future in self._requests:
-            future.set_exception(error)
-
     def _now(self) -> float:
-        return time.monotonic() - self._origin if self._real_time else self.machine.time
+        return time.monotonic() - self.origin if self._real_time else self.machine.time
 
     def _wait(self) -> list[str]:
         """Wait until something is due or comes in; serve requests and sockets; return the ports that have bytes."""
@@ -265,7 +258,7 @@ class Server:
         """Give up the time (s) by which emulated time is further behind."""
         if self._real_time and (more := self._now() - self.machine.time - largest) > 0.0:
             self.slipped += more
-            self._origin += more
+            self.origin += more
             self.machine.pause(more)
 
     def _advance(self, duration: float) -> None:

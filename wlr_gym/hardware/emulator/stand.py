@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from wlr_gym.base.errors import unknown_name
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
 from wlr_gym.physics.effects import apply_patch, load_patch
@@ -62,30 +61,17 @@ class EmulatedStand:
         self._friction = changed["servo.coulomb_friction"][0].copy()
         self.stall_current: float = robot.servo.supply_voltage / float(winding(robot)[1][-1])
 
-    def turn(self, joint: str, angle: float) -> None:
-        """Turn a joint by ``angle`` (rad) in its positive direction, torque off."""
-        self.machine.turn(joint, angle)
-
-    def straighten(self, leg: str) -> None:
-        """Hold a leg straight down, torque off: the leg itself, whatever its encoder says."""
-        self.machine.straighten(leg)
-
     def tilt(self, **angles: float) -> None:
         """Begin to turn the body to ``roll``, ``pitch`` and ``yaw`` (rad; the others to 0); it gets there in about 2 s."""
         self._plant.set_force_values(force_values([*_stand_forces(**angles), *self._forces])[None])
 
     def brake(self, joint: str) -> None:
         """Hold a wheel or a leg by hand."""
-        self._set_friction(joint, GRIP)
+        self.machine.coupling.set_friction(joint, GRIP)
 
     def release(self, joint: str) -> None:
         """Let go of it."""
-        self._set_friction(joint, float(self._friction[JOINTS.index(joint)]))
-
-    def _set_friction(self, joint: str, torque: float) -> None:
-        if joint not in JOINTS:
-            raise unknown_name("joint", joint, JOINTS)
-        self.machine.coupling.set_parameter("servo.coulomb_friction", JOINTS.index(joint), torque)
+        self.machine.coupling.set_friction(joint, float(self._friction[JOINTS.index(joint)]))
 
     def wheel_current(self) -> float:
         """Return what the wheels draw from the supply, A: motor currents times the part of the time they are switched on."""

@@ -84,7 +84,7 @@ def calibrate_flow(run: Run, robot: Robot, known: FlowCalibration, distance: flo
     found = known.model_copy(
         update={
             "scale": round(known.scale * scale, 4),
-            "mount_yaw": round(_wrapped(known.mount_yaw - math.atan2(ratio.imag, ratio.real)), 4),
+            "mount_yaw": round(math.remainder(known.mount_yaw - math.atan2(ratio.imag, ratio.real), 2.0 * math.pi), 4),
         }
     )
     return FlowFit(found, known.scale * sigma, sigma / abs(ratio), way, len(windows))
@@ -99,19 +99,15 @@ def _velocities(run: Run, robot: Robot) -> tuple[Array, Array, Array]:
     if robot.sensors.flow is None:
         raise InputError(f"robot '{robot.name}' has no optical-flow sensor: expected a section sensors.flow in its file")
     flow, gyro = (np.stack([run[name] for name in names], axis=1) for names in (needed[:2], needed[2:5]))
-    if np.isfinite(flow).all(axis=1).mean() < LEAST_SHARE:
-        share = np.isfinite(flow).all(axis=1).mean()
+    if (share := np.isfinite(flow).all(axis=1).mean()) < LEAST_SHARE:
         raise InputError(f"{run.path}: valid flow in {100 * share:.0f} % of the rows, expected {100 * LEAST_SHARE:.0f} or more")
-    legs, wheels = (np.stack([run[name] for name in names], axis=1) for names in (_names("pos", LEGS), _names("vel", WHEELS)))
+    legs = np.stack([run[f"pos_{leg}"] for leg in LEGS], axis=1)
+    wheels = np.stack([run[f"vel_{wheel}"] for wheel in WHEELS], axis=1)
     lens = np.array(robot.sensors.flow.position)
     seen = np.array([floor_velocity(f, w, lens_height(robot, leg), lens) for f, w, leg in zip(flow, gyro, legs, strict=True)])
     rolled = np.array([wheel_velocity(robot, rates) for rates in wheels])
     rolled[np.abs(gyro[:, 2]) > STRAIGHT] = np.nan
     return seen, rolled, run["t"]
-
-
-def _names(kind: str, joints: tuple[str, ...]) -> list[str]:
-    return [f"{kind}_{joint}" for joint in joints]
 
 
 def _windows(seen: Array, rolled: Array, t: Array) -> Array:
@@ -123,7 +119,3 @@ def _windows(seen: Array, rolled: Array, t: Array) -> Array:
     sums = np.zeros((window[-1] + 1, 3))
     np.add.at(sums, window, ways)
     return sums[np.abs(sums[:, 2]) > LEAST_WINDOW]
-
-
-def _wrapped(angle: float) -> float:
-    return math.remainder(angle, 2.0 * math.pi)

@@ -149,14 +149,12 @@ class FlowReader:
             self.statistics.readings += 1
             quality = good[-1].quality / FULL_QUALITY
             return FlowReading(self._flow, quality, max(0.0, now - self._end), is_new=True)
-        trouble = gone or next((fault for _, fault in reversed(faults) if fault), "") or self._silence(now)
+        trouble = gone or next((fault for _, fault in reversed(faults) if fault), "")
+        if not trouble and (silent := now - self._last_frame) > SILENCE:
+            trouble = f"silent: no frame for {silent:.1f} s"
         if trouble:
             self.statistics.refuse(trouble)
         return FlowReading(self._flow, 0.0, max(0.0, now - self._end), is_new=False, trouble=trouble)
-
-    def _silence(self, now: float) -> str:
-        silent = now - self._last_frame
-        return f"silent: no frame for {silent:.1f} s" if silent > SILENCE else ""
 
     def _fault(self, motion: CountedMotion) -> str:
         """Return why what was counted is not valid; empty = it is."""

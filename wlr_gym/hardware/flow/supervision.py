@@ -57,24 +57,6 @@ def wheel_velocity(robot: Robot, wheels: Array) -> float:
     return robot.wheel.radius * float(np.mean(wheels))
 
 
-class _Way:
-    """What was seen (2,) and rolled, m."""
-
-    def __init__(self) -> None:
-        self.x = self.y = self.rolled = 0.0
-
-    def add(self, seen: Array, rolled: float) -> None:
-        self.x, self.y, self.rolled = self.x + float(seen[0]), self.y + float(seen[1]), self.rolled + rolled
-
-    @property
-    def turn(self) -> float:
-        return math.atan2(self.y, self.x)
-
-    @property
-    def ratio(self) -> float:
-        return math.hypot(self.x, self.y) / self.rolled
-
-
 class FlowSupervision:
     """Reads the flow sensor, and takes what it says for a dropout while it contradicts wheels and gyroscope.
 
@@ -90,7 +72,7 @@ class FlowSupervision:
         self._forget()
 
     def _forget(self) -> None:
-        self._way, self._long_way = _Way(), _Way()
+        self._way, self._long_way = np.zeros(3), np.zeros(3)  # m: seen along x and y, rolled
         self._verdict = self._note = ""
 
     def first(self) -> FlowReading:
@@ -113,9 +95,8 @@ class FlowSupervision:
         if abs(gyro[2]) < LARGEST_YAW_RATE and abs(rolling) > LEAST_SPEED:
             height = lens_height(self._robot, position[LEG_SLICE])
             way = elapsed * math.copysign(1.0, rolling)
-            seen = way * floor_velocity(reading.flow, gyro, height, self._lens)
-            self._way.add(seen, way * rolling)
-            self._long_way.add(seen, way * rolling)
+            moved = np.append(way * floor_velocity(reading.flow, gyro, height, self._lens), way * rolling)
+            self._way, self._long_way = self._way + moved, self._long_way + moved
             self._judge()
         if not self._verdict:
             return replace(reading, note=self._note) if self._note else reading
@@ -124,15 +105,17 @@ class FlowSupervision:
 
     def _judge(self) -> None:
         """Compare the ways seen with the ways rolled; each begins anew then."""
-        if self._way.rolled > WAY:
-            turn, ratio = self._way.turn, self._way.ratio
-            self._way = _Way()
-            if ratio > LEAST_RATIO:
+        x, y, rolled = self._way.tolist()
+        if rolled > WAY:
+            self._way = np.zeros(3)
+            if math.hypot(x, y) / rolled > LEAST_RATIO:
+                turn = math.atan2(y, x)
                 turned = abs(turn) > LARGEST_TURN
                 self._verdict = (
                     f"turned: {math.degrees(turn):.0f} deg against the wheels; see wlr calibrate flow" if turned else ""
                 )
-        if self._long_way.rolled > LONG_WAY:
-            ratio = self._long_way.ratio
-            self._long_way = _Way()
+        x, y, rolled = self._long_way.tolist()
+        if rolled > LONG_WAY:
+            self._long_way = np.zeros(3)
+            ratio = math.hypot(x, y) / rolled
             self._note = "" if RATIO[0] < ratio < RATIO[1] else f"way: {ratio:.2f} of the wheels' (slip, or a wrong scale)"
