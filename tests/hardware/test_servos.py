@@ -43,7 +43,7 @@ def test_all_ports_open_or_none(server, tmp_path):
     servos = Servos(ROBOT, with_ports(HARDWARE, {**server.ports, "wheels": str(tmp_path / "none")}))
     with pytest.raises(InputError, match="none: cannot be opened"):
         servos.open()
-    assert not servos.groups["legs"]._port.is_open
+    assert not servos.groups["legs"].port.is_open
 
 
 def drive(servos):

@@ -141,10 +141,10 @@ def test_the_watchdog_process_waits_for_an_adapter_that_is_gone(server):
     ]
     for servo in server.machine.servos.values():
         servo.write(64, b"\x01")
-    groups[0]._port.port_name = "/dev/none"
+    groups[0].port.port_name = "/dev/none"
     assert switch_off(groups, 0.3) == {"legs": {1, 2, 3, 4}}
     assert torque(server) == [True] * 4 + [False] * 4
-    groups[0]._port.port_name = server.ports["legs"]
+    groups[0].port.port_name = server.ports["legs"]
     assert switch_off(groups, 3.0) == {}
     assert not any(torque(server))
 

@@ -197,7 +197,7 @@ class Servos:
     def set_patience(self, seconds: float) -> None:
         """Set how long (s) an answer may take beyond its bytes' time on the wire, on all buses."""
         for group in self.groups.values():
-            group.patience = seconds
+            group.port.patience = seconds
 
     def close(self) -> None:
         """Close all ports; servos stay as they are."""
@@ -344,7 +344,7 @@ class Servos:
     def reopen_gone(self) -> None:
         """Open the ports again that are gone, where they are back."""
         for group in self.groups.values():
-            if group.gone:
+            if group.port.gone:
                 with contextlib.suppress(InputError):
                     group.close()
                     group.open()

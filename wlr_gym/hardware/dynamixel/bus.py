@@ -40,14 +40,12 @@ class Statistics:
     """What went over the bus since it was opened.
 
     Attributes:
-        exchanges: instructions that wanted answers.
         missing, alerts, stale: id -> answers that did not come, that carried the alert bit, that were too old.
         crc_errors: packets with a wrong CRC.
         discarded: bytes thrown away because they belonged to an exchange that was given up.
         fallbacks: fast reads that were repeated as ordinary ones.
     """
 
-    exchanges: int = 0
     missing: Counter[int] = field(default_factory=Counter)
     alerts: Counter[int] = field(default_factory=Counter)
     stale: Counter[int] = field(default_factory=Counter)
@@ -69,6 +67,7 @@ class BusGroup:
         make_port: (path, bit/s, patience) -> port; None = a serial port.
 
     Attributes:
+        port: what the packets go through.
         fast: sync reads use the fast instruction; cleared for good when servos turn out not to know it.
         statistics: counts since the port was opened.
     """
@@ -91,7 +90,7 @@ class BusGroup:
         self.servos: dict[int, ControlTable] = dict(servos)
         self.fast = True
         self.statistics: Statistics = Statistics()
-        self._port: DynamixelPort = (make_port or DynamixelPort)(port, baud_rate, patience)
+        self.port: DynamixelPort = (make_port or DynamixelPort)(port, baud_rate, patience)
         self._clock = clock
         self._clocks = {id: TickClock() for id in servos}
         self._fast_failures = 0
@@ -105,29 +104,15 @@ class BusGroup:
         Raises:
             InputError: it is not there, or cannot be opened.
         """
-        self._port.openPort()
+        self.port.openPort()
 
     def close(self) -> None:
         """Close the port; servos stay as they are."""
-        self._port.closePort()
-
-    @property
-    def patience(self) -> float:
-        """Time (s) an answer may take beyond its bytes' time on the wire."""
-        return self._port.patience
-
-    @patience.setter
-    def patience(self, seconds: float) -> None:
-        self._port.patience = seconds
-
-    @property
-    def gone(self) -> bool:
-        """Whether the port has failed since it was opened."""
-        return self._port.gone
+        self.port.closePort()
 
     def on_same_port(self, servos: Mapping[int, ControlTable]) -> BusGroup:
         """Return another group on the open port, for servos that are asked once in another order; use one at a time."""
-        return BusGroup(self.name, "", 0, servos, clock=self._clock, make_port=lambda *_: self._port)
+        return BusGroup(self.name, "", 0, servos, clock=self._clock, make_port=lambda *_: self.port)
 
     def __enter__(self) -> BusGroup:
         self.open()
@@ -149,7 +134,7 @@ class BusGroup:
 
     def scan(self) -> dict[int, tuple[int, int]]:
         """Return id -> (model number, firmware) of every servo that answers; takes about 0.8 s."""
-        port = self._port
+        port = self.port
         port.send_packet(protocol.ping(), is_answered=True)
         port.setPacketTimeoutMillis(protocol.MAX_ID * ((_PING_DATA + 11) * port.tx_time_per_byte + _PING_SPACING) + _PING_START)
         found: dict[int, tuple[int, int]] = {}
@@ -197,19 +182,18 @@ class BusGroup:
         return self.servos[id]
 
     def _ask(self, id: int, raw: bytes, length: int, what: str) -> Status:
-        self.statistics.exchanges += 1
-        status = self._port.exchange(raw, length)
+        status = self.port.exchange(raw, length)
         self._note_port()
         where = f"bus {self.name}, id {id}: {what}"
         if status is None:
             self.statistics.missing[id] += 1
-            if not self._port.quiet:
+            if not self.port.quiet:
                 raise RestlessLineError(f"{where}: no answer, the line is never quiet: check wiring, are two ports swapped?")
             raise NoAnswerError(f"{where}: no answer")
         if status.alert:
             self.statistics.alerts[id] += 1
         if status.fault:
-            raise RefusedError(f"{where}: refused ({_ERROR_NAMES.get(status.fault, status.fault)})", status)
+            raise RefusedError(f"{where}: refused ({_ERROR_NAMES.get(status.fault, status.fault)})")
         return status
 
     # ---- all servos ----
@@ -221,10 +205,9 @@ class BusGroup:
             BusGoneError: the port is gone.
         """
         self._asked, self._asked_at = block, self._clock()
-        self.statistics.exchanges += 1
         count = len(self.servos)
-        self._port.send_packet(protocol.sync_read(block.address, block.length, self._order, self.fast), is_answered=True)
-        self._port.setPacketTimeout((block.length + 11) * count + 14 + count)
+        self.port.send_packet(protocol.sync_read(block.address, block.length, self._order, self.fast), is_answered=True)
+        self.port.setPacketTimeout((block.length + 11) * count + 14 + count)
 
     def answers(self) -> dict[int, BlockReading]:
         """Return id -> reading of the servos that answered :meth:`ask_all`; who is missing, is missing.
@@ -237,12 +220,12 @@ class BusGroup:
         block = self._asked
         assert block is not None, "ask_all comes first"
         wanted = dict.fromkeys(self.servos, block.length)
-        found = self._port.collect(wanted)
+        found = self.port.collect(wanted)
         if self.fast and not found:
             self.statistics.fallbacks += 1
             self.fast = False
             self.ask_all(block)
-            found = self._port.collect(wanted)
+            found = self.port.collect(wanted)
             self._fast_failures = self._fast_failures + 1 if found else 0
             self.fast = self._fast_failures < 3
         elif self.fast:
@@ -274,7 +257,7 @@ class BusGroup:
     def _is_good(self, id: int, reading: BlockReading, oldest: float) -> bool:
         if reading.age > oldest:
             self.statistics.stale[id] += 1
-            self._port.suspect = 1
+            self.port.suspect = 1
             return False
         return True
 
@@ -287,7 +270,7 @@ class BusGroup:
         """
         data = {id: self._table(id)[item].encode(count) for id, count in counts.items()}
         row = self._table(next(iter(counts)))[item]
-        self._port.send_packet(protocol.sync_write(row.address, data), is_answered=False)
+        self.port.send_packet(protocol.sync_write(row.address, data), is_answered=False)
 
     def torque_off(self, retries: int = 5, ids: Iterable[int] | None = None) -> set[int]:
         """Switch motors off, whatever happened before; return the ids that did not confirm it.
@@ -321,8 +304,8 @@ class BusGroup:
     # ---- book-keeping ----
 
     def _note_port(self) -> None:
-        self.statistics.crc_errors = self._port.parser.crc_errors
-        self.statistics.discarded = self._port.discarded
+        self.statistics.crc_errors = self.port.parser.crc_errors
+        self.statistics.discarded = self.port.discarded
 
 
 def _identity(ping: Status) -> tuple[int, int]:

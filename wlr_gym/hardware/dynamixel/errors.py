@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from wlr_gym.hardware.dynamixel.protocol import Status
-
 
 class BusGoneError(ConnectionError):
     """The port does not work any more: unplugged adapter, dead driver."""
@@ -18,12 +16,4 @@ class RestlessLineError(NoAnswerError):
 
 
 class RefusedError(RuntimeError):
-    """A servo refused an instruction.
-
-    Attributes:
-        status: its answer.
-    """
-
-    def __init__(self, message: str, status: Status) -> None:
-        super().__init__(message)
-        self.status = status
+    """A servo refused an instruction."""

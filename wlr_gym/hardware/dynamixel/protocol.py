@@ -263,13 +263,10 @@ class Parser:
             del self._buffer[:place]
             if len(self._buffer) < PREFIX:
                 return False
-            if self._is_plausible():
+            id, length = self._buffer[4], int.from_bytes(self._buffer[5:7], "little")
+            if (id <= MAX_ID or id == BROADCAST) and 3 <= length <= MAX_LENGTH:
                 return True
             del self._buffer[:1]
-
-    def _is_plausible(self) -> bool:
-        id, length = self._buffer[4], int.from_bytes(self._buffer[5:7], "little")
-        return (id <= MAX_ID or id == BROADCAST) and 3 <= length <= MAX_LENGTH
 
 
 def _header_tail(data: bytearray) -> int:

@@ -249,8 +249,7 @@ def load_table(model: str) -> ControlTable:
     series = _series(path, str(data["series"]))
     counts = parse_config(Counts, {**series.get("counts", {}), **data.get("counts", {})}, f"{path}: counts")
     sheet = parse_config(DataSheet, data["data_sheet"], f"{path}: data_sheet")
-    fixed: dict[str, dict[str, Any]] = {"model_number": {"default": data["model_number"]}}
-    changed = {**data.get("changed", {}), **fixed}
+    changed = {**data.get("changed", {}), "model_number": {"default": data["model_number"]}}
     try:
         rows = [_item(row, changed) for part in (series, data) for area in ("eeprom", "ram") for row in part.get(area, ())]
         rows += [item for block in series["indirect"] for item in _indirect(*block)]
