@@ -66,6 +66,7 @@ class CameraRig:
         """(K, 4) time, and error along x, y (m) and of yaw (rad), of every pose that was believed."""
         truth = np.array(self.truth)
         truth[:, 3] = np.unwrap(truth[:, 3])
+        assert self.loop.recorder.origin is not None
         start = self._at(truth, self.loop.recorder.origin.time)
         cosine, sine = math.cos(start[2]), math.sin(start[2])
         found = []

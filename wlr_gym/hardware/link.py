@@ -42,6 +42,9 @@ class Link:
     camera: CameraReader | None = None
     seed: int | None = None
 
+    def _devices(self) -> list[Servos | Imu | Flow | CameraReader]:
+        return [device for device in (self.servos, self.imu, self.flow, self.camera) if device is not None]
+
     def open(self) -> None:
         """Open all ports, or none.
 
@@ -49,25 +52,15 @@ class Link:
             InputError: a port is not there, or cannot be opened.
         """
         with contextlib.ExitStack() as stack:
-            self.servos.open()
-            stack.callback(self.servos.close)
-            self.imu.open()
-            stack.callback(self.imu.close)
-            if self.flow is not None:
-                self.flow.open()
-                stack.callback(self.flow.close)
-            if self.camera is not None:
-                self.camera.open()
+            for device in self._devices():
+                device.open()
+                stack.callback(device.close)
             stack.pop_all()
 
     def close(self) -> None:
         """Close all ports; servos stay as they are."""
-        self.servos.close()
-        self.imu.close()
-        if self.flow is not None:
-            self.flow.close()
-        if self.camera is not None:
-            self.camera.close()
+        for device in self._devices():
+            device.close()
         self.finish()
 
 

@@ -12,7 +12,6 @@ import json
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from wlr_gym.hardware.safety.state import RobotStatus
 from wlr_gym.hardware.step import StepRecord
 from wlr_gym.hardware.timing import Clock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
-from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS, Robot
+from wlr_gym.robot import JOINTS, WHEEL_SLICE, Robot
 
 PARTIAL = "partial_"
 #: Phases of the control loop that begin a table, and its kind.
@@ -191,7 +190,7 @@ class RunRecorder:
         columns: of a row.
         log: of the present or last run.
         trouble: why the log cannot be written; empty = it can.
-        origin: what wheel angles and the camera's age count from.
+        origin: what was known where the run began: wheel angles and the camera's age count from there; None = not begun.
         stream: where rows of the run go besides; it has these columns.
     """
 
@@ -209,7 +208,7 @@ class RunRecorder:
         self.log: RunLog | None = None
         self.trouble = ""
         self.stream: McapStream | None = None
-        self.origin: RunOrigin = RunOrigin(0.0, np.zeros(len(WHEELS)))
+        self.origin: RobotStatus | None = None
         self._clock, self._seed = clock, seed
         self._checks: list[str] = []
         self._rules: frozenset[str] = frozenset()
@@ -303,37 +302,20 @@ class RunRecorder:
             self.trouble = self.trouble or f"the log cannot be written: {error}"
 
 
-@dataclass(frozen=True)
-class RunOrigin:
-    """Where and when a run began.
-
-    Attributes:
-        time: s.
-        wheel_position: (4,) rad.
-    """
-
-    time: float
-    wheel_position: np.ndarray
-
-
-def origin_of(status: RobotStatus) -> RunOrigin:
-    """Return the origin of a run that begins now."""
-    return RunOrigin(status.time, status.position[WHEEL_SLICE].copy())
-
-
-def sensors_of(status: RobotStatus, origin: RunOrigin) -> Sensors:
-    """Return what was read as a plant's sensors (1, W); wheels from where they stood at the run's start.
+def sensors_of(status: RobotStatus, origin: RobotStatus | None) -> Sensors:
+    """Return what was read as a plant's sensors (1, W); wheels from where they stood at the run's start, if it has begun.
 
     Without a camera its pose stays 0 and is never new, and its age counts from the start; so it does until the first pose.
     """
     sensors = Sensors(np.zeros((1, SENSOR_LAYOUT.width)))
+    began, wheels = (0.0, 0.0) if origin is None else (origin.time, origin.position[WHEEL_SLICE])
     sensors.joint_position[0] = status.position
-    sensors.joint_position[0, WHEEL_SLICE] -= origin.wheel_position
+    sensors.joint_position[0, WHEEL_SLICE] -= wheels
     sensors.joint_velocity[0], sensors.joint_effort[0] = status.velocity, status.effort
     sensors.gyro[0], sensors.accelerometer[0] = status.gyro, status.accelerometer
     sensors.supply_voltage[0] = np.mean(status.voltage)
     sensors.joint_age[0], sensors.imu_age[0] = status.silence.max(), status.imu_silence
-    sensors.camera_age[0] = sensors.flow_age[0] = status.time - origin.time
+    sensors.camera_age[0] = sensors.flow_age[0] = status.time - began
     if status.flow is not None:
         sensors.flow[0], sensors.flow_quality[0] = status.flow.flow, status.flow.quality
         sensors.flow_age[0], sensors.flow_is_new[0] = status.flow.age, status.flow.is_new

@@ -32,7 +32,7 @@ from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.link import Link
-from wlr_gym.hardware.log import RunRecorder, origin_of, sensors_of
+from wlr_gym.hardware.log import RunRecorder, sensors_of
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.ramp import legs_away, make_ramp, ramp_speed, start_pose
 from wlr_gym.hardware.safety.check import NotReadyError
@@ -173,7 +173,7 @@ class ControlLoop:
                 self.recorder.new_run()
             self._enter(Phase.RAMP)
             self._follow_ramp(target)
-            self.recorder.origin = origin_of(self._step.begin_run())
+            self.recorder.origin = self._step.begin_run()
             self._enter(Phase.RUNNING)
         return self._step.known
 

@@ -56,7 +56,7 @@ class Sensing:
         flow: Flow | None = None,
     ) -> None:
         self._camera = camera
-        self.watch: CameraWatch | None = None if camera is None else CameraWatch(limiter.robot, camera.doubt)
+        self.watch: CameraWatch | None = None if camera is None else CameraWatch(limiter.robot, camera.file.doubt)
         self.count = 0
         self._broken = 0  # packets until all joints answered last
         self._limiter, self._imu, self._clock, self._period = limiter, imu, clock, period

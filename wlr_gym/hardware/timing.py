@@ -13,7 +13,6 @@ import numpy as np
 
 #: Parts of a control step that are timed; latency is from the readings to the setpoints that answer them.
 PARTS = ("read", "think", "write", "slack", "latency")
-_PERCENTILES = (50, 95, 99, 100)
 #: s for which a program works without a pause to learn its share of the processor.
 _SHARE_TIME = 0.2
 
@@ -57,6 +56,12 @@ def processor_share(clock: Callable[[], float]) -> float:
     while (passed := time.perf_counter() - start) < _SHARE_TIME:
         pass
     return min(1.0, (time.thread_time() - used) / passed)
+
+
+def percentiles(milliseconds: np.ndarray) -> dict[str, float]:
+    """Return what 50, 95, 99 and 100 % of the times (ms, one or more) do not exceed: ``p50``, ``p95``, ``p99`` and ``max``."""
+    points = np.percentile(milliseconds, (50, 95, 99, 100)).round(3).tolist()
+    return dict(zip(("p50", "p95", "p99", "max"), points, strict=True))
 
 
 class Pacer:
@@ -129,8 +134,4 @@ class Pacer:
         """Return ticks, missed ones, and percentiles (ms) of period, jitter (start after the deadline) and parts of a tick."""
         times = {name: np.array(values) * 1e3 for name, values in self._times.items()}
         found: dict[str, float | dict[str, float]] = {"ticks": len(times["jitter"]), "missed": self.missed}
-        for name, values in times.items():
-            if len(values):
-                points = np.percentile(values, _PERCENTILES).round(3).tolist()
-                found[name] = dict(zip(("p50", "p95", "p99", "max"), points, strict=True))
-        return found
+        return found | {name: percentiles(values) for name, values in times.items() if len(values)}

@@ -103,11 +103,6 @@ class LiveCamera:
         return reading
 
     @property
-    def doubt(self) -> str:
-        """What is not known of the camera that its poses suffer from; empty = nothing."""
-        return self.file.doubt
-
-    @property
     def trouble(self) -> str:
         """Why no reading will come any more; empty = the process runs."""
         if self.process is None:

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.hardware.camera.config import CameraFile
 from wlr_gym.perception.vision.live_pose import MEANINGS
 from wlr_gym.perception.vision.tracking import OK, PARTIAL, Sample
 
@@ -52,6 +53,8 @@ class CameraReading:
 class CameraReader(Protocol):
     """Where the control loop gets readings from; nothing in it waits."""
 
+    file: CameraFile
+
     def open(self) -> None:
         """Begin; readings may come a while later."""
         ...
@@ -62,11 +65,6 @@ class CameraReader(Protocol):
 
     def read(self, now: float) -> CameraReading | None:
         """Return the newest reading that was not returned yet, at ``now`` (s); None = there is none."""
-        ...
-
-    @property
-    def doubt(self) -> str:
-        """What is not known of the camera that its poses suffer from; empty = nothing."""
         ...
 
     @property

@@ -82,23 +82,15 @@ class EmulatedCamera:
         while self._due and self._due[0][0].arrival <= now + 1e-9:
             exposure, poses = self._due.popleft()
             if not (exposure.is_lost or self._is_dead):
-                reading = self._reading(exposure, poses)
+                image = self._camera.picture(exposure, poses)
+                moment = self._clock.time(exposure.stamp, exposure.arrival)
+                sample = self._finder(VideoFrame(exposure.number, moment, image))
+                reading = reading_of(sample, exposure.number, exposure.arrival, exposure.arrival)
         return reading
-
-    def _reading(self, exposure: Exposure, poses: list[RobotPose]) -> CameraReading:
-        image = self._camera.picture(exposure, poses)
-        moment = self._clock.time(exposure.stamp, exposure.arrival)
-        sample = self._finder(VideoFrame(exposure.number, moment, image))
-        return reading_of(sample, exposure.number, exposure.arrival, exposure.arrival)
 
     def _at(self, time: float) -> RobotPose:
         """The pose of the tick nearest to a time."""
         return min(self._poses, key=lambda pose: abs(pose.time - time))
-
-    @property
-    def doubt(self) -> str:
-        """What is not known of the camera that its poses suffer from; empty = nothing."""
-        return self.file.doubt
 
     @property
     def trouble(self) -> str:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.hardware.camera.reading import CameraReading
 from wlr_gym.hardware.safety.state import CameraStatus
+from wlr_gym.hardware.timing import percentiles
 from wlr_gym.perception.vision.live_pose import MEANINGS
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE, Robot
 
@@ -83,7 +84,7 @@ class CameraWatch:
     """Judges the camera's readings, control step by control step, and shows poses in the frame of the run.
 
     Args:
-        robot: its geometry. doubt: of the camera, see :class:`wlr_gym.hardware.camera.reading.CameraReader`.
+        robot: its geometry. doubt: of the camera, see :class:`wlr_gym.hardware.camera.config.CameraFile`.
 
     Attributes:
         status: what is known now.
@@ -353,8 +354,7 @@ def camera_statistics(watch: CameraWatch) -> dict[str, Any]:
     found: dict[str, Any] = {"frames": watch.frames, "poses": watch.poses, "rate": round(watch.rate, 2)}
     for name, seconds in (("latency", watch.latencies), ("work", watch.work)):
         if seconds:
-            points = np.percentile(1e3 * np.array(seconds), (50, 95, 99, 100)).round(3).tolist()
-            found[name] = dict(zip(("p50", "p95", "p99", "max"), points, strict=True))
+            found[name] = percentiles(1e3 * np.array(seconds))
     if (lag := watch.lag) is not None:
         found["lag"] = {"ms": round(1e3 * lag[0], 2), "std": round(1e3 * lag[1], 2)}
     if watch.status.doubt:
