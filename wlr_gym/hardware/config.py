@@ -204,21 +204,16 @@ class Hardware(SettingsModel):
     @model_validator(mode="after")
     def _registers_are_those_of_the_setpoints(self) -> Hardware:
         for name, bus in self.buses.items():
-            turn = load_table(bus.model).counts.turn
+            table = load_table(bus.model)
             for joint in bus.joints:
-                _require_registers(name, bus, joint)
-                if self.joints[joint].zero >= turn:
+                mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE  # in another one, setpoints would be another quantity
+                for item, expected in {"operating_mode": mode, **FIXED_REGISTERS}.items():
+                    if (found := bus.eeprom.get(item, table[item].default)) != expected:
+                        where = f"buses.{name}.eeprom.{item}"
+                        raise ValueError(f"{where} is {found}, expected {expected}: {joint} is driven with that")
+                if self.joints[joint].zero >= (turn := table.counts.turn):
                     raise ValueError(f"joints.{joint}.zero = {self.joints[joint].zero}: expected 0 to {turn - 1}")
         return self
-
-
-def _require_registers(name: str, bus: Bus, joint: str) -> None:
-    """Raise :class:`ValueError` where a bus's EEPROM is not what a joint is driven with."""
-    mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE  # in another one, setpoints would be another quantity
-    for item, expected in {"operating_mode": mode, **FIXED_REGISTERS}.items():
-        found = bus.eeprom.get(item, load_table(bus.model)[item].default)
-        if found != expected:
-            raise ValueError(f"buses.{name}.eeprom.{item} is {found}, expected {expected}: {joint} is driven with that")
 
 
 def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:

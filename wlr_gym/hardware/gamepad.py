@@ -85,7 +85,13 @@ class DrivingPad:
             raise
         whole = len(self._rest) // _EVENT.size * _EVENT.size
         for _, value, kind, number in _EVENT.iter_unpack(self._rest[:whole]):
-            self._take(value, kind & ~_AT_START, number)
+            kind &= ~_AT_START
+            if kind == _AXIS and number < len(self._sticks):
+                self._sticks[number] = max(-1.0, value / _END)
+            elif kind == _BUTTON and number == self._buttons.deadman:
+                self.is_held = bool(value)
+            elif kind == _BUTTON and value:
+                self._pressed.add(number)
         self._rest = self._rest[whole:]
 
     def _read(self) -> bytes:
@@ -97,11 +103,3 @@ class DrivingPad:
         except BlockingIOError:
             return found
         raise OSError(errno.ENODEV, f"gamepad {self._device} is gone")
-
-    def _take(self, value: int, kind: int, number: int) -> None:
-        if kind == _AXIS and number < len(self._sticks):
-            self._sticks[number] = max(-1.0, value / _END)
-        elif kind == _BUTTON and number == self._buttons.deadman:
-            self.is_held = bool(value)
-        elif kind == _BUTTON and value:
-            self._pressed.add(number)

@@ -61,7 +61,7 @@ class RobotPlant:
     ) -> None:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count != 1:
             raise InputError(f"number of robots is {count!r}, expected 1: there is one robot on the ports")
-        self.robot = robot
+        self.robot, self.count = robot, 1
         self.options: PlantOptions = options or PlantOptions()
         self.parameters: Parameters = Parameters.nominal(robot, 1)
         chosen = hardware or RobotOptions()
@@ -86,11 +86,6 @@ class RobotPlant:
             watchdog=chosen.guard,
             meta=meta,
         )
-
-    @property
-    def count(self) -> int:
-        """One robot."""
-        return 1
 
     def reset(
         self,

@@ -216,7 +216,9 @@ class Stand:
             raise QuitError(asked)
         joints = list(joints)
         for leg in [joint for joint in joints if joint in LEGS]:
-            self._check_way(leg)
+            way = self._goal(leg) - self._register(leg, "present_position")
+            if not abs(way) <= LARGEST_LEAN + _READING:  # a hand may have moved it
+                raise TroubleError(f"{leg}: {way:+.2f} rad from its setpoint, expected {LARGEST_LEAN:g} at most: turn it less")
         self._on.update(joints)
         self.sign_of_life(LONGEST_BUSY)
         for joint in joints:
@@ -226,12 +228,6 @@ class Stand:
         self._armed.update(joints)
         for joint in sorted(joints, key=lambda joint: JOINTS.index(joint) % len(LEGS)):  # no bus is silent for long meanwhile
             self.servos.set(joint, "bus_watchdog", watchdog_count(self.hardware.safety.watchdog))
-
-    def _check_way(self, leg: str) -> None:
-        """See that a leg is no farther from its setpoint than any test asks: a hand may have moved it."""
-        way = self._goal(leg) - self._register(leg, "present_position")
-        if not abs(way) <= LARGEST_LEAN + _READING:
-            raise TroubleError(f"{leg}: {way:+.2f} rad from its setpoint, expected {LARGEST_LEAN:g} at most: turn it less")
 
     def switch_off(self, joints: Iterable[str]) -> None:
         """Switch single motors off, and disarm their watchdogs; what they are to do stays in their registers.

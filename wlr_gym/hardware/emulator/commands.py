@@ -29,10 +29,13 @@ def run_command(machine: Machine, text: str) -> str:
     if word == "straighten":
         machine.straighten(" ".join(rest))
         return f"{rest[0]} hangs straight down"
-    actions = {"faults": _list_faults, "status": _status, "help": _help}
-    if word not in actions:
-        raise unknown_name("command", word, [*actions, "clear", "turn", "straighten", *FAULTS])
-    return actions[word](machine)
+    if word == "faults":
+        return "\n".join(machine.faults.listing(machine.time)) or "no faults"
+    if word == "status":
+        return _status(machine)
+    if word == "help":
+        return _help()
+    raise unknown_name("command", word, ["faults", "status", "help", "clear", "turn", "straighten", *FAULTS])
 
 
 def _turn(machine: Machine, text: str, words: list[str]) -> str:
@@ -43,10 +46,6 @@ def _turn(machine: Machine, text: str, words: list[str]) -> str:
         raise InputError(f"'{text}': expected turn JOINT DEGREES") from None
     machine.turn(joint, angle)
     return f"{joint} turned by {degrees} deg"
-
-
-def _list_faults(machine: Machine) -> str:
-    return "\n".join(machine.faults.listing(machine.time)) or "no faults"
 
 
 def _status(machine: Machine) -> str:
@@ -63,7 +62,7 @@ def _status(machine: Machine) -> str:
     return "\n".join(lines)
 
 
-def _help(machine: Machine) -> str:
+def _help() -> str:
     lines = [
         "status | faults | clear [KIND] | turn JOINT DEGREES | straighten LEG | help",
         "KIND [WHERE ...] [probability=] [value=] [after=] [duration=]",

@@ -17,7 +17,7 @@ from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
 from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo
 from wlr_gym.hardware.fit import check_fit
 from wlr_gym.hardware.imu.frames import ImuFrame, encode_frame
-from wlr_gym.hardware.imu.reading import Conversion, Counts
+from wlr_gym.hardware.imu.reading import Conversion
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState
 from wlr_gym.physics.plants.forces import Force
@@ -206,7 +206,9 @@ class Machine:
         self._frames += 1
         stamp = self._frames / self.hardware.imu.rate + self._paused
         if not self.faults.active(self.time, "imu_frozen", ["imu"]):
-            self._imu_values = self._chip_counts(sensors.accelerometer[0], sensors.gyro[0])
+            force, (x, y, z) = self._imu.counts(sensors.accelerometer[0], sensors.gyro[0])
+            # the chip's last bit never rests, also where the plant's sensors have no noise
+            self._imu_values = force, (x, y, z if self.options.sensor_noise else z + self._frames // IMU_DITHER % 2)
         force, rate = self._imu_values
         if not self.faults.active(self.time, "imu_stale", ["imu"]):
             self._imu_frame = ImuFrame(self._frames % 65536, round(stamp * 1e6) % 2**32, force, _IMU_TEMPERATURE, rate)
@@ -214,11 +216,6 @@ class Machine:
         raw, delay = self.faults.mangle(self.time, encode_frame(frame), ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
             self._imu_output.append(Emission(self.time + delay, raw))
-
-    def _chip_counts(self, accelerometer: np.ndarray, gyro: np.ndarray) -> tuple[Counts, Counts]:
-        """Return what the chip counts. Its last bit never rests, also where the plant's sensors have no noise."""
-        force, (x, y, z) = self._imu.counts(accelerometer, gyro)
-        return force, (x, y, z if self.options.sensor_noise else z + self._frames // IMU_DITHER % 2)
 
     def take_output(self) -> dict[str, list[Emission]]:
         """Return the frames that the sensors sent since the last call, by their ports."""

@@ -11,7 +11,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import FlowPort
@@ -95,34 +95,20 @@ class Pmw3901:
             )
         for register in range(MOTION, MOTION + 5):  # once, whatever they say
             self.read(register)
-        self._optimise()
-
-    def _optimise(self) -> None:
-        for register, value in FIRST_SETTINGS:
-            self.write(register, value)
+        self._write_all(FIRST_SETTINGS)
         self.write(0x48, 0x04 if self.read(0x67) & 0x80 else 0x02)
-        for register, value in SECOND_SETTINGS:
-            self.write(register, value)
-        if self.read(0x73) == 0x00:
-            self._set_gains()
-        for register, value in THIRD_SETTINGS:
-            self.write(register, value)
+        self._write_all(SECOND_SETTINGS)
+        if self.read(0x73) == 0x00:  # two values depend on what the chip was trimmed to
+            first, second = self.read(0x70), self.read(0x71)
+            first = min(first + (0x0E if first <= 0x1C else 0x0B), 0x3F)
+            gains = ((0x70, first), (0x71, second * 45 // 100))
+            self._write_all(((PAGE, 0x00), (0x61, 0xAD), (0x51, 0x70), (PAGE, 0x0E), *gains))
+        self._write_all(THIRD_SETTINGS)
         self._sleep(SETTLE_TIME)
-        for register, value in LAST_SETTINGS:
-            self.write(register, value)
+        self._write_all(LAST_SETTINGS)
 
-    def _set_gains(self) -> None:
-        """Write two values that depend on what the chip was trimmed to."""
-        first, second = self.read(0x70), self.read(0x71)
-        first = min(first + (0x0E if first <= 0x1C else 0x0B), 0x3F)
-        for register, value in (
-            (PAGE, 0x00),
-            (0x61, 0xAD),
-            (0x51, 0x70),
-            (PAGE, 0x0E),
-            (0x70, first),
-            (0x71, second * 45 // 100),
-        ):
+    def _write_all(self, settings: Iterable[tuple[int, int]]) -> None:
+        for register, value in settings:
             self.write(register, value)
 
     def motion(self) -> tuple[bool, int, int, int, int]:

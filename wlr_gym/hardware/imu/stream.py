@@ -61,20 +61,11 @@ class ImuStream:
             self._device.close()
             self._device = None
 
-    def frames(self) -> list[ImuFrame]:
-        """Return all frames that came since the last call; does not wait.
-
-        Raises:
-            ImuGoneError: the port is gone.
-        """
+    def read(self) -> ImuReading | None:
+        """Return the newest frame; see :class:`wlr_gym.hardware.imu.driver.Imu`. None also while nobody knows how old it is."""
         frames = self._parser.feed(self._received())
         self.statistics.readings += len(frames)
         self.statistics.lost, self.statistics.errors = self._parser.lost, self._parser.crc_errors
-        return frames
-
-    def read(self) -> ImuReading | None:
-        """Return the newest frame; see :class:`wlr_gym.hardware.imu.driver.Imu`. None also while nobody knows how old it is."""
-        frames = self.frames()
         now = self._clock()
         is_recent, self._emptied_at = now - self._emptied_at <= RECENT, now
         if frames:

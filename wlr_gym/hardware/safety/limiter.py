@@ -271,14 +271,10 @@ class CommandLimiter:
         self.setpoints = decision.setpoints
         if not self.dry_run:
             self.__servos.write_setpoints(self._within_registers(decision.setpoints))
-            self._switch(decision.torque_on)
+            for k in np.flatnonzero(decision.torque_on != self.torque_on):  # their setpoints ask for what they are to do
+                self.__servos.set(JOINTS[k], "torque_enable", int(decision.torque_on[k]))
         self.torque_on = decision.torque_on.copy()
         return decision
-
-    def _switch(self, torque_on: NDArray[np.bool_]) -> None:
-        """Switch single motors; their setpoints, just written, ask for what they are to do."""
-        for k in np.flatnonzero(torque_on != self.torque_on):
-            self.__servos.set(JOINTS[k], "torque_enable", int(torque_on[k]))
 
     def off(self) -> list[str]:
         """Switch every motor off, whatever happened before; return the joints that did not confirm it.

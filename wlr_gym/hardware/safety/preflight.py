@@ -124,14 +124,8 @@ def _check_servo(servos: Servos, robot: Robot, hardware: Hardware, joint: str) -
     yield Check(joint, "model", number == table.model_number, str(number), f"{table.model_number} ({bus.model})", remedy)
     if number != table.model_number:
         return
-    yield Check(
-        joint,
-        "firmware",
-        firmware >= FIRST_FIRMWARE,
-        str(firmware),
-        f"{FIRST_FIRMWARE} or newer",
-        "Update it (Dynamixel Wizard).",
-    )
+    newer, remedy = f"{FIRST_FIRMWARE} or newer", "Update it (Dynamixel Wizard)."
+    yield Check(joint, "firmware", firmware >= FIRST_FIRMWARE, str(firmware), newer, remedy)
     fast = f"{FAST_READ_FIRMWARE} or newer for fast reads"
     yield Check(joint, "fast reads", firmware >= FAST_READ_FIRMWARE, str(firmware), fast, "Update the firmware.", False)
     try:
@@ -152,15 +146,9 @@ def _check_state(servos: Servos, hardware: Hardware, bus: Bus, joint: str) -> It
     low, high = expected_count(bus, "min_voltage_limit"), expected_count(bus, "max_voltage_limit")
     volt = load_table(bus.model).counts.voltage
     low = max(low, math.ceil(hardware.safety.low_voltage / volt - 1e-9))  # below it the run would stop at once
+    expected = f"{low * volt:.1f} to {high * volt:.1f} V"
     remedy = "Charge the battery, or check supply and cables; power should be fed in on both sides of a long chain."
-    yield Check(
-        joint,
-        "supply",
-        low <= voltage <= high,
-        f"{voltage * volt:.1f} V",
-        f"{low * volt:.1f} to {high * volt:.1f} V",
-        remedy,
-    )
+    yield Check(joint, "supply", low <= voltage <= high, f"{voltage * volt:.1f} V", expected, remedy)
     temperature = servos.get(joint, "present_temperature")
     yield Check(joint, "temperature", temperature < WARM, f"{temperature} degC", f"below {WARM} degC", "Let it cool down.")
     errors = error_names(servos.get(joint, "hardware_error_status"))
