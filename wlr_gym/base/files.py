@@ -31,7 +31,7 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
         raise InputError(f"{option} {path}: cannot be written to")
 
 
-def require_output_place(path: Path, option: str = "--out") -> None:
+def require_output_place(path: Path) -> None:
     """Refuse, before the work, a place where no folder for results can be made; nothing is.
 
     Raises:
@@ -39,12 +39,12 @@ def require_output_place(path: Path, option: str = "--out") -> None:
     """
     nearest = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
     if not nearest.is_dir():
-        raise InputError(f"{option} {path}: {nearest} is a file; expected a folder")
+        raise InputError(f"--out {path}: {nearest} is a file; expected a folder")
     try:
         with tempfile.TemporaryDirectory(dir=nearest):  # rights alone do not tell: /proc has them
             pass
     except OSError as error:
-        raise InputError(f"{option} {path}: cannot be written to: {error.strerror}") from None
+        raise InputError(f"--out {path}: cannot be written to: {error.strerror}") from None
 
 
 @contextmanager

@@ -41,13 +41,6 @@ def refusal(model: type[BaseModel], data: object, error: ValidationError, where:
     return InputError("\n  ".join([f"{where}: {len(faults)} faults", *faults]))
 
 
-def refused_option(error: ValidationError) -> InputError:
-    """Return the error about the first refused field, which is an option of a command."""
-    problem = error.errors()[0]
-    name = str(problem["loc"][0]).replace("_", "-")
-    return InputError(f"--{name} {shown(problem['input'], str)}: {expected(problem)}")
-
-
 def expected(problem: Any) -> str:
     """Return what was expected, such as ``expected more than 0``, or what pydantic or a model's own check says."""
     context = problem.get("ctx", {})

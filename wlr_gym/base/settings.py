@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import find_config, named_by, named_in
-from wlr_gym.base.refusals import refusal, refused_option, shown
+from wlr_gym.base.refusals import expected, refusal, shown
 
 ModelType = TypeVar("ModelType", bound=BaseModel)
 #: What a file says, and its path as messages name it.
@@ -186,4 +186,6 @@ def parse_options(model: type[ModelType], given: Mapping[str, Any]) -> ModelType
     try:
         return model.model_validate(given)
     except ValidationError as error:
-        raise refused_option(error) from None
+        problem = error.errors()[0]
+        name = str(problem["loc"][0]).replace("_", "-")
+        raise InputError(f"--{name} {shown(problem['input'], str)}: {expected(problem)}") from None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import struct
-from types import TracebackType
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import PadButtons
@@ -55,7 +54,7 @@ class DrivingPad:
             ) from None
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         os.close(self._file)
 
     def command(self) -> dict[str, float]:

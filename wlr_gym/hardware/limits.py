@@ -106,21 +106,17 @@ class SafetyLimits(SettingsModel):
 
     @model_validator(mode="after")
     def _limits_are_in_order(self) -> SafetyLimits:
-        for low, high, why in _ORDER:
+        for low, high, why in (
+            ("coast", "silence", ""),
+            ("leg_error", "leg_lead", ", or it never shows"),
+            ("watchdog", "heartbeat", ""),
+            ("warm", "hot", ""),
+        ):
             below, above = getattr(self, low), getattr(self, high)
             if not below < above:
                 unit = unit_of(low)
                 raise InputError(f"safety.{low} = {below:g} {unit}: expected below {high} = {above:g} {unit}{why}")
         return self
-
-
-#: Limits of which the first must be below the second, and why where it does not go without saying.
-_ORDER = (
-    ("coast", "silence", ""),
-    ("leg_error", "leg_lead", ", or it never shows"),
-    ("watchdog", "heartbeat", ""),
-    ("warm", "hot", ""),
-)
 
 
 def require_deadman(name: str, seconds: float) -> None:

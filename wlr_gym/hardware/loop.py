@@ -104,10 +104,7 @@ class ControlLoop:
         watchdog: bool = True,
         meta: RunMeta | None = None,
     ) -> None:
-        if period >= (longest := hardware.safety.watchdog):
-            raise InputError(
-                f"control period {period:g} s: expected less than safety.watchdog, {longest:g} s: servos would stop"
-            )
+        _check_period(period, hardware.safety.watchdog)
         meta = meta or RunMeta(robot=robot.name, profile=Profile(), notes="dry run" if dry_run else None)
         self.robot, self.hardware, self.limits = robot, hardware, hardware.safety
         self.phase: Phase = Phase.TORQUE_OFF
@@ -374,6 +371,11 @@ class ControlLoop:
         self.phase = phase
         self._limiter.is_calm = phase is Phase.RAMP
         self.recorder.phase(phase.value, self.reason)
+
+
+def _check_period(period: float, longest: float) -> None:
+    if period >= longest:
+        raise InputError(f"control period {period:g} s: expected less than safety.watchdog, {longest:g} s: servos would stop")
 
 
 def _demand(left: list[str]) -> str:

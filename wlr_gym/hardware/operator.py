@@ -10,7 +10,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from types import TracebackType
 
 from wlr_gym.hardware.timing import Clock
 
@@ -108,7 +107,7 @@ class Keys:
             tty.setcbreak(self._source)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._before is not None and self._source is not None:
             import termios
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field
 
@@ -85,17 +84,12 @@ def load_camera_file(source: str | Path | CameraFile) -> CameraFile:
         return source
     data, where = read_config("camera", source)
     require_keys(CameraFile, data, where)
-    return parse_config(CameraFile, {**data, **_named_files(data, where)}, where)
-
-
-def _named_files(data: dict[Any, Any], where: str) -> dict[str, Any]:
-    """Return the contents of the files that a camera file names."""
-    found: dict[str, Any] = {}
+    content = dict(data)
     for key in ("body", "floor"):
         if not isinstance(data.get(key), dict):
             with named_by(where, key):
-                found[key] = load_target(named_in(where, data.get(key, key)))
+                content[key] = load_target(named_in(where, data.get(key, key)))
     if isinstance(calibration := data.get("calibration"), str):
         with named_by(where, "calibration"):
-            found["calibration"] = load_camera(named_in(where, calibration))
-    return found
+            content["calibration"] = load_camera(named_in(where, calibration))
+    return parse_config(CameraFile, content, where)

@@ -24,7 +24,11 @@ def _measure_latency(stand: Stand, person: Person) -> list[Reading]:
     for name, bus in stand.hardware.buses.items():
         joint, group = bus.joints[0], stand.servos.groups[name]
         lost = sum(group.statistics.missing.values())
-        times = [_timed_ping(stand, joint) - _PING_BYTES * _BITS / bus.baud_rate for _ in range(_PINGS)]
+        times = []
+        for _ in range(_PINGS):
+            start = stand.clock.now()
+            stand.servos.ping(joint)
+            times.append(stand.clock.now() - start - _PING_BYTES * _BITS / bus.baud_rate)
         median, slow = np.percentile(times, [50, 99]).tolist()
         stand.samples[f"ping_{name}"] = times
         lost = sum(group.statistics.missing.values()) - lost
@@ -34,12 +38,6 @@ def _measure_latency(stand: Stand, person: Person) -> list[Reading]:
             Reading("lost_answers", name, lost / _PINGS),
         ]
     return found
-
-
-def _timed_ping(stand: Stand, joint: str) -> float:
-    start = stand.clock.now()
-    stand.servos.ping(joint)
-    return stand.clock.now() - start
 
 
 LATENCY = StandTest(

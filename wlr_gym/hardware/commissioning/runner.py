@@ -109,21 +109,15 @@ class Commissioning:
 
     def make(self, tests: Sequence[StandTest]) -> Iterator[StandResult]:
         """Make the tests and yield how each went; the last one is the one that was stopped, if one was."""
-        with self._guarded():
+        guard = Guard(self._robot, self._hardware, is_wanted=self._link.is_serial)
+        guard.start(self._folder)
+        self._stand.sign_of_life = guard.expect
+        try:
             for test in tests:
                 result = self._make(test)
                 yield result
                 if result.state == STOPPED:
                     return
-
-    @contextlib.contextmanager
-    def _guarded(self) -> Iterator[None]:
-        """Have a process beside this one that switches the motors of a real robot off when this one is killed or hangs."""
-        guard = Guard(self._robot, self._hardware, is_wanted=self._link.is_serial)
-        guard.start(self._folder)
-        self._stand.sign_of_life = guard.expect
-        try:
-            yield
         finally:
             if self._is_off:  # else it goes on trying when this process is gone
                 guard.release()

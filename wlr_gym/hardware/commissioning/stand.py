@@ -315,33 +315,30 @@ class Stand:
 
     def off(self) -> list[str]:
         """Switch every motor off and put the registers back, whatever happened; return the joints that did not confirm."""
+        servos = self.servos
         self.operator.is_switching_off = True
         try:
-            return self._off()
+            for _ in range(2):
+                servos.torque_off_unacknowledged()
+            self.sign_of_life(LONGEST_OFF)
+            left = servos.torque_off(1)
+            for _ in range(_OFF_TRIES):
+                if not left:
+                    break
+                self.clock.wait_until(self.clock.now() + _OFF_PAUSE)
+                servos.reopen_gone()
+                left = servos.torque_off(1, left)
+            with contextlib.suppress(ConnectionError, NoAnswerError, RefusedError):
+                is_off = [joint for joint in JOINTS if joint not in left]
+                for joint in is_off:
+                    servos.set(joint, "bus_watchdog", 0)
+                self.prepare(is_off)
+            self._on.clear()
+            self.sign_of_life(math.inf)
+            return left
         finally:
             self.operator.is_switching_off = False
             self._setpoints[:] = np.nan
-
-    def _off(self) -> list[str]:
-        servos = self.servos
-        for _ in range(2):
-            servos.torque_off_unacknowledged()
-        self.sign_of_life(LONGEST_OFF)
-        left = servos.torque_off(1)
-        for _ in range(_OFF_TRIES):
-            if not left:
-                break
-            self.clock.wait_until(self.clock.now() + _OFF_PAUSE)
-            servos.reopen_gone()
-            left = servos.torque_off(1, left)
-        with contextlib.suppress(ConnectionError, NoAnswerError, RefusedError):
-            for joint in JOINTS:
-                if joint not in left:
-                    servos.set(joint, "bus_watchdog", 0)
-            self.prepare([joint for joint in JOINTS if joint not in left])
-        self._on.clear()
-        self.sign_of_life(math.inf)
-        return left
 
 
 def _names(mask: NDArray[np.bool_]) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -233,17 +233,16 @@ class BusGroup:
         self._note_port()
         now = self._clock()
         self.statistics.missing.update(self.servos.keys() - found.keys())
-        self._ask_last(found)
+        if (silent := next((id for id in self._order if id not in found), None)) is not None:
+            self._order.remove(silent)  # the first one is asked last from now on: those named behind it wait for its answer
+            self._order.append(silent)
         readings = {id: self._reading(block, status, now) for id, status in found.items()}
         oldest = now - self._asked_at + STALE  # an answer may have waited for us, but was not given before we asked
-        return {id: reading for id, reading in readings.items() if self._is_good(id, reading, oldest)}
-
-    def _ask_last(self, found: Collection[int]) -> None:
-        """Ask the first servo that was silent last from now on: those named behind it wait for its answer."""
-        silent = next((id for id in self._order if id not in found), None)
-        if silent is not None:
-            self._order.remove(silent)
-            self._order.append(silent)
+        for id in [id for id, reading in readings.items() if reading.age > oldest]:
+            self.statistics.stale[id] += 1
+            self.port.suspect = 1
+            del readings[id]
+        return readings
 
     def _reading(self, block: Block, status: Status, now: float) -> BlockReading:
         counts = block.decode(status.data)
@@ -253,13 +252,6 @@ class BusGroup:
         if status.alert:
             self.statistics.alerts[status.id] += 1
         return BlockReading(counts, status.alert, age, restarted)
-
-    def _is_good(self, id: int, reading: BlockReading, oldest: float) -> bool:
-        if reading.age > oldest:
-            self.statistics.stale[id] += 1
-            self.port.suspect = 1
-            return False
-        return True
 
     def write_all(self, item: str, counts: Mapping[int, int]) -> None:
         """Write id -> count in one packet. Nobody acknowledges it, and a servo ignores a count out of range: clamp before.

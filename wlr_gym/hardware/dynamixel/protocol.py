@@ -258,7 +258,8 @@ class Parser:
         while True:
             place = self._buffer.find(HEADER)
             if place < 0:
-                del self._buffer[: len(self._buffer) - _header_tail(self._buffer)]
+                start = next((size for size in (3, 2, 1) if self._buffer.endswith(HEADER[:size])), 0)  # of a header to come
+                del self._buffer[: len(self._buffer) - start]
                 return False
             del self._buffer[:place]
             if len(self._buffer) < PREFIX:
@@ -267,11 +268,6 @@ class Parser:
             if (id <= MAX_ID or id == BROADCAST) and 3 <= length <= MAX_LENGTH:
                 return True
             del self._buffer[:1]
-
-
-def _header_tail(data: bytearray) -> int:
-    """Bytes at the end of ``data`` that a header may start with."""
-    return next((size for size in (3, 2, 1) if data.endswith(HEADER[:size])), 0)
 
 
 def _decode(raw: bytes) -> Packet | None:

@@ -107,9 +107,8 @@ class Machine:
         self.ticks = 0
         self.faults: FaultBoard = FaultBoard(self.options.seed)
         self.watchers: list[Callable[[], None]] = []
-        self._imu_output: list[Emission] = []
-        self._flow_output: list[Emission] = []
         self._flow = self._make_flow()
+        self._output: dict[str, list[Emission]] = {name: [] for name in self.sensors}
         self._imu = Conversion(hardware.imu)
         self._frames = 0
         self._paused = 0.0
@@ -169,7 +168,7 @@ class Machine:
         while self.time >= (self._frames + 1) / self.hardware.imu.rate - 1e-9:
             self._read_imu()
         if self._flow is not None:
-            self._flow_output += self._flow.step(self.time, self._paused, self.coupling.sensors)
+            self._output["flow"] += self._flow.step(self.time, self._paused, self.coupling.sensors)
         for watcher in self.watchers:
             watcher()
 
@@ -215,13 +214,12 @@ class Machine:
         frame = self._imu_frame
         raw, delay = self.faults.mangle(self.time, encode_frame(frame), ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
-            self._imu_output.append(Emission(self.time + delay, raw))
+            self._output["imu"].append(Emission(self.time + delay, raw))
 
     def take_output(self) -> dict[str, list[Emission]]:
         """Return the frames that the sensors sent since the last call, by their ports."""
-        output = {"imu": self._imu_output, "flow": self._flow_output}
-        self._imu_output, self._flow_output = [], []
-        return {name: output[name] for name in self.sensors}
+        output, self._output = self._output, {name: [] for name in self.sensors}
+        return output
 
     # ---- faults ----
 

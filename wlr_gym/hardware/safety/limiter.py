@@ -192,23 +192,18 @@ class CommandLimiter:
 
     def _prepare(self) -> Array:
         """Set the registers that a run depends on; return Goal PWM (8,) in counts."""
-        servos = self.__servos
+        servos, profile = self.__servos, self.profile
+        leg = {"profile_velocity": profile.leg_velocity, "profile_acceleration": profile.leg_acceleration}  # rad/s, rad/s2
+        wheel = {"profile_acceleration": profile.wheel_acceleration}
         goal_pwm = np.zeros(len(JOINTS))
         for k, joint in enumerate(JOINTS):
             goal_pwm[k] = servos.get(joint, "pwm_limit")
             servos.set(joint, "goal_pwm", int(goal_pwm[k]))
             registers.reset_tuning(servos, joint)
-            for item, value in self._profile_of(joint).items():
+            for item, value in (leg if joint in LEGS else wheel).items():
                 count = round(value / servos.table(joint).per_count(item))
                 servos.set(joint, item, count if value == 0.0 else max(1, count))  # 0 would be no profile at all
         return goal_pwm
-
-    def _profile_of(self, joint: str) -> dict[str, float]:
-        """Profile registers of a joint, rad/s and rad/s2."""
-        profile = self.profile
-        if joint in LEGS:
-            return {"profile_velocity": profile.leg_velocity, "profile_acceleration": profile.leg_acceleration}
-        return {"profile_acceleration": profile.wheel_acceleration}
 
     def _positions(self) -> Array:
         position = np.full(len(JOINTS), np.nan)

@@ -245,7 +245,10 @@ def load_table(model: str) -> ControlTable:
     if not own and model not in shipped_tables():
         raise unknown_name("servo model", model, shipped_tables())
     path = Path(model) if own else shipped_tables()[model]
-    data = _checked(path)
+    data = read_yaml(path)
+    for key in ("model", "model_number", "series", "operating_modes", "data_sheet"):
+        if not isinstance(data, dict) or key not in data:
+            raise InputError(f"{path}: '{key}' is missing: expected a servo, as {_FOLDER / 'xm540_w150.yaml'} describes one")
     series = _series(path, str(data["series"]))
     counts = parse_config(Counts, {**series.get("counts", {}), **data.get("counts", {})}, f"{path}: counts")
     sheet = parse_config(DataSheet, data["data_sheet"], f"{path}: data_sheet")
@@ -262,14 +265,6 @@ def load_table(model: str) -> ControlTable:
     return ControlTable(
         data["model"], data["model_number"], tuple(data["operating_modes"]), items, counts, sheet, sheet.voltage
     )
-
-
-def _checked(path: Path) -> dict[str, Any]:
-    data = read_yaml(path)
-    for key in ("model", "model_number", "series", "operating_modes", "data_sheet"):
-        if not isinstance(data, dict) or key not in data:
-            raise InputError(f"{path}: '{key}' is missing: expected a servo, as {_FOLDER / 'xm540_w150.yaml'} describes one")
-    return data
 
 
 def _series(path: Path, name: str) -> dict[str, Any]:
