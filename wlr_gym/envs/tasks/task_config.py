@@ -273,7 +273,8 @@ def _check_ranges(config: TaskConfig, where: str) -> None:
 
 
 def _check_scalars(group: str, chosen: Mapping[str, Mapping[str, float]], where: str) -> None:
-    kind, registry, required = _CALLED[group], SCALARS[group], {"weight"} if group == "rewards" else set[str]()
+    kind, registry = _CALLED[group], SCALARS[group]
+    required = {"weight"} if group == "rewards" else set[str]()
     for name, values in chosen.items():
         valid = required | set(registry[name].parameters)
         for key in values:

@@ -19,7 +19,7 @@ from wlr_gym.perception.markers.detection import Detection
 from wlr_gym.perception.markers.pose import MINIMUM_MARKERS, TargetPose, solve_pose, solved_floor
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import LONGEST_STEP, TargetView, adjust, at_frame_time, velocity_between
-from wlr_gym.perception.vision.tracking import Sample, mean_detection
+from wlr_gym.perception.vision.tracking import Sample, centres_of, mean_detection
 
 Array = NDArray[np.float64]
 
@@ -65,10 +65,7 @@ def camera_motion(samples: Sequence[Sample], camera: Camera, floor: Target, read
     first = next((sample.floor for sample in samples if sample.floor is not None), None)
     if first is None or not any(sample.floor_seen for sample in samples):  # samples without pictures
         return CameraMotion(tuple(sample.floor for sample in samples), moves=False)
-    centres = np.full((len(samples), len(floor.markers), 2), np.nan)
-    for k, sample in enumerate(samples):
-        for index, seen in sample.floor_seen.items():
-            centres[k, index] = seen.ellipse[:2]
+    centres = np.stack([centres_of(floor, sample.floor_seen) for sample in samples])
     scale = first.position[2] / camera.focal[0]
     kicks = tuple(_kicks(centres, np.array([sample.time for sample in samples]), scale))
     names = tuple(marker.name for marker in floor.markers)

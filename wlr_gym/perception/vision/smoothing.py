@@ -67,7 +67,7 @@ def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: Array
     rejected, none, spreads = np.zeros(len(t), np.bool_), np.empty((0, 3)), np.empty((0, 3, 3))
     likelihood = [_filter(t, z - middle, variance, 10.0**q, jump, rejected, none, spreads) for q in _DENSITIES]
     density = 10.0 ** _DENSITIES[int(np.argmax(likelihood))]
-    moments = np.concatenate([t, at])  # of samples, then of results without a sample
+    moments = np.concatenate([t, at])  # of samples, then of results
     order = np.argsort(moments, kind="stable")
     moments, places = moments[order], np.argsort(order, kind="stable")
     inputs = np.concatenate([z - middle, np.full(len(at), np.nan)])[order]

@@ -130,7 +130,7 @@ class Tracker:
         if self.camera.readout and not self._follow_camera:
             found = self._at_frame_time(found, seen)
         used = {index: detection for index, detection in seen.items() if found.used[index]}
-        centres = _centres(self.body, used)
+        centres = centres_of(self.body, used)
         pose, covariance = pose_in_floor(found, self.floor_pose)
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
@@ -292,7 +292,7 @@ def locate_floor(frames: Sequence[VideoFrame], camera: Camera, floor: Target) ->
         raise InputError(f"no floor frame in the first {len(frames)} frames: {sheet_fault(most, floor, camera)}")
     means = {index: mean_detection(found) for index, found in sums.items() if len(found) >= max(1, len(frames) // 2)}
     found = solved_floor(means, floor, camera, start) or start
-    return found, _centres(floor, means)
+    return found, centres_of(floor, means)
 
 
 def check_size(image: Image, camera: Camera, where: str) -> None:
@@ -350,10 +350,10 @@ def without_pose(sample: Sample, status: str) -> Sample:
 def no_pose(frame: VideoFrame, status: str, body: Target) -> Sample:
     """The sample of a frame that shows nothing."""
     nothing = np.full(6, np.nan), np.full((6, 6), np.nan)
-    return Sample(frame.index, frame.time, status, *nothing, 0, math.nan, _centres(body, {}))
+    return Sample(frame.index, frame.time, status, *nothing, 0, math.nan, centres_of(body, {}))
 
 
-def _centres(target: Target, seen: Mapping[int, Detection]) -> Array:
+def centres_of(target: Target, seen: Mapping[int, Detection]) -> Array:
     """Centres (M, 2) px of a target's markers; NaN where not seen."""
     centres = np.full((len(target.markers), 2), np.nan)
     for index, detection in seen.items():
