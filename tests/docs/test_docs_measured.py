@@ -11,7 +11,7 @@ from wlr_gym.studies.bench.adapt_study import CONTENDERS, read_lines
 from wlr_gym.studies.bench.adapt_table import by_case, summary
 from wlr_gym.studies.bench.gap import score_answers
 
-ablations, learning = site_script("ablations"), site_script("learning")
+learning = site_script("learning")
 UNITS = {"1/A": " /A", "-": ""}
 
 
@@ -91,7 +91,7 @@ def test_the_pages_have_the_numbers_of_the_blind_test():
 
 
 def test_the_policies_page_has_the_numbers_of_velocity():
-    rows = {(row["sensors"], row["floors"]): row for row in learning.read_data()["velocity"]["rows"]}
+    rows = {(row["sensors"], row["floors"]): row for row in data("learning")["velocity"]["rows"]}
     text, readme = page("policies"), readme_text()
     late, plain = (rows["camera", floors]["tracking_error"][0] for floors in ("slippery, 40 ms late", "slippery"))
     assert f"increase the error by {100 * (late / plain - 1):.0f} %: {late:.3f} instead of {plain:.3f}" in text
@@ -119,7 +119,7 @@ def test_the_policies_page_has_the_numbers_of_velocity():
 
 
 def test_the_policies_page_has_the_numbers_of_the_ablations():
-    settings, text = ablations.read_data()["settings"], page("policies")
+    settings, text = data("ablations")["settings"], page("policies")
     for name, said in (
         ("plain PPO, 4 million steps", "has an error {} % larger [{}, {}]"),
         ("controller of pid", "the error is {} % larger [{}, {}]"),
