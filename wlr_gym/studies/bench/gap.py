@@ -140,7 +140,7 @@ def score_classifier(plan: Plan, sets: int, say: Callable[[str], None] = print) 
 
     Training sets stay in ``plan.out``, and so does the score, as ``score_classifier.json``.
     """
-    trained = train(training_sets(plan.out / "training", sets, say))
+    trained = train(training_sets(plan.out / "training", sets, plan.processes, say))
     cases = plan.cases()
     report = score(answers_of(trained, _kept(plan, cases)), {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score_classifier.json", report)

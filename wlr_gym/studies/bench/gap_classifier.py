@@ -9,6 +9,7 @@ alike.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,11 +22,14 @@ from scipy.special import logsumexp, softmax
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, write_json
+from wlr_gym.base.jobs import Job, Send, serve, spread
+from wlr_gym.base.text import duration
 from wlr_gym.gap.analysis import UNKNOWN, Evidence
 from wlr_gym.gap.problem import Candidate, Problem, Setting
 from wlr_gym.gap.selection.screening import Score
 
 Array = NDArray[np.float64]
+_MODULE = "wlr_gym.studies.bench.gap_classifier"
 #: Name -> the best candidate of this name in the first screening: predicted improvement, place, first guess.
 Screen = Mapping[str, Mapping[str, Any]]
 
@@ -123,24 +127,36 @@ def template_runs(folder: Path) -> Path:
     from wlr_gym.robot import load_robot
 
     make_output_folder(folder)
-    for name in MOTIONS:
-        path = folder / f"{name}.csv"
+    for number, name in enumerate(MOTIONS, 1):
+        path = folder / f"run_{number:02d}.csv"
         if not path.is_file():
             record_simulation(path, excite(name), load_robot(), "gibbs_appell")
     return folder
 
 
-def training_sets(out: Path, count: int, say: Callable[[str], None] = print) -> list[dict[str, Any]]:
-    """Return training sets, one file each in ``out``: those that are there are not made again. Half a minute each."""
-    runs = template_runs(out / "runs")
-    found = []
-    for seed in range(count):
-        file = out / f"set_{seed:04d}.json"
-        if not file.is_file():
-            write_json(file, training_screen(runs, seed))
-            say(f"training set {seed + 1} of {count}")
-        found.append(json.loads(file.read_text(encoding="utf-8")))
-    return found
+def training_sets(out: Path, count: int, processes: int = 2, say: Callable[[str], None] = print) -> list[dict[str, Any]]:
+    """Return training sets, one file each in ``out``: those that are there are not made again. Half a minute each.
+
+    Raises:
+        RuntimeError: a set cannot be made; the others stay.
+    """
+    runs, log = template_runs(out / "runs"), str((out / "work.log").resolve())
+    files = {f"set_{seed:04d}": out / f"set_{seed:04d}.json" for seed in range(count)}
+    tasks = {name: {"runs": str(runs.resolve()), "seed": seed} for seed, name in enumerate(files) if not files[name].is_file()}
+    jobs = [Job(name, _MODULE, {**task, "file": str(files[name].resolve())}, log) for name, task in tasks.items()]
+    begin = time.monotonic()
+    for done, ended in enumerate(spread(jobs, processes), 1):
+        if ended.error:
+            raise RuntimeError(f"training {ended.name}: {ended.error}; see {log}")
+        passed = time.monotonic() - begin
+        rest = duration(passed / done * (len(jobs) - done))
+        say(f"training set {done} of {len(jobs)}: {duration(passed)} passed, about {rest} to go")
+    return [json.loads(file.read_text(encoding="utf-8")) for file in files.values()]
+
+
+def _work(task: Mapping[str, Any], send: Send) -> None:
+    """Make one set, in a process of its own."""
+    write_json(Path(task["file"]), training_screen(Path(task["runs"]), task["seed"]))
 
 
 # ---- the classifier --------------------------------------------------------------------------------------------------
@@ -222,3 +238,7 @@ def answers_of(classifier: Classifier, results: Mapping[str, Mapping[str, Any]])
         else dict(result)
         for name, result in results.items()
     }
+
+
+if __name__ == "__main__":
+    serve(_work)
