@@ -7,7 +7,7 @@ import pytest
 
 HEAVY = (
     "torch", "stable_baselines3", "mujoco", "numba", "cv2", "matplotlib", "pandas", "pyarrow", "scipy", "sympy", "onnx",
-    "onnxruntime", "pydantic", "tyro", "rich", "ray", "optuna",
+    "onnxruntime", "pydantic", "yaml", "tyro", "rich", "ray", "optuna",
 )  # fmt: skip
 
 

@@ -103,3 +103,14 @@ def test_drawn_models_stay_within_tolerances_and_ranges():
     assert np.abs(sizes).min() >= 0.05 * 2.0 - 1e-9
     assert all(0.5 <= effect.parameters["place"] <= 0.7 for effect in effects)
     assert math.isfinite(sizes.sum())
+
+
+@pytest.mark.slow
+def test_training_sets_are_made_and_stay(tmp_path):
+    said = []
+    (one,) = baseline.training_sets(tmp_path, 1, 1, said.append)
+    assert one["missing"] == baseline.NOTHING or one["missing"] in one["screen"]
+    assert len(one["screen"]) > 20
+    assert len(said) == 1
+    assert baseline.training_sets(tmp_path, 1, 1, said.append) == [one]
+    assert len(said) == 1

@@ -498,3 +498,10 @@ def test_the_file_of_the_page_is_one(tmp_path):
     camera = load_camera_file(tmp_path / "camera.yaml")
     assert (camera.name, camera.rate, camera.delay) == ("overhead", 30.0, 0.0)
     assert not camera.is_film
+
+
+def test_a_target_that_is_no_name_is_refused(tmp_path):
+    content = small_camera().model_dump(mode="json") | {"body": 3}
+    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(InputError, match=r"camera\.yaml: .*body"):
+        load_camera_file(tmp_path / "camera.yaml")

@@ -989,3 +989,9 @@ def test_a_copy_of_the_hardware_file_still_finds_its_robot(tmp_path):
     words = ["commission", "--emulated", "--hardware", str(file), "--out", str(tmp_path / "out"), "--tests", "latency"]
     assert main(words) == 0
     assert load_robot(load_hardware(tmp_path / "out/hardware.yaml").robot or "").name == "mine"
+
+
+@pytest.mark.parametrize("action", ["brake", "release"])
+def test_a_joint_that_is_not_there_cannot_be_held(stood, action):
+    with pytest.raises(InputError, match="unknown joint 'wheel_fl'"):
+        getattr(stood[0], action)("wheel_fl")

@@ -205,13 +205,14 @@ class Hardware(SettingsModel):
     def _registers_are_those_of_the_setpoints(self) -> Hardware:
         for name, bus in self.buses.items():
             table = load_table(bus.model)
+            turn = table.counts.turn
             for joint in bus.joints:
                 mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE  # in another one, setpoints would be another quantity
                 for item, expected in {"operating_mode": mode, **FIXED_REGISTERS}.items():
                     if (found := bus.eeprom.get(item, table[item].default)) != expected:
                         where = f"buses.{name}.eeprom.{item}"
                         raise ValueError(f"{where} is {found}, expected {expected}: {joint} is driven with that")
-                if self.joints[joint].zero >= (turn := table.counts.turn):
+                if self.joints[joint].zero >= turn:
                     raise ValueError(f"joints.{joint}.zero = {self.joints[joint].zero}: expected 0 to {turn - 1}")
         return self
 

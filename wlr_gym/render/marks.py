@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import assert_never
 
 import mujoco
 import numpy as np
@@ -241,6 +242,8 @@ def _draw(geom: mujoco.MjvGeom, mark: Mark) -> None:
             _start(geom, "ARROW", [SHAFT, SHAFT, SHAFT], start, colour)
             mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, SHAFT, start, end)
             geom.emission = 0.5
+        case _:
+            assert_never(mark)
 
 
 def _start(geom: mujoco.MjvGeom, kind: str, size: Iterable[float], position: Iterable[float], colour: Colour) -> None:

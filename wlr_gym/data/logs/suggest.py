@@ -153,7 +153,7 @@ def _content(look: LogSignals, found: JointFindings, units: Mapping[str, str]) -
         "every": _every(look, rows),
         "joints": {joint: one.model_dump(exclude_defaults=True) for joint, one in joints.items()},
         "channels": {name: one.model_dump(exclude_defaults=True) for name, one in _grouped(channels).items()},
-        "frames": {name: tuple(axes) for name, axes in look.frames.items()},
+        "frames": {name: tuple(look.frames[name]) for name in ("cam", "imu") if name in look.frames},
         "clocks": {name: one.model_dump() for name, one in clocks.items()},
     }
 

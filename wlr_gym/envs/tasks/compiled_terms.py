@@ -49,7 +49,15 @@ class Scores(NamedTuple):
     def zeros(cls, task: Task, count: int) -> Scores:
         """Return the scores of ``count`` robots on a task before their first step."""
         rewards, ends, measures = ((count, len(names)) for names in (task.rewards, task.terminations, task.measures))
-        return cls(*map(np.zeros, (rewards, count, ends, rewards, measures, measures, measures)))
+        return cls(
+            terms=np.zeros(rewards),
+            total=np.zeros(count),
+            over=np.zeros(ends),
+            sums=np.zeros(rewards),
+            measures=np.zeros(measures),
+            squares=np.zeros(measures),
+            largest=np.zeros(measures),
+        )
 
 
 @dataclass(frozen=True)

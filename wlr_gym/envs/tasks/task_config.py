@@ -18,8 +18,9 @@ from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, POLICY_TERMS, PRIVILEGE
 from wlr_gym.policy.slip_compensating import SlipGains
 from wlr_gym.robot import Robot, load_robot
 
-#: Group of a task's data -> those of its terms that there are, and what they are called.
+#: Group of a task's data -> its terms.
 _TERMS: dict[str, Mapping[str, Any]] = {"observations": POLICY_TERMS, "privileged": PRIVILEGED_TERMS, **SCALARS}
+#: Group -> what messages call one of its terms.
 _CALLED = {
     "observations": "observation term",
     "privileged": "privileged term",

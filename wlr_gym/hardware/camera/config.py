@@ -86,9 +86,9 @@ def load_camera_file(source: str | Path | CameraFile) -> CameraFile:
     require_keys(CameraFile, data, where)
     content = dict(data)
     for key in ("body", "floor"):
-        if not isinstance(data.get(key), dict):
+        if isinstance(target := data.get(key, key), str):
             with named_by(where, key):
-                content[key] = load_target(named_in(where, data.get(key, key)))
+                content[key] = load_target(named_in(where, target))
     if isinstance(calibration := data.get("calibration"), str):
         with named_by(where, "calibration"):
             content["calibration"] = load_camera(named_in(where, calibration))

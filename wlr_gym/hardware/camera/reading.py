@@ -51,7 +51,11 @@ class CameraReading:
 
 
 class CameraReader(Protocol):
-    """Where the control loop gets readings from; nothing in it waits."""
+    """Where the control loop gets readings from; nothing in it waits.
+
+    Attributes:
+        file: the camera, and what is not known of it.
+    """
 
     file: CameraFile
 

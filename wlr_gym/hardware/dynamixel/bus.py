@@ -234,7 +234,8 @@ class BusGroup:
         now = self._clock()
         self.statistics.missing.update(self.servos.keys() - found.keys())
         if (silent := next((id for id in self._order if id not in found), None)) is not None:
-            self._order.remove(silent)  # the first one is asked last from now on: those named behind it wait for its answer
+            # The first servo that was silent is asked last from now on: those named behind it wait for its answer.
+            self._order.remove(silent)
             self._order.append(silent)
         readings = {id: self._reading(block, status, now) for id, status in found.items()}
         oldest = now - self._asked_at + STALE  # an answer may have waited for us, but was not given before we asked

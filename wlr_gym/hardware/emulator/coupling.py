@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.tables import (
     CURRENT_MODE,
@@ -240,7 +240,13 @@ class PlantCoupling:
     # ---- a hand ----
 
     def set_friction(self, joint: str, torque: float) -> None:
-        """Let a joint's dry friction be ``torque`` (N m) from now on: what a hand does that holds it."""
+        """Let a joint's dry friction be ``torque`` (N m) from now on: what a hand does that holds it.
+
+        Raises:
+            InputError: no such joint, or a torque beyond the parameter's bounds.
+        """
+        if joint not in JOINTS:
+            raise unknown_name("joint", joint, JOINTS)
         self._parameters["servo.coulomb_friction"][0, JOINTS.index(joint)] = torque
         self.plant.set_parameters(self._parameters)
 

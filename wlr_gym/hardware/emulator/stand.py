@@ -58,7 +58,7 @@ class EmulatedStand:
         state = standing_state(robot, changed)
         state.position[0, 2] = HEIGHT
         self.machine: Machine = Machine(robot, hardware, options, plant=plant, parameters=changed, state=state)
-        self._friction = changed["servo.coulomb_friction"][0].copy()
+        self._friction = dict(zip(JOINTS, changed["servo.coulomb_friction"][0].tolist(), strict=True))
         self.stall_current: float = robot.servo.supply_voltage / float(winding(robot)[1][-1])
 
     def tilt(self, **angles: float) -> None:
@@ -71,7 +71,7 @@ class EmulatedStand:
 
     def release(self, joint: str) -> None:
         """Let go of it."""
-        self.machine.coupling.set_friction(joint, float(self._friction[JOINTS.index(joint)]))
+        self.machine.coupling.set_friction(joint, self._friction.get(joint, 0.0))
 
     def wheel_current(self) -> float:
         """Return what the wheels draw from the supply, A: motor currents times the part of the time they are switched on."""

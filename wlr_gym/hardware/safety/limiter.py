@@ -266,7 +266,9 @@ class CommandLimiter:
         self.setpoints = decision.setpoints
         if not self.dry_run:
             self.__servos.write_setpoints(self._within_registers(decision.setpoints))
-            for k in np.flatnonzero(decision.torque_on != self.torque_on):  # their setpoints ask for what they are to do
+            for k in np.flatnonzero(
+                decision.torque_on != self.torque_on
+            ):  # setpoints, just written, ask for what they are to do
                 self.__servos.set(JOINTS[k], "torque_enable", int(decision.torque_on[k]))
         self.torque_on = decision.torque_on.copy()
         return decision

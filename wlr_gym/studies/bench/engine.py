@@ -205,11 +205,14 @@ def make_reference(
 ) -> Reference:
     """Return the mean of the limits of both simulators; both are of first order in the step, which is halved once."""
     options = [PlantOptions(physics_step=step, sensor_noise=False) for step in (*engine, *peer)]
-    engines = [GibbsAppellPlant(load_robot(), len(chosen), one, sweeps=8) for one in options[:2]]
-    peers = [MujocoPlant(load_robot(), len(chosen), one) for one in options[2:]]
-    for plant in peers:  # less virtual mass at the contacts, whose push off the floor grows as the step shrinks
+    coarse, fine = (_drive(GibbsAppellPlant(load_robot(), len(chosen), one, sweeps=8), chosen) for one in options[:2])
+    limits = []
+    for one in options[2:]:
+        plant = MujocoPlant(load_robot(), len(chosen), one)
+        # less virtual mass at the contacts, whose push off the floor grows as the step shrinks
         plant._batch.divide_virtual_mass(VIRTUAL_MASS_DIVISOR)
-    coarse, fine, peer_coarse, peer_fine = (_drive(plant, chosen) for plant in (*engines, *peers))
+        limits.append(_drive(plant, chosen))
+    peer_coarse, peer_fine = limits
     ours, theirs = _extrapolated(coarse, fine), _extrapolated(peer_coarse, peer_fine)
     hip, pose = _hip(), _unit(0.5 * (ours + theirs))
     convergence = np.maximum(distance(fine, ours, hip), distance(peer_fine, theirs, hip))
