@@ -54,6 +54,9 @@ def test_a_bar_says_what_has_passed_then_what_is_left_then_what_it_took(clock):
     shown.set(1.0)
     clock(5.0)
     assert str(shown) == "in 10 s"
+    shown.set(1.0)
+    clock(5.0)
+    assert str(shown) == "in 10 s"
 
 
 def test_a_bar_fits_the_terminal(monkeypatch):

@@ -90,11 +90,13 @@ class _Clock:
         self._is_done = False
 
     def set(self, share: float) -> None:
-        """Go by the share that is done now."""
+        """Go by the share that is done now; what is done stays so."""
+        if self._is_done:
+            return
         now = time.monotonic()
         passed = now - self._begin
         self._end = self._begin + passed / share if _is_known(passed, share) else None
-        if share >= 1.0 and not self._is_done:
+        if share >= 1.0:
             self._end, self._is_done = now, True
 
     def __str__(self) -> str:
