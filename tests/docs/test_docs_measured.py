@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import re
+from pathlib import Path
+from typing import Any
 
 from blocks import ROOT, site_script
 
@@ -16,15 +17,16 @@ UNITS = {"1/A": " /A", "-": ""}
 
 
 def page(name: str) -> str:
-    return " ".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").split())
+    return in_one_line(ROOT / "docs" / f"{name}.md")
 
 
-def readme_text() -> str:
-    return " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+def in_one_line(path: Path) -> str:
+    """A page's text in one line."""
+    return " ".join(path.read_text(encoding="utf-8").split())
 
 
-def data(name: str) -> dict:
-    return json.loads((ROOT / "docs" / "data" / f"{name}.json").read_text(encoding="utf-8"))
+def data(name: str) -> Any:
+    return learning.read_data(ROOT / "docs" / "data" / f"{name}.json")
 
 
 def test_the_real_servo_lacks_what_the_page_says():
@@ -69,7 +71,10 @@ def test_films_of_a_lab_have_the_numbers():
 
 
 def test_the_pages_have_the_numbers_of_adaptation():
-    readme, said = readme_text(), " ".join(summary(by_case(read_lines(ROOT / "docs" / "data" / "adapt.jsonl"))))
+    readme, said = (
+        in_one_line(ROOT / "README.md"),
+        " ".join(summary(by_case(read_lines(ROOT / "docs" / "data" / "adapt.jsonl")))),
+    )
     (error,) = re.findall(r"after adaptation: (\d+ \[\d+, \d+\]) % smaller", said)
     shares = dict(re.findall(r"Regained by '([^']+)' in \d+ of these, %: median (\d+ \[-?\d+, \d+\])", said))
     ours, calibrated = (shares[CONTENDERS[name]] for name in ("ours", "calibrated"))
@@ -79,7 +84,7 @@ def test_the_pages_have_the_numbers_of_adaptation():
 
 
 def test_the_pages_have_the_numbers_of_the_blind_test():
-    found, readme = score_answers(ROOT / "docs" / "data" / "gap_answers.json"), readme_text()
+    found, readme = score_answers(ROOT / "docs" / "data" / "gap_answers.json"), in_one_line(ROOT / "README.md")
     named, alarms, sets = found["single"]["top1"], found["false_alarms"]["all"], found["sets"]
     said = f"right name first in {named['hits']} of {named['count']} (at least {100 * named['bound95']:.0f} %), "
     said += f"no false alarm in {alarms['count']} (at most {100 * alarms['bound95']:.0f} %)"
@@ -92,7 +97,7 @@ def test_the_pages_have_the_numbers_of_the_blind_test():
 
 def test_the_policies_page_has_the_numbers_of_velocity():
     rows = {(row["sensors"], row["floors"]): row for row in data("learning")["velocity"]["rows"]}
-    text, readme = page("policies"), readme_text()
+    text, readme = page("policies"), in_one_line(ROOT / "README.md")
     late, plain = (rows["camera", floors]["tracking_error"][0] for floors in ("slippery, 40 ms late", "slippery"))
     assert f"increase the error by {100 * (late / plain - 1):.0f} %: {late:.3f} instead of {plain:.3f}" in text
     assert f"40 ms late raise the tracking error by {100 * (late / plain - 1):.0f} %" in readme
@@ -138,3 +143,24 @@ def test_filmed_drives_have_the_numbers():
     )
     assert f"at most {along:.2f} mm longitudinally and {across:.2f} mm laterally, the clock offset by {clock:.1f} ms" in text
     assert all(row["met"] is not False for row in rows)
+
+
+def test_the_classifier_has_the_numbers():
+    found = data("gap_classifier")
+    named, alarms = found["single"]["top1"], found["false_alarms"]["all"]
+    said = (
+        f"it names {named['hits']} of {named['count']} effects of severity 2 or more, and raises {alarms['hits']} false alarms"
+    )
+    assert f"{said} in {alarms['count']}" in page("gap_benchmark")
+
+
+def test_what_chosen_runs_decide_is_as_the_page_says():
+    hiding, took = [line for line in data("decide") if line["hidden"]], {}
+    for contender in ("chosen", "random", "eight"):
+        own = [line for line in hiding if line["contender"] == contender]
+        took[contender] = sum(line["seconds"] for line in own) / sum(line["right"] for line in own)
+    chosen = [line["right"] for line in hiding if line["contender"] == "chosen"]
+    text = page("gap")
+    assert f"decide {sum(chosen)} of {len(chosen)} rightly ({100 * sum(chosen) / len(chosen):.0f} %; target 95 %" in text
+    assert f"with {took['chosen']:.0f} s of driving per right decision" in text
+    assert f"random ones take {took['random']:.0f} s, eight fixed ones {took['eight']:.0f} s" in text
