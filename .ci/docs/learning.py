@@ -136,7 +136,7 @@ def percent(numbers: list[float]) -> str:
 
 
 def read_data(file: Path = DATA) -> dict[str, Any]:
-    """Return the kept numbers, here: task -> SHA-256 of the policies, commit, date, rows."""
+    """Return what is kept in a file, nothing where there is none; here: task -> SHA-256 of the policies, commit, date, rows."""
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import fmean
 from typing import Any
+
+from learning import read_data
 
 DATA = Path(__file__).resolve().parents[2] / "docs" / "data"
 OBSERVER_HEADER = ("floor, drive", "v x", "its 99 %", "v y", "slip", "in 2 sigma", "error/sigma")
@@ -76,7 +77,7 @@ def _error(found: dict[tuple[str, str], dict[str, Any]], what: str, header: str)
 
 
 def _read(name: str) -> Any:
-    return json.loads((DATA / f"{name}.json").read_text(encoding="utf-8"))
+    return read_data(DATA / f"{name}.json")
 
 
 #: Name in a page's mark -> header, and what makes the rows.

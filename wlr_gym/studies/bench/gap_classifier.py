@@ -23,7 +23,7 @@ from scipy.special import logsumexp, softmax
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, write_json
 from wlr_gym.base.jobs import Job, Send, serve, spread
-from wlr_gym.base.text import duration
+from wlr_gym.base.progress import time_left
 from wlr_gym.gap.analysis import UNKNOWN, Evidence
 from wlr_gym.gap.problem import Candidate, Problem, Setting
 from wlr_gym.gap.selection.screening import Score
@@ -148,9 +148,7 @@ def training_sets(out: Path, count: int, processes: int = 2, say: Callable[[str]
     for done, ended in enumerate(spread(jobs, processes), 1):
         if ended.error:
             raise RuntimeError(f"training {ended.name}: {ended.error}; see {log}")
-        passed = time.monotonic() - begin
-        rest = duration(passed / done * (len(jobs) - done))
-        say(f"training set {done} of {len(jobs)}: {duration(passed)} passed, about {rest} to go")
+        say(f"training set {done} of {len(jobs)}  {time_left(time.monotonic() - begin, done / len(jobs))}")
     return [json.loads(file.read_text(encoding="utf-8")) for file in files.values()]
 
 
