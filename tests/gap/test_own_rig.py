@@ -20,6 +20,7 @@ from wlr_gym.gap.rig.own_runs import read_rig_runs
 from wlr_gym.gap.workflow import analyse
 
 FILE = Path(__file__).resolve().parents[2] / "examples" / "linear_axis.py"
+PAGE = FILE.parents[1] / "docs" / "own_rig.md"
 AXIS = load_rig(FILE)
 AXIS_FILE = sys.modules["wlr_gym_rig_linear_axis"]
 
@@ -27,7 +28,7 @@ AXIS_FILE = sys.modules["wlr_gym_rig_linear_axis"]
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("axis")
-    AXIS_FILE.record(folder, runs=4, seed=3)
+    AXIS_FILE.record(folder)
     return folder
 
 
@@ -44,6 +45,9 @@ def test_asymmetric_friction_is_named_and_sized(found):
     assert difference.value == pytest.approx(1.0, abs=0.05)
     assert difference.low < 1.0 < difference.high
     assert found.gap.reduction > 0.8
+    said = re.search(r"(\S+) N \((\S+) to (\S+)\)", " ".join(PAGE.read_text(encoding="utf-8").split()))
+    assert said is not None
+    assert [float(number) for number in said.groups()] == pytest.approx([difference.value, difference.low, difference.high], abs=1e-3)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import META_FILE
 from wlr_gym.data.read import read_meta, read_run, run_files
 from wlr_gym.data.replay import robot_of
-from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
+from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED
 from wlr_gym.gap.report.entries import Result
 from wlr_gym.gap.report.explanations import DECIDED, NOTHING, Explanation, explanations
 from wlr_gym.gap.report.result import RESULT_FILE, read_result
@@ -263,7 +263,7 @@ def _choice(
 ) -> tuple[Ending, _Next | None]:
     """Return what to drive next; or None and why it ends."""
     doubt = _doubt(now, result, left)
-    answered = now.verdict not in (NOT_EXCITED, BAD_DATA) and not doubt
+    answered = now.verdict not in (NOT_EXCITED, BAD_DATA) and not doubt and not _some_runs_alone_show_one(result)
     if len(left) == 1 and answered:
         return "decided", None
     if len(history.driven) >= asked.budget.runs:
@@ -292,6 +292,12 @@ def _choice(
     if doubt:
         return "", shows_most
     return "decided" if sure and answered else "nothing would tell", None
+
+
+def _some_runs_alone_show_one(result: Result | None) -> bool:
+    """Whether nothing was selected, and some runs show an effect that runs left out of the fit do not."""
+    unnamed = result is not None and not result.effects
+    return unnamed and any(one.outcome == FAILS_CROSS_VALIDATION for one in result.evidence)
 
 
 def _doubt(now: DecisionRound, result: Result | None, left: Sequence[Explanation]) -> str:

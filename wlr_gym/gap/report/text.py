@@ -182,8 +182,8 @@ def title(analysis: Analysis) -> str:
 
 
 def _leaves_something(analysis: Analysis) -> bool:
-    """Whether nothing was named although the error of the held-out runs is well above the noise floor."""
-    return analysis.verdict == NOTHING_MISSING and bool(closure(analysis))
+    """Whether nothing was named although the held-out runs' error is well above the noise floor, or some runs show an effect."""
+    return analysis.verdict == NOTHING_MISSING and bool(closure(analysis) or _shown_by_some_runs_only(analysis))
 
 
 def closure(analysis: Analysis) -> str:
@@ -268,14 +268,19 @@ def _bad_data(analysis: Analysis) -> str:
 
 def _not_excited(analysis: Analysis) -> str:
     wanted = listed([recommendation.excitation for recommendation in analysis.recommendations])
-    alone = [e for e in analysis.evidence if e.outcome == FAILS_CROSS_VALIDATION and e.gain > LEAST_GAIN and e.by_run]
-    if alone:
-        shown = max(alone, key=lambda evidence: evidence.gain)
-        run = max(shown.by_run, key=lambda name: shown.by_run[name])
-        what = f"{plain(shown.name)} ({places(shown.where)})"
-        more = f", and {wanted}" if wanted else ""
-        return f"{run} shows {what} most clearly, but runs left out of the fit do not: record more such runs{more}."
+    if shown := _shown_by_some_runs_only(analysis):
+        return f"{shown}: record more such runs{f', and {wanted}' if wanted else ''}."
     return f"These runs excite too little to show whether the model lacks anything{f'; record {wanted}' if wanted else ''}."
+
+
+def _shown_by_some_runs_only(analysis: Analysis) -> str:
+    """Return which run shows what that others do not, as a clause; "" = none does."""
+    alone = [e for e in analysis.evidence if e.outcome == FAILS_CROSS_VALIDATION and e.gain > LEAST_GAIN and e.by_run]
+    if not alone:
+        return ""
+    shown = max(alone, key=lambda evidence: evidence.gain)
+    run = max(shown.by_run, key=lambda name: shown.by_run[name])
+    return f"{run} shows {plain(shown.name)} ({places(shown.where)}) most clearly, but runs left out of the fit do not"
 
 
 def _nothing_missing(analysis: Analysis) -> str:
@@ -286,8 +291,10 @@ def _nothing_missing(analysis: Analysis) -> str:
     rest = f"it replays the held-out runs to within {error(gap.heldout_calibrated)} times the sensor noise"
     if not _leaves_something(analysis):
         return f"The model lacks nothing that these runs could show: {rest}{calibrated}."
+    alone = _shown_by_some_runs_only(analysis)
     return (
-        f"No effect of the library is clear enough in these runs to be named: the model {rest.removeprefix('it ')}{calibrated}."
+        f"No effect of the library is clear enough in these runs to be named: the model {rest.removeprefix('it ')}{calibrated}"
+        f"{f'. {alone}; more such runs would tell' if alone else ''}."
     )
 
 
