@@ -316,6 +316,13 @@ def test_that_nothing_is_missing_takes_six_runs(data, tmp_path, answers):
     assert few.ended == "decided"  # the six are there
 
 
+def test_nothing_is_not_decided_where_some_runs_alone_show_an_effect(data, tmp_path, answers):
+    alone = candidate("coulomb_friction", 0.01, "fails cross-validation")
+    answers["results"] = [result("nothing_missing", (0.99, [alone]))] * 5
+    history = decide(data, tmp_path / "out", record, Budget(runs=5)).history
+    assert (history.ended, len(history.rounds[-1].runs)) == ("budget", 7)
+
+
 def test_motions_that_take_longer_than_what_is_left_are_not_driven(data, tmp_path, answers):
     found = decide(data, tmp_path / "out", record, Budget(seconds=5.0))
     assert (found.history.ended, found.history.seconds, found.result) == ("budget", 0.0, None)

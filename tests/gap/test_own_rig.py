@@ -47,7 +47,9 @@ def test_asymmetric_friction_is_named_and_sized(found):
     assert found.gap.reduction > 0.8
     said = re.search(r"(\S+) N \((\S+) to (\S+)\)", " ".join(PAGE.read_text(encoding="utf-8").split()))
     assert said is not None
-    assert [float(number) for number in said.groups()] == pytest.approx([difference.value, difference.low, difference.high], abs=1e-3)
+    assert [float(number) for number in said.groups()] == pytest.approx(
+        [difference.value, difference.low, difference.high], abs=1e-3
+    )
 
 
 @pytest.mark.slow

@@ -7,12 +7,12 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from toy_problem import DECOYS, NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.analysis import EFFECT_FOUND, NOT_EXCITED
+from wlr_gym.gap.analysis import EFFECT_FOUND, NOT_EXCITED, NOTHING_MISSING
 from wlr_gym.gap.estimation.fit import Fit, fit, linearise
 from wlr_gym.gap.estimation.likelihood import estimate_noise
 from wlr_gym.gap.estimation.model import nominal_model, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
-from wlr_gym.gap.report.text import sentence
+from wlr_gym.gap.report.text import NOTHING_CLEAR, sentence, title
 from wlr_gym.gap.selection import cross_validation, search
 from wlr_gym.gap.selection.cross_validation import (
     MOST_LEFT,
@@ -579,6 +579,19 @@ def test_what_one_run_alone_shows_is_reported_and_not_selected():
     assert analysis.verdict == NOT_EXCITED
     assert analysis.effects == ()
     assert sentence(analysis).startswith("run_1 shows decoy 2 (body) most clearly, but runs left out of the fit do not")
+
+
+def test_what_some_runs_show_weakly_is_told_of_where_the_error_is_hardly_more_than_noise():
+    problem = Toy({}, [sized("drag", 0.15, "right")], rows=400, runs=6)
+    problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
+    analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
+    (alone,) = [one for one in analysis.evidence if one.outcome == "fails cross-validation"]
+    assert LEAST_GAIN < alone.gain < INSISTENT
+    assert (analysis.verdict, analysis.effects) == (NOTHING_MISSING, ())
+    assert title(analysis) == NOTHING_CLEAR
+    assert "shows drag (right) most clearly, but runs left out of the fit do not; more such runs would tell." in sentence(
+        analysis
+    )
 
 
 @pytest.mark.parametrize("everywhere", [True, False])

@@ -41,6 +41,7 @@ from wlr_gym.gap.report.relations import relations
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.detectability import detectable
 from wlr_gym.gap.selection.equivalence import equivalents, selection_frequency
+from wlr_gym.gap.selection.hypothesis import INSISTENT
 from wlr_gym.gap.selection.outcomes import evidence_of, refuted_evidence
 from wlr_gym.gap.selection.search import SearchResult, search_effects
 from wlr_gym.gap.selection.threshold import chance
@@ -66,7 +67,7 @@ SCATTER = 5.0
 _one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
 #: Share of the effects that must be visible within their plausible range for "nothing missing" to mean anything.
 LEAST_VISIBLE = 0.5
-#: Noise floors up to which an error is no sign that something is missing: 98 % of robots without an effect leave less
+#: Noise floors up to which an error is no sign that something is missing: 98 % of the robots without an effect leave less
 #: (blind test).
 HARDLY_MORE_THAN_NOISE = 2.0
 
@@ -204,7 +205,7 @@ def analyse_problem(
     somewhere = _somewhere(problem, most_in(channel_gaps) if worst else places[0].name) if nameless else ()
     effects = _effects(problem, search, fitted) or _turned(turned) or somewhere
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
-    verdict = _verdict(search, effects, is_replayed=error <= HARDLY_MORE_THAN_NOISE * gap.noise_floor)
+    verdict = _verdict(search, effects, error / gap.noise_floor)
     groups = _equivalent(problem, search)
     clock.stop()
     return Analysis(
@@ -282,12 +283,13 @@ class _Clock:
             self.seconds[self._stage] = time.perf_counter() - self._since
 
 
-def _verdict(search: SearchResult, effects: Sequence[FoundEffect], *, is_replayed: bool) -> str:
-    """The verdict; ``is_replayed``: the model leaves hardly more than noise."""
+def _verdict(search: SearchResult, effects: Sequence[FoundEffect], floors: float) -> str:
+    """The verdict; ``floors``: largest error, in noise floors."""
     if effects:
         return UNKNOWN if all(effect.name == UNKNOWN for effect in effects) else EFFECT_FOUND
     last = search.rounds[-1]
-    if not is_replayed and (search.refuted or any(shown_by_some_runs_only(h, last.threshold) for h in last.hypotheses)):
+    alone = [*search.refuted, *(h for h in last.hypotheses if shown_by_some_runs_only(h, last.threshold))]
+    if alone and (floors > HARDLY_MORE_THAN_NOISE or any(hypothesis.gain > INSISTENT for hypothesis in alone)):
         return NOT_EXCITED
     scores = last.scores
     visible = {score.candidate.name: False for score in scores}

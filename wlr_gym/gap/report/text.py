@@ -182,7 +182,7 @@ def title(analysis: Analysis) -> str:
 
 
 def _leaves_something(analysis: Analysis) -> bool:
-    """Whether nothing was named although the held-out runs' error is well above the noise floor, or some runs show an effect."""
+    """Whether nothing was named although the held-out runs' error is well above the noise floor, or some runs show one."""
     return analysis.verdict == NOTHING_MISSING and bool(closure(analysis) or _shown_by_some_runs_only(analysis))
 
 

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
-#: Fall of minus two log posterior that outweighs what is known beforehand of the size of an effect.
+#: Fall of minus two log posterior that outweighs what is known beforehand of the size of an effect, or what other runs lack.
 INSISTENT = 160.0
 #: Of an unknown that meets no calibrated parameter, what counts as an effect, in its steps.
 NOTICED = 0.25
