@@ -149,7 +149,8 @@ def _draw(
     line: dict[str, Any] = {"marker": marker, "label": label}
     if is_second:
         line |= {"linestyle": "--", "markerfacecolor": "white"}
-    for chosen, style in ((usual, line), (other, {"marker": "x", "linestyle": "none"})):
+    crosses: dict[str, Any] = {"marker": "x", "linestyle": "none"}
+    for chosen, style in ((usual, line), (other, crosses)):
         if chosen:
             axes.plot(*zip(*map(_point, chosen), strict=True), color=colour, markersize=5, linewidth=1.2, **style)
     steps = [] if is_second else [Label(*_point(one), f"{1e3 * one['step']:g}", colour) for one in usual]
