@@ -495,6 +495,14 @@ def test_pictures_show_the_numbers():
     assert "effects added" not in [line.get_label() for line in bare["overlays_1"].axes[0].lines]
 
 
+def test_evidence_shows_what_an_effect_must_gain():
+    analysis = replace(small(examples.EFFECT_FOUND), thresholds=(Threshold(1, 16.0, 9.0, 0.04),))
+    axes = figures(analysis)["evidence"].axes[0]
+    (least,) = axes.lines
+    assert np.asarray(least.get_xdata()).tolist() == [16.0, 16.0]
+    assert axes.get_xscale() == "symlog"  # beside a gain of 5312
+
+
 def test_a_row_that_no_sensor_has_read_is_not_drawn():
     analysis = small(examples.EFFECT_FOUND)
     trace = analysis.traces[0]

@@ -192,17 +192,17 @@ def save_map(comparison: Comparison, path: Path) -> Path:
 
     names = list(comparison.signals)
     values = np.array([[case.differences[name].rms_in_noise for case in comparison.cases] for name in names])
-    figure = new_figure(1.8 + 0.85 * len(comparison.cases), 0.9 + 0.32 * len(names))
+    figure = new_figure(2.2 + 0.56 * len(comparison.cases), 1.5 + 0.21 * len(names))
     axes = figure.subplots()
     image = axes.imshow(np.maximum(values, 1e-2), norm=LogNorm(1e-2, 1e2), cmap="RdYlBu_r", aspect="auto")
     axes.set_xticks(
-        range(len(comparison.cases)), [case.motion for case in comparison.cases], rotation=40, ha="right", fontsize=9
+        range(len(comparison.cases)), [case.motion for case in comparison.cases], rotation=40, ha="right", fontsize=8
     )
-    axes.set_yticks(range(len(names)), [_starred(comparison, name) for name in names], fontsize=9)
+    axes.set_yticks(range(len(names)), [_starred(comparison, name) for name in names], fontsize=8)
     colours = image.to_rgba(np.maximum(values, 1e-2))
     for row, column in np.ndindex(*values.shape):
         colour = text_colour(colours[row, column].tolist())
-        axes.text(column, row, _noise(float(values[row, column])), ha="center", va="center", fontsize=8, color=colour)
+        axes.text(column, row, _noise(float(values[row, column])), ha="center", va="center", fontsize=7, color=colour)
     axes.set_title(
         f"{comparison.second.plant.label} minus {comparison.first.plant.label}\n"
         f"rms in units of sensor noise; effects: {comparison.effects}",

@@ -33,7 +33,7 @@ def film_length(run: Run) -> int:
 
 
 def replay_film(result: ReplayResult, parameters: Parameters, backend: str, view: View = VIEW) -> Iterator[Picture]:
-    """Yield pictures at :data:`FPS`: the measured run at the left, its simulation from start to end at the right.
+    """Yield pictures at :data:`FPS`: the recorded run at the left, its simulation from start to end at the right.
 
     Args:
         result: the run and its replay.
@@ -47,7 +47,7 @@ def replay_film(result: ReplayResult, parameters: Parameters, backend: str, view
     times = _times(result.run)
     many = Parameters(np.repeat(parameters.values, len(times), axis=0))
     truths = [truth_of(measured_state(run, times, standing_state(result.robot, many), many)) for run in (result.run, simulated)]
-    titles = ("measured: camera and encoders", f"simulated ({backend}): same commands, open loop")
+    titles = ("recorded: camera and encoders", f"simulated ({backend}): same commands, open loop")
     middle = truths[0].position[:, :2]
     left, right = (_pictures(result, truth, many, times, middle, view) for truth in truths)
     yield from side_by_side(left, right, titles)

@@ -23,7 +23,7 @@ from wlr_gym.learning.evaluation import (
     write_card,
     write_episodes,
 )
-from wlr_gym.learning.evaluation.card_plots import draw_card
+from wlr_gym.learning.evaluation.card_plots import draw_card, improvements, pareto
 from wlr_gym.learning.evaluation.card_report import cell
 from wlr_gym.learning.evaluation.plots import commanded_path
 from wlr_gym.learning.evaluation.rollout import saturated, yaw_of
@@ -132,6 +132,13 @@ def test_card_files(swept, tmp_path):
     episodes = pandas.read_parquet(folder / "episodes.parquet")
     assert len(episodes) == EPISODES * 3 * (2 + len(SWEEPS["friction"].points))
     assert episodes["seed"].tolist()[:EPISODES] == [7, 8, 9, 10]
+
+
+def test_pictures_of_values_that_are_wide_apart():
+    wide = Card({MAIN: {"ours": played(0.05), "pid": played(0.001), "other": played(0.04)}})
+    assert "-4900 %" in [text.get_text() for text in improvements(wide).axes[0].texts]  # the bar ends at -100
+    assert pareto(wide).axes[0].get_xscale() == "log"
+    assert pareto(card()).axes[0].get_xscale() == "linear"
 
 
 def test_yaw_of_a_quaternion():

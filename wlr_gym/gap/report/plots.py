@@ -24,6 +24,7 @@ from wlr_gym.gap.analysis import (
     HeatMap,
     Relation,
     RunGap,
+    Threshold,
     Trace,
 )
 from wlr_gym.gap.report.text import channel, error, feature, percent, places, plain
@@ -50,7 +51,9 @@ _OTHER_OUTCOME = PALE
 #: Overlays in one figure.
 _PANELS = 6
 #: Effects shown in a round beside those that were fitted.
-_OTHERS = 6
+_OTHERS = 3
+#: Gain beyond which a round's axis is logarithmic above the second number: small bars and the threshold stay visible.
+_LARGE_GAIN, _LINEAR_GAIN = 200.0, 10.0
 #: Ends of the heat map's scale, noise units.
 _COLDEST = 0.7
 _HOTTEST = 10.0
@@ -76,7 +79,7 @@ def figures(analysis: Analysis) -> dict[str, Figure]:
         if heat_map.values.size:
             found[f"where_{index + 1}"] = _heat_map(heat_map)
     if analysis.evidence:
-        found["evidence"] = _evidence(analysis.evidence)
+        found["evidence"] = _evidence(analysis.evidence, analysis.thresholds)
     if analysis.gap is not None:
         found["gap"] = _gap(analysis.gap, analysis.run_gaps, with_effects=bool(analysis.added))
     if analysis.channel_gaps:
@@ -136,11 +139,12 @@ def _heat_map(heat_map: HeatMap) -> Figure:
     if rows * columns <= 800:
         _write_values(axes, heat_map.values, image)
     axes.set_xlabel(feature(heat_map.feature), fontsize=9)
-    axes.set_title("rms error of the calibrated model; 1 = sensor noise", fontsize=9, loc="left")
+    axes.set_title("rms error of the calibrated model", fontsize=9, loc="left")
     ticks = [tick for tick in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if tick <= hottest]
     bar = figure.colorbar(image, ax=axes, shrink=0.8, pad=0.02, ticks=ticks, format="%g")
     bar.ax.tick_params(labelsize=8)
     bar.minorticks_off()
+    bar.set_label("rms error (1 = sensor noise)", fontsize=9)
     return figure
 
 
@@ -151,21 +155,25 @@ def _write_values(axes: Axes, values: Array, image: AxesImage) -> None:
         value = float(values[row, column])
         if np.isfinite(value):
             colour = text_colour(colours[row, column].tolist())
-            axes.text(column, row, f"{value:.1f}" if value < 9.95 else f"{value:.0f}", ha="center", va="center", fontsize=6.5,
+            axes.text(column, row, f"{value:.1f}" if value < 9.95 else f"{value:.0f}", ha="center", va="center", fontsize=7.5,
                       color=colour)  # fmt: skip
 
 
 # ---- what ------------------------------------------------------------------------------------------------------------
 
 
-def _evidence(evidence: Sequence[Evidence]) -> Figure:
+def _evidence(evidence: Sequence[Evidence], thresholds: Sequence[Threshold]) -> Figure:
+    least = {one.round: one.least for one in thresholds}
     rounds = sorted({one.round for one in evidence})
     shown = [_strongest([one for one in evidence if one.round == turn]) for turn in rounds]
-    heights = [1.1 + 0.24 * len(members) for members in shown]
-    figure = new_figure(9.5, sum(heights) + 0.6)
+    heights = [0.85 + 0.18 * len(members) for members in shown]
+    figure = new_figure(8.5, sum(heights) + 0.6)
     panels = figure.subplots(len(rounds), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, turn, members in zip(panels, rounds, shown, strict=True):
         _draw_round(axes, members)
+        if turn in least:
+            style = {"color": GREEN, "linestyle": "--", "linewidth": 1.2}
+            axes.axvline(least[turn], label="least that an effect of one number must gain", **style)
         part = ": the strongest candidates" if sum(one.round == turn for one in evidence) > len(members) else ""
         axes.set_title(f"Round {turn}{part}", fontsize=10, loc="left")
         axes.set_xlabel("gain: improvement of the fit (fall of -2 log posterior)", fontsize=9)
@@ -175,8 +183,9 @@ def _evidence(evidence: Sequence[Evidence]) -> Figure:
         (_OTHER_OUTCOME, "not selected"),
     )
     handles = [panels[0].barh([0], [0], color=colour, label=label) for colour, label in labels]
-    handles.append(panels[0].barh([0], [0], fill=False, edgecolor=_OTHER_OUTCOME, label="not fitted: predicted improvement"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    handles.append(panels[0].barh([0], [0], fill=False, edgecolor=GREY, label="not fitted: predicted improvement"))
+    handles += [axes.lines[-1] for axes in panels[:1] if axes.lines]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return figure
 
 
@@ -201,14 +210,25 @@ def _draw_round(axes: Axes, members: Sequence[Evidence]) -> None:
     bars = axes.barh(rows, sizes, color=[_COLOURS.get(one.outcome, _OTHER_OUTCOME) for one in members], height=0.7)
     for row, bar, size, one in zip(rows, bars, sizes, members, strict=True):
         if one.outcome == REJECTED:
-            bar.set(fill=False, edgecolor=_OTHER_OUTCOME)
+            bar.set(fill=False, edgecolor=GREY)
         text = f"{size:.0f}  {one.outcome}"
         weight = "bold" if one.outcome == SELECTED else "normal"
-        axes.annotate(text, (max(size, 0.0), row), (5, 0), textcoords="offset points", va="center", fontsize=7.5, weight=weight)
+        style = {
+            "va": "center",
+            "fontsize": 7.5,
+            "weight": weight,
+            "bbox": {"facecolor": "white", "linewidth": 0.0, "pad": 0.5},
+        }
+        axes.annotate(text, (max(size, 0.0), row), (5, 0), textcoords="offset points", **style)
     labels = [f"{plain(one.name)}, {places(one.where)}" for one in members]
     axes.set_yticks(rows, [textwrap.shorten(label, 48, placeholder=" …") for label in labels])
     low, high = min(sizes.min(), 0.0), max(sizes.max(), 1.0)
-    axes.set_xlim(low - (0.05 * (high - low) if low < 0.0 else 0.0), high + 0.25 * (high - low))
+    if high > _LARGE_GAIN:
+        axes.set_xscale("symlog", linthresh=_LINEAR_GAIN)
+        axes.xaxis.set_major_formatter(_plain_ticks)
+        axes.set_xlim(3.0 * low, 40.0 * high)
+    else:
+        axes.set_xlim(low - (0.05 * (high - low) if low < 0.0 else 0.0), high + 0.25 * (high - low))
     axes.set_ylim(-0.6, len(members) - 0.4)
     tidy(axes, "x")
 
@@ -219,16 +239,19 @@ def _draw_round(axes: Axes, members: Sequence[Evidence]) -> None:
 def _gap(gap: GapFigures, runs: Sequence[RunGap], *, with_effects: bool) -> Figure:
     figure = new_figure(10.0, max(3.4, 1.7 + 0.3 * len(runs)) if runs else 3.2)
     left, *right = np.atleast_1d(figure.subplots(1, 2 if runs else 1, width_ratios=(1.0, 1.25) if runs else (1.0,)))
-    _draw_gap_bars(left, gap, with_effects=with_effects)
+    shown = _draw_gap_bars(left, gap, with_effects=with_effects)
     if runs:
         labels = [f"{one.run}{'  (held out)' if one.heldout else ''}" for one in runs]
         handles = _draw_moves(right[0], labels, runs, with_effects=with_effects)
         right[0].set_title("each run", fontsize=10, loc="left")
-        figure.legend(handles=handles, loc="outside lower right", ncols=4, fontsize=8.5, frameon=False)
+        shown += handles
+    if shown:
+        figure.legend(handles=shown, loc="outside lower right", ncols=5, fontsize=8.5, frameon=False)
     return figure
 
 
-def _draw_gap_bars(axes: Axes, gap: GapFigures, *, with_effects: bool) -> None:
+def _draw_gap_bars(axes: Axes, gap: GapFigures, *, with_effects: bool) -> list[Artist]:
+    """Draw a bar per model, over the held-out runs; return the interval of the reduction, if there is one, for a legend."""
     bars = [("model as given", gap.heldout_before, BEFORE), ("calibrated", gap.heldout_calibrated, CALIBRATED)]
     if with_effects:
         bars.append(("effects added", gap.heldout_after, AFTER))
@@ -242,9 +265,11 @@ def _draw_gap_bars(axes: Axes, gap: GapFigures, *, with_effects: bool) -> None:
         axes.annotate(error(value), place, (6, raised), textcoords="offset points", va="center", fontsize=9)
     avoidable = gap.heldout_calibrated - gap.noise_floor
     interval = [gap.heldout_calibrated - share * avoidable for share in gap.reduction_ci95]
+    whiskers: list[Artist] = []
     if with_effects and np.all(np.isfinite(interval)):
         low, high = sorted(interval)
-        axes.plot([low, high], [rows[-1]] * 2, color="black", linewidth=1.4, marker="|", markersize=9)
+        style: dict[str, Any] = {"color": "black", "linewidth": 1.4, "marker": "|", "markersize": 9}
+        whiskers += axes.plot([low, high], [rows[-1]] * 2, label="95 % interval of the reduction", **style)
         end = max(end, high)
     axes.axvline(gap.noise_floor, color=GREEN, linestyle="--", linewidth=1.2)
     axes.set_ylim(-0.55, len(bars) - 0.1)
@@ -256,6 +281,7 @@ def _draw_gap_bars(axes: Axes, gap: GapFigures, *, with_effects: bool) -> None:
     axes.set_title("held-out runs", fontsize=10, loc="left")
     tidy(axes, "x")
     axes.tick_params(axis="y", labelsize=9)
+    return whiskers
 
 
 def _draw_moves(

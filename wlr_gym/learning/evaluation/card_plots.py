@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MultipleLocator
 
-from wlr_gym.base.plots import COLOURS, GREY, legend_below, new_figure, save, tidy
+from wlr_gym.base.plots import COLOURS, GREY, legend_below, new_figure, save, text_colour, tidy
 from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, IDLE, MAIN, Card
 from wlr_gym.learning.evaluation.metrics import JITTER_FREQUENCY, TRACKING, Metric, has_limits
+from wlr_gym.learning.evaluation.statistics import Estimate
 from wlr_gym.learning.evaluation.sweeps import Sweep
 
 #: Panels of a sweep, each a metric.
@@ -26,9 +30,12 @@ REFERENCES = (IDLE, "untrained")
 #: Distance between two subjects at one rank of a sweep without numbers.
 DODGE = 0.09
 MARKERS = "osD^vP*Xh"
-LINES = ("-", "-.")
+#: Told apart without colour too; one more than there are colours, so that the two do not repeat together.
+LINES = ("-", (0, (6, 1.5)), "-.", (0, (1.2, 1)), (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (3, 3)))
 #: %; improvements beyond it are cut off.
 CUT = 100.0
+#: Largest by smallest value of an axis beyond which it is logarithmic.
+WIDE = 10.0
 
 
 def draw_card(folder: Path, card: Card) -> dict[str, str]:
@@ -46,7 +53,7 @@ def _style(card: Card, name: str) -> dict[str, Any]:
     if name in REFERENCES:
         return {"color": GREY, "marker": "", "linestyle": "--" if name == IDLE else ":"}
     rank = [other for other in card.names if other not in REFERENCES].index(name)
-    line = LINES[rank // len(COLOURS) % len(LINES)]
+    line = LINES[rank % len(LINES)]
     return {"color": COLOURS[rank % len(COLOURS)], "marker": MARKERS[rank % len(MARKERS)], "linestyle": line}
 
 
@@ -59,12 +66,16 @@ def _scale(metric: Metric) -> tuple[float, str]:
 
 
 def sweep_curves(card: Card, sweep: Sweep) -> Figure:
-    """Draw tracking error, success and slip over a sweep, a curve with its interval per subject."""
+    """Draw tracking error, success and slip over a sweep below each other, a curve with its interval per subject."""
     chosen = [metric for key in SWEPT for metric in card.metrics if metric.key == key]
-    figure = new_figure(4.6 * len(chosen), 3.8)
-    for axes, metric in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
+    figure = new_figure(7.0, 1.1 + 1.9 * len(chosen))
+    panels = figure.subplots(len(chosen), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, metric in zip(panels, chosen, strict=True):
         _draw_sweep(axes, card, sweep, metric)
-    legend_below(figure, columns=6)
+    if sweep.name == "slope":
+        panels[-1].invert_xaxis()  # the steepest on the right
+    panels[-1].set_xlabel(sweep.axis, fontsize=9)
+    legend_below(figure, columns=3)
     figure.suptitle(f"{sweep.doc}", fontsize=10)
     return figure
 
@@ -75,17 +86,14 @@ def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
     if metric.key == "tracking_error":
         axes.axhline(1.0, color="0.3", linestyle=":", linewidth=1.2)
         axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter("{x:g}")
+        _plain_log(axes.yaxis)
     else:
         axes.set_ylim(*((-2.0, 102.0) if metric.unit == "%" else (0.0, None)))
     if sweep.name in ("friction", "grip"):
         axes.set_xscale("log")
     axes.set_xticks([point.value for point in sweep.points], [point.label for point in sweep.points])
     axes.minorticks_off()
-    if sweep.name == "slope":
-        axes.invert_xaxis()  # the steepest on the right
-    axes.set(xlabel=sweep.axis, ylabel=_scale(metric)[1])
+    axes.set_ylabel(_scale(metric)[1].replace(" (", "\n(", 1))
     tidy(axes, "both" if sweep.numeric else "y")
     if not sweep.numeric:
         for left in np.arange(len(sweep.points) + 1) - 0.5:
@@ -124,6 +132,8 @@ def improvements(card: Card) -> Figure:
         ends = np.maximum(0.0, np.array([[e.mean - e.low, e.high - e.mean] for e in estimates]).T)
         style = {"color": _style(card, name)["color"], "label": f"against {name}", "error_kw": {"linewidth": 1}}
         axes.barh(y, mean, height=0.9 * height, xerr=ends, **style)
+        for place, value in zip(y[mean < -CUT], mean[mean < -CUT], strict=True):
+            _write_cut(axes, float(place), float(value), style["color"])
     axes.axvline(0.0, color="black", linewidth=1)
     axes.set_yticks(range(len(metrics)), [metric.key.replace("_", " ") for metric in metrics])
     axes.set_ylim(len(metrics) - 0.5, -0.5)
@@ -135,20 +145,45 @@ def improvements(card: Card) -> Figure:
     return figure
 
 
+def _write_cut(axes: Axes, y: float, value: float, colour: str) -> None:
+    """Write the value of a bar that is cut off at its end."""
+    style = {"textcoords": "offset points", "va": "center", "fontsize": 7, "color": text_colour(to_rgb(colour))}
+    axes.annotate(f"{value:.0f} %", (-CUT, y), (3, -0.5), **style)
+
+
 def pareto(card: Card) -> Figure:
     """Draw tracking error against slip, total and excess: best is what is low and left."""
-    figure = new_figure(9.0, 4.0)
+    figure, shown = new_figure(9.0, 4.0), [card.names[0], *_rivals(card)]
     error, *slips = [metric for key in ("tracking_error", *SLIP) for metric in card.metrics if metric.key == key]
     for axes, slip in zip(figure.subplots(1, len(slips)), slips, strict=True):
-        for name in [card.names[0], *_rivals(card)]:
+        for name in shown:
             scores = card.scores[MAIN][name]
             x, y = (_scale(m)[0] * np.array([scores[m.key].mean, scores[m.key].low, scores[m.key].high]) for m in (error, slip))
             style = _style(card, name) | {"linestyle": "", "capsize": 2, "elinewidth": 1}
             axes.errorbar(x[0], y[0], xerr=np.abs(x[1:, None] - x[0]), yerr=np.abs(y[1:, None] - y[0]), label=name, **style)
-        axes.set(xlabel=_scale(error)[1], ylabel=_scale(slip)[1], xlim=(0.0, None), ylim=(0.0, None))
+        axes.set(xlabel=_scale(error)[1], ylabel=_scale(slip)[1])
         tidy(axes)
+        _fit(axes, "x", [card.scores[MAIN][name][error.key] for name in shown])
+        _fit(axes, "y", [card.scores[MAIN][name][slip.key] for name in shown])
     legend_below(figure, columns=5)
     return figure
+
+
+def _fit(axes: Axes, name: Literal["x", "y"], estimates: Sequence[Estimate]) -> None:
+    """Let an axis begin at 0, or make it logarithmic where its values are wide apart."""
+    low, high = min(one.low for one in estimates), max(one.high for one in estimates)
+    if not high > WIDE * low > 0.0:
+        axes.set(**{f"{name}lim": (0.0, None)})
+        return
+    axes.set(**{f"{name}scale": "log"})
+    _plain_log(axes.xaxis if name == "x" else axes.yaxis)
+    axes.minorticks_off()
+
+
+def _plain_log(axis: Axis) -> None:
+    """Write the numbers of a logarithmic axis without powers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
 
 
 def _rivals(card: Card) -> list[str]:

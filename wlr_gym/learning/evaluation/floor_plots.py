@@ -39,7 +39,7 @@ def draw_floors(path: Path, randomizations: Sequence[Randomization], first_seed:
 
     columns, beside = min(count, _COLUMNS), min(len(randomizations), _BLOCKS)
     rows, below = -(-count // columns), -(-len(randomizations) // beside)
-    size = 2.2 if beside == 1 else 1.2
+    size = 2.2 if beside == 1 else 1.75 if count == 1 else 1.2
     height = (size * rows + 0.2) * below + 0.3
     figure = new_figure(size * (columns + 0.2) * beside + 0.4, height + 0.7)
     norm = LogNorm(0.05, 1.0, clip=True)  # friction coefficients at the ends of the colours

@@ -19,20 +19,22 @@ from wlr_gym.studies.bench.camera_chain import ChainDrive, ChainSetting, chain_c
 
 #: s of the drive that is drawn, from when on the lens is covered, and for how long.
 _SECONDS, _COVERED, _FOR = 12.0, 5.0, 3.0
-_TRUTH, _SEEN, _ESTIMATE, _FLOW = "0.1", ORANGE, BLUE, GREEN
+#: The truth is wide and pale: what lies on it hides no more than its middle.
+_TRUTH: dict[str, Any] = {"color": "0.6", "lw": 4.0, "label": "truth"}
+_SEEN, _ESTIMATE, _FLOW = ORANGE, BLUE, GREEN
 
 
 def draw_chain(drive: ChainDrive, path: Path, title: str) -> None:
-    """Draw a drive: position, forward speed, heading, slip of one wheel, age of the camera's pose.
+    """Draw a drive: errors of position and heading, forward speed, slip of one wheel, age of the camera's pose.
 
     Args:
         drive: what was seen. path: of the picture. title: of it.
     """
-    figure = new_figure(10.0, 9.5)
-    axes = figure.subplots(5, 1, sharex=True, height_ratios=(3, 3, 3, 3, 1.3))
-    _draw_pose(axes[0], drive, 0, "x from the start (m)")
-    _draw_speed(axes[1], drive)
-    _draw_pose(axes[2], drive, 2, "heading (rad)")
+    figure = new_figure(8.0, 6.8)
+    axes = figure.subplots(5, 1, sharex=True, height_ratios=(2, 2, 3, 3, 1.5))
+    _draw_pose_error(axes[0], drive, 0, "error of x\n(mm)")
+    _draw_pose_error(axes[1], drive, 2, "error of the\nheading (mrad)")
+    _draw_speed(axes[2], drive)
     _draw_slip(axes[3], drive)
     axes[4].plot(drive.time, 1e3 * drive.sensed("camera_age"), color=_SEEN, lw=1.0)
     axes[4].set_ylabel("age of the\npose (ms)")
@@ -41,12 +43,13 @@ def draw_chain(drive: ChainDrive, path: Path, title: str) -> None:
     axes[4].set_xlabel("time (s)")
     blind = np.array([bool(reason) for reason in drive.reasons])
     for axis in axes:
-        shade = {"transform": axis.get_xaxis_transform(), "color": "0.9", "lw": 0, "zorder": 0}
+        shade = {"transform": axis.get_xaxis_transform(), "color": "0.92", "lw": 0, "zorder": 0}
         axis.fill_between(drive.time, 0, 1, where=blind, label="no pose", **shade)
         tidy(axis)
         axis.set_xlim(0, drive.time[-1])
     axes[0].set_title(title, fontsize=10)
-    legend_below(figure, columns=6)
+    figure.align_ylabels(axes)
+    legend_below(figure, columns=3)
     save(figure, path)
 
 
@@ -54,14 +57,16 @@ def _estimate(drive: ChainDrive, name: str) -> Any:
     return ESTIMATE_LAYOUT.view(drive.estimate, name)
 
 
-def _draw_pose(axis: Any, drive: ChainDrive, k: int, label: str) -> None:
-    """One component of the pose: truth, estimate, and every frame where it was exposed."""
+def _draw_pose_error(axis: Any, drive: ChainDrive, k: int, label: str) -> None:
+    """One component of the pose, less the truth: the estimate, and every frame against when it was exposed."""
+    true = drive.true_pose()[:, k]
     estimate = _estimate(drive, "yaw") if k == 2 else _estimate(drive, "position")[:, k]
     is_new = drive.sensed("camera_is_new") > 0.5
-    exposed = drive.time - drive.sensed("camera_age")
-    axis.plot(drive.time, drive.true_pose()[:, k], color=_TRUTH, lw=2.0, label="truth")
-    axis.plot(drive.time, estimate, color=_ESTIMATE, lw=1.2, label="observer")
-    axis.plot(exposed[is_new], drive.sensed("camera_pose")[is_new, k], ".", color=_SEEN, ms=4, label="camera, when exposed")
+    exposed = (drive.time - drive.sensed("camera_age"))[is_new]
+    seen = drive.sensed("camera_pose")[is_new, k] - np.interp(exposed, drive.time, true)
+    axis.plot(exposed, 1e3 * seen, ".", color=_SEEN, ms=3, label="camera, when exposed")
+    axis.plot(drive.time, 1e3 * (estimate - true), color=_ESTIMATE, lw=1.2, label="observer")
+    axis.axhline(0.0, color="black", lw=0.6)
     axis.set_ylabel(label)
 
 
@@ -72,23 +77,23 @@ def _draw_band(axis: Any, time: Any, values: Any, sigma: Any) -> None:
 
 def _draw_speed(axis: Any, drive: ChainDrive) -> None:
     speed, sigma = (_estimate(drive, f"linear_velocity_{name}")[:, 0] for name in ("in_body", "sigma"))
-    axis.plot(drive.time, drive.true("linear_velocity_in_body")[:, 0], color=_TRUTH, lw=2.0, label="truth")
+    axis.plot(drive.time, drive.true("linear_velocity_in_body")[:, 0], **_TRUTH)
     _draw_band(axis, drive.time, speed, sigma)
     axis.plot(drive.time, drive.command[:, 0], "--", color=GREY, lw=1.0, label="command")
     if "flow" in SENSOR_LAYOUT.channels and (is_new := drive.sensed("flow_is_new") > 0.5).any():
         turned = drive.sensed("flow")[:, 0] + drive.sensed("gyro")[:, 1]
         height = drive.true("position")[:, 2]
         axis.plot(drive.time[is_new], (turned * height)[is_new], ".", color=_FLOW, ms=2, label="flow times height")
-    axis.set_ylabel("forward speed (m/s)")
+    axis.set_ylabel("forward speed\n(m/s)")
     axis.set_ylim(*_limits(drive.true("linear_velocity_in_body")[:, 0], speed))
 
 
 def _draw_slip(axis: Any, drive: ChainDrive, wheel: int = 0) -> None:
     slip, sigma = (_estimate(drive, name)[:, 2 * wheel] for name in ("slip_velocity", "slip_sigma"))
     true = drive.true("slip_velocity")[:, 2 * wheel]
-    axis.plot(drive.time, true, color=_TRUTH, lw=2.0, label="truth")
+    axis.plot(drive.time, true, **_TRUTH)
     _draw_band(axis, drive.time, slip, sigma)
-    axis.set_ylabel(f"slip of {WHEELS[wheel]} (m/s)")
+    axis.set_ylabel(f"slip of {WHEELS[wheel]}\n(m/s)")
     axis.set_ylim(*_limits(true, slip))
 
 

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
 from wlr_gym.studies.bench.engine import KINDS, EngineResult
+from wlr_gym.studies.bench.label_places import Label, place_labels
 from wlr_gym.studies.bench.measure import Measurement
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: m: errors at which the fastest setting of each side is compared. The first two
 #: are met where the contacts are nearly those of Coulomb, the last by MuJoCo's default contact.
@@ -93,49 +99,80 @@ def settings_table(report: dict[str, Any]) -> tuple[tuple[str, ...], list[tuple[
     return ("side", "setting", "precision", "error, rms", "worst", "x real time"), rows
 
 
+_ERROR = "rms error: mean distance of the four hips from the reference after a motion of 2 s, rms over ten motions (mm)"
+_HOW_TO_READ = "Numbers: step in ms. Crosses: another number of passes (p; usual: 4) or iterations (i; usual: 100)"
 #: Colour of an engine's precision and of a contact of MuJoCo.
 _COLOURS = {"float64": BLUE, "float32": ORANGE, "default": "black", "stiff friction": GREY, "matched": WINE, "tuned": GREEN}
 
 
 def save_picture(report: dict[str, Any], path: Path) -> None:
     """Write error against speed of every setting on one thread as a PNG; ``report`` is ``EngineReport.as_dict()``."""
-    figure = new_figure(9.5, 6.0)
+    figure = new_figure(9.5, 6.6)
     axes = figure.subplots()
-    axes.set(xscale="log", yscale="log", xlabel="error of the pose after 2 s, rms of ten motions (mm)")
+    axes.set(xscale="log", yscale="log", xlabel=_ERROR)
     axes.set_ylabel("simulated seconds of a robot per second of one core")
     shown = [one for one in report["settings"] if one["upright"] and one["threads"] == 1 and one["call"] == "step"]
+    labels: list[Label] = []
     for precision in ("float64", "float32"):
         rows = [one for one in shown if one["side"] == "engine" and one["precision"] == precision]
-        _draw(axes, rows, f"engine, {precision}", _COLOURS[precision], "o")
+        labels += _draw(axes, rows, f"engine, {precision}", _COLOURS[precision], "o")
     drawn: set[str] = set()
     for cone, contact, integrator in KINDS:
         kind = {"side": "MuJoCo", "cone": cone, "contact": contact, "integrator": integrator}
         rows = [one for one in shown if all(one[name] == value for name, value in kind.items())]
         label = f"MuJoCo: {contact}, {cone}, {integrator}"
-        _draw(axes, rows, label, _COLOURS[contact], "s", is_second=contact in drawn)
+        labels += _draw(axes, rows, label, _COLOURS[contact], "s", is_second=contact in drawn)
         drawn.add(contact)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")
-    axes.set_title("Numbers: step in ms. Crosses: fewer or more passes or iterations", fontsize=9, loc="left")
+    _draw_pair(axes, shown)
+    axes.set_title(_HOW_TO_READ, fontsize=9, loc="left")
     tidy(axes)
     legend_below(figure, columns=3)
+    place_labels(figure, axes, labels)
     save(figure, path)
 
 
-def _draw(axes: Any, rows: list[dict[str, Any]], label: str, colour: str, marker: str, *, is_second: bool = False) -> None:
-    """One curve over the step; settings with another number of passes or iterations are crosses.
+def _point(one: dict[str, Any]) -> tuple[float, float]:
+    return 1e3 * one["error"], one["speed"]["median"]
+
+
+def _draw(
+    axes: Axes, rows: list[dict[str, Any]], label: str, colour: str, marker: str, *, is_second: bool = False
+) -> list[Label]:
+    """Draw a curve over the step, and crosses of settings with another number of passes or iterations; return their labels.
 
     The second of one colour is dashed, its markers are open, and its steps, which are those of the first, are not written.
     """
     usual = [one for one in rows if one["is_usual"]]
     other = [one for one in rows if not one["is_usual"]]
-    line = {"marker": marker, "label": label}
+    line: dict[str, Any] = {"marker": marker, "label": label}
     if is_second:
         line |= {"linestyle": "--", "markerfacecolor": "white"}
-    for chosen, style in ((usual, line), (other, {"marker": "x", "linestyle": "none"})):
+    crosses: dict[str, Any] = {"marker": "x", "linestyle": "none"}
+    for chosen, style in ((usual, line), (other, crosses)):
         if chosen:
-            points = [(1e3 * one["error"], one["speed"]["median"]) for one in chosen]
-            axes.plot(*zip(*points, strict=True), color=colour, markersize=5, linewidth=1.2, **style)
-    for one in [] if is_second else usual:
-        place = (1e3 * one["error"], one["speed"]["median"])
-        axes.annotate(f"{1e3 * one['step']:g}", place, textcoords="offset points", xytext=(5, 3), fontsize=7, color=colour)
+            axes.plot(*zip(*map(_point, chosen), strict=True), color=colour, markersize=5, linewidth=1.2, **style)
+    steps = [] if is_second else [Label(*_point(one), f"{1e3 * one['step']:g}", colour) for one in usual]
+    return steps + [Label(*_point(one), _unusual(one), colour) for one in other]
+
+
+def _unusual(one: dict[str, Any]) -> str:
+    return f"{1e3 * one['step']:g}, {one['iterations']}{'p' if one['side'] == 'engine' else 'i'}"
+
+
+def _draw_pair(axes: Axes, shown: Sequence[dict[str, Any]]) -> None:
+    """Ring the fastest float64 setting of each side within the smallest level, and say how much faster the engine is."""
+    fit = [one for one in shown if one["precision"] == "float64" and one["error"] <= LEVELS[0]]
+    sides = [[one for one in fit if one["side"] == side] for side in ("engine", "MuJoCo")]
+    if not all(sides):
+        return
+    ours, peer = (max(rows, key=lambda one: one["speed"]["median"]) for rows in sides)
+    ratio = np.median(np.divide(ours["speed"]["values"], peer["speed"]["values"]))
+    for one in (ours, peer):
+        axes.plot(*_point(one), "o", markersize=11, markerfacecolor="none", markeredgecolor="black")
+    ends = {"arrowstyle": "<->", "shrinkA": 9, "shrinkB": 9}
+    axes.annotate("", _point(ours), _point(peer), arrowprops=ends)
+    text = f"rings: {level_name(LEVELS[0])}\n{ratio:.0f} times as fast\n\nengine: {ours['label']}\nMuJoCo: {peer['label']}"
+    middle = 1e3 * peer["error"], float(np.sqrt(ours["speed"]["median"] * peer["speed"]["median"]))
+    axes.annotate(text, middle, (8, 0), textcoords="offset points", va="center", fontsize=9)

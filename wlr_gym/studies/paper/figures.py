@@ -19,7 +19,7 @@ from wlr_gym.studies.paper import printed
 from wlr_gym.studies.paper.experiments import MODELS, REDUCED, PaperTest, Record, duration
 from wlr_gym.studies.paper.ideal import IdealMotion
 from wlr_gym.studies.paper.measured import FromMeasurement
-from wlr_gym.studies.paper.slip_candidates import READINGS
+from wlr_gym.studies.paper.slip_candidates import CANDIDATES, READINGS
 from wlr_gym.studies.paper.slip_search import SearchFinding
 
 Array = NDArray[np.float64]
@@ -205,28 +205,42 @@ def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
 def question_figure(findings: Sequence[SearchFinding]) -> Figure:
     """How near departures from the nominal robot come to the paper's four numbers: one at a time, and the best combinations."""
     nearest = sorted(findings, key=lambda finding: min(map(finding.closest, READINGS)))
-    groups = {
-        "one departure": [finding for finding in nearest if len(finding.names) == 1],
-        "several at once: the closest": [finding for finding in nearest if len(finding.names) > 1][:_COMBINATIONS],
-    }
-    groups = {title: shown for title, shown in groups.items() if shown}
-    figure, axes = _panels(
-        "How near do departures from the nominal robot come to the paper's four numbers?", 1, len(groups), 2.6
-    )
-    for panel, (title, shown) in zip(axes.flat, groups.items(), strict=True):
-        panel.axvspan(0.0, 1.0, color=GREEN, alpha=0.2, linewidth=0.0, label="match: all four within tolerance")
-        for on_leg, style in _PREDICTIONS.items():
-            readings = [reading for reading in READINGS if reading.encoder_on_leg is on_leg]
-            misses = [min(map(finding.closest, readings)) for finding in shown]
-            panel.plot(misses, range(len(shown)), linestyle="", markeredgewidth=1.5, **style)
-        panel.set_yticks(range(len(shown)), [finding.label for finding in shown])
-        panel.set_ylim(len(shown) - 0.4, -0.6)
-        panel.set_xlim(left=0.0)
-        panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        panel.set_xlabel("largest of four errors, closest robot (1 = tolerance)")
+    alone = [finding for finding in nearest if len(finding.names) == 1]
+    together = [finding for finding in nearest if len(finding.names) > 1][:_COMBINATIONS]
+    groups = [
+        ("one departure, and what it is", alone, [_departure(finding.label) for finding in alone]),
+        ("several at once: the closest", together, [finding.label for finding in together]),
+    ]
+    groups = [group for group in groups if group[1]]
+    heights = [0.9 + 0.21 * len(shown) for _, shown, _ in groups]
+    figure = new_figure(8.5, sum(heights) + 1.0)
+    figure.suptitle("How near do departures from the nominal robot come to the paper's four numbers?", fontsize=11)
+    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for panel, (title, shown, labels) in zip(panels, groups, strict=True):
+        _draw_misses(panel, shown, labels)
         panel.set_title(title, fontsize=9, loc="left")
+        tidy(panel)
+    panels[-1].set_xlabel("largest of four errors, closest robot (1 = tolerance)", fontsize=9)
     legend_below(figure)
     return figure
+
+
+def _departure(name: str) -> str:
+    """``zeros: zeros of the leg encoders``."""
+    return next((f"{name}: {one.doc}" for one in CANDIDATES if one.name == name), name)
+
+
+def _draw_misses(panel: Axes, shown: Sequence[SearchFinding], labels: Sequence[str]) -> None:
+    """Draw by how much each departure misses the paper's numbers, in tolerances, a row each."""
+    panel.axvspan(0.0, 1.0, color=GREEN, alpha=0.2, linewidth=0.0, label="match: all four within tolerance")
+    for on_leg, style in _PREDICTIONS.items():
+        readings = [reading for reading in READINGS if reading.encoder_on_leg is on_leg]
+        misses = [min(map(finding.closest, readings)) for finding in shown]
+        panel.plot(misses, range(len(shown)), linestyle="", markeredgewidth=1.5, **style)
+    panel.set_yticks(range(len(shown)), labels)
+    panel.set_ylim(len(shown) - 0.4, -0.6)
+    panel.set_xlim(left=0.0)
+    panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
 
 
 def figures_of_test(
