@@ -160,8 +160,8 @@ def test_the_policies_page_has_the_numbers_of_slope():
     (row,) = [row for row in data("learning")["slope"]["rows"] if row["sensors"] == "none"]
     better, less = ({name: f"{one[key][0]:.0f} %" for name, one in row["others"].items()} for key in ("better", "slips_less"))
     said = f"error is {better['blind']} smaller than that of `blind`, {better['slip_compensating']} than `slip_compensating`, "
-    said += f"{better['pid']} than `pid`. Slip is {less['blind']} less than that of `blind`"
-    assert f"{said} and {less['pid']} less than that of `pid`" in page("policies")
+    said += f"{better['pid']} than `pid`. It slips {less['blind']} less than `blind`"
+    assert f"{said} and {less['pid']} less than `pid`" in page("policies")
 
 
 def card_numbers(task: str, metric: str) -> dict[str, list[float]]:
