@@ -64,8 +64,8 @@ INTRODUCTION = (
 FORMULA = re.compile(r"\$\$(?P<display>.+?)\$\$|\$(?P<inline>[^$\s](?:[^$]*[^$\s])?)\$", re.S)
 
 
-#: Where a page has a table that is made; the link is for readers of the repository.
-TABLE = re.compile(r"<!-- table: (\w+) -->\n\[Table\]\(tables/\1\.md\)")
+#: Where a page has a table that is made; the link, of any text, is for readers of the repository.
+TABLE = re.compile(r"<!-- table: (\w+) -->\n\[[^\]\n]+\]\(tables/\1\.md\)")
 
 
 #: Tables and code are wide: the site takes more of a wide window than the theme's 61 rem.

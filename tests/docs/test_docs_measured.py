@@ -54,10 +54,32 @@ def test_the_observer_on_mujoco_is_as_the_page_says():
     assert f"slip errors are {min(ratios):.1f} to {max(ratios):.1f} times these" in page("slip_observer")
 
 
+def test_the_observers_sigmas_are_as_the_page_says():
+    rows, text = data("observer")["rows"], page("slip_observer")
+    found = {
+        (row["floor"], row["drive"], row["backend"], sensors): row[sensors]["error_over_sigma"]
+        for row in rows
+        for sensors in ("neither", "camera", "flow", "camera and flow")
+        if sensors in row
+    }
+    wide, on_mujoco = (found.pop(("wide", "commands", backend, "neither")) for backend in ("gibbs_appell", "mujoco"))
+    excited = {key: found.pop(key) for key in list(found) if key[1] == "excitation" and key[-1] == "neither"}
+    ours = [value for (_, _, backend, _), value in excited.items() if backend == "gibbs_appell"]
+    split = [found.pop(key) for key in list(found) if key[0] == "split" and "velocity" in key[1] and key[-1] == "neither"]
+    assert f"`wide` commands (error/sigma {wide:.1f}; {on_mujoco:.1f} on MuJoCo)" in text
+    assert f"for excitation ({min(ours):.1f} to {max(ours):.1f}) and for policies on split floors" in text
+    assert f"({min(split):.1f} to {max(split):.1f}). Elsewhere, and with a camera" in text
+    assert f"error/sigma is {min(found.values()):.1f} to {max(found.values()):.1f}" in text
+
+
 def test_a_covered_lens_costs_what_the_page_says():
     rows = [row for row in data("bench")["rows"] if row["name"] == "camera" and "over that without a camera" in row["what"]]
     ratios = [row["ours"]["median"] for row in rows]
-    assert f"{min(ratios):.2f} to {max(ratios):.2f} times that of a robot without a camera" in page("camera")
+    said = (
+        f"{min(ratios):.2f} to {max(ratios):.2f} times that of a robot without a camera (target: at most 1.00, just missed on "
+    )
+    assert sum(not row["met"] for row in rows) == 2
+    assert f"{said}two of the three floors)" in page("camera")
 
 
 def test_films_of_a_lab_have_the_numbers():
@@ -81,6 +103,17 @@ def test_the_pages_have_the_numbers_of_adaptation():
     assert f"tracking error {error.replace(' ', ' % ', 1)} smaller (median)" in readme
     assert f"{ours.replace(' ', ' % ', 1)} of what training with the true model wins" in readme
     assert f"calibration alone {calibrated.split()[0]} %" in readme
+
+
+def test_the_adaptation_page_counts_what_was_named_and_what_was_not_committed():
+    lines, text = read_lines(ROOT / "docs" / "data" / "adapt.jsonl"), page("adapt")
+    library = [line for line in lines if line["contender"] == "ours" and line["shared_law"]]
+    named = [sorted(one["name"] for one in line["found"]) == sorted(one["name"] for one in line["effects"]) for line in library]
+    assert f"In {sum(named)} of {len(named)} cases from the library all effects were named" in text
+    assert sum(len(line["effects"]) == 2 for line in library) == 4
+    loose = sum(line["commit"].endswith("-dirty") for line in lines)
+    assert f"{loose} of the {len(lines)} results come from uncommitted code" in text
+    assert f"{loose} of {len(lines)} results of adaptation" in page("versions")
 
 
 def test_the_pages_have_the_numbers_of_the_blind_test():
@@ -126,6 +159,41 @@ def test_the_policies_page_has_the_numbers_of_velocity():
     assert f"its error is {min(errors):.0f} to {max(errors):.0f} % smaller" in text
 
 
+def test_the_policies_page_has_the_numbers_of_slope():
+    (row,) = [row for row in data("learning")["slope"]["rows"] if row["sensors"] == "none"]
+    better, less = ({name: f"{one[key][0]:.0f} %" for name, one in row["others"].items()} for key in ("better", "slips_less"))
+    said = f"error is {better['blind']} smaller than that of `blind`, {better['slip_compensating']} than `slip_compensating`, "
+    said += f"{better['pid']} than `pid`. It slips {less['blind']} less than `blind`"
+    assert f"{said} and {less['pid']} less than `pid`" in page("policies")
+
+
+def card_numbers(task: str, metric: str) -> dict[str, list[float]]:
+    """A row of a score card's tables, by policy; a row that both tables have is that of the comparison."""
+    text = (ROOT / "docs" / "cards" / task / "card.md").read_text(encoding="utf-8")
+    header: list[str] = []
+    found: dict[str, list[float]] = {}
+    for cells in ([cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")):
+        if cells[0] in ("metric", "better in"):
+            header = cells
+        elif cells[0] == metric:
+            numbers = [[float(number) for number in re.findall(r"-?[\d.]+", cell)] for cell in cells[2:]]
+            found = dict(zip(header[2:], numbers, strict=True))
+    return found
+
+
+def test_the_policies_page_has_the_numbers_of_the_cards():
+    text = page("policies")
+    mean, median = (card_numbers("velocity", name)["slip_compensating"] for name in ("tracking_error", "tracking_error_median"))
+    assert (
+        f"mean error is {mean[0]:.1f} % smaller, the median only {median[0]:.1f} % [{median[1]:.1f}, {median[2]:.1f}]" in text
+    )
+    path, slope = (card_numbers(task, "action_jitter") for task in ("path", "slope"))
+    times, more = 1 - path["pid"][0] / 100, -path["slip_compensating"][0]
+    assert f"its jitter is {times:.1f} times that of `pid` and {more:.0f} % above `slip_compensating`" in text
+    times, more = 1 - slope["pid"][0] / 100, -slope["slip_compensating"][0]
+    assert f"Jitter is {times:.1f} times that of `pid`, {more:.0f} % above `slip_compensating`" in text
+
+
 def test_the_policies_page_has_the_numbers_of_the_ablations():
     settings, text = data("ablations")["settings"], page("policies")
     for name, said in (
@@ -146,6 +214,13 @@ def test_filmed_drives_have_the_numbers():
     )
     assert f"at most {along:.2f} mm longitudinally and {across:.2f} mm laterally, the clock offset by {clock:.1f} ms" in text
     assert all(row["met"] is not False for row in rows)
+
+
+def test_the_frames_of_learning_have_the_numbers():
+    frames = {row["what"]: row["ours"]["median"] for row in data("bench")["rows"] if row["what"].startswith("frames, ")}
+    ours, peers = frames.pop("frames, ours"), sorted(frames.values())
+    said = f"Ours needed {ours:,.0f} frames; the peers were stopped by the clock after {peers[0]:,.0f} and {peers[1]:,.0f}"
+    assert said in page("performance")
 
 
 def test_the_classifier_has_the_numbers():

@@ -43,7 +43,7 @@ def test_the_site_has_whole_rows(name):
     for block in "\n".join(tables.TABLES[name]()).split("\n\n"):
         inner = [len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines() if line.startswith("|")]
         assert len(set(inner)) <= 1
-    assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->\n[Table](tables/{name}.md)")
+    assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->\n[Its name](tables/{name}.md)")
 
 
 def test_the_page_names_what_the_acceptance_test_refuses():
