@@ -1,6 +1,6 @@
 """Optuna in 15 lines beside the imports: a study whose trials stop early where their held-out scores fall behind.
 
-Needs ``pip install 'wlr-gym[sweep]'``. Minutes (``--quick``: one).
+Needs ``pip install -e '.[sweep]'`` in the clone. Minutes (``--quick``: one).
 
     python examples/optuna_search.py [--quick]
 """
