@@ -237,8 +237,31 @@ def test_what_chosen_runs_decide_is_as_the_page_says():
     for contender in ("chosen", "random", "eight"):
         own = [line for line in hiding if line["contender"] == contender]
         took[contender] = sum(line["seconds"] for line in own) / sum(line["right"] for line in own)
-    chosen = [line["right"] for line in hiding if line["contender"] == "chosen"]
+    right = {name: [line["right"] for line in hiding if line["contender"] == name] for name in took}
+    chosen = right["chosen"]
     text = page("gap")
     assert f"decide {sum(chosen)} of {len(chosen)} rightly ({100 * sum(chosen) / len(chosen):.0f} %; target 95 %" in text
     assert f"with {took['chosen']:.0f} s of driving per right decision" in text
-    assert f"random ones take {took['random']:.0f} s, eight fixed ones {took['eight']:.0f} s" in text
+    random, eight = (f"{took[name]:.0f} s ({sum(right[name])} right)" for name in ("random", "eight"))
+    assert f"random ones take {random}, eight fixed ones {eight}" in text
+
+
+def test_the_large_robot_has_the_numbers():
+    found, text = data("own_robot"), page("own_robot").replace("\N{MINUS SIGN}", "-")
+    for name, said in (("three", "have a tracking error of"), ("tuned_pid", "tuned `pid`")):
+        mean, low, high = found["policies"][name]["tracking_error"]
+        assert f"{said} {mean:.3f} [{low:.3f}, {high:.3f}]" in text
+    better = found["better_than_tuned_pid_percent"]
+    assert "{:.0f} % [{:.0f}, {:.0f}] less on the same episodes".format(*better["tracking_error"]) in text
+    for key, said in (
+        ("excess_slip", "slip **{:.0f} % more** [{:.0f}, {:.0f}]"),
+        ("yaw_rate_error", "({:.0f} % worse [{:.0f}, {:.0f}])"),
+    ):
+        mean, low, high = better[key]
+        assert said.format(-mean, -high, -low) in text
+    gap = found["gap"]
+    (number,) = gap["parameters"].values()
+    low, high = number["ci95"]
+    assert gap["effect"] == "rolling_resistance"
+    assert f"found {number['value']:.4f} ({low:.4f} to {high:.4f})" in text
+    assert f"removed {100 * gap['reduction']:.0f} % of the avoidable error" in text
