@@ -26,7 +26,8 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{option} {path}: cannot be a folder: {error.strerror}") from None
+        why = "it is a file" if path.is_file() else error.strerror
+        raise InputError(f"{option} {path}: cannot be a folder: {why}") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{option} {path}: cannot be written to")
 
