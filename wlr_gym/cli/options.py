@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError
 
 if TYPE_CHECKING:
     from wlr_gym.physics.effects import Patch
@@ -67,12 +67,11 @@ class SensorsOption:
 
 def require_simulator(backend: str, robot: str) -> None:
     """Raise :class:`InputError` where ``--backend`` is no simulator; ``robot`` says what a real robot is for."""
-    from wlr_gym.physics.plants import REAL, SIMULATORS
+    from wlr_gym.physics.plants import REAL, check_simulator
 
     if backend in REAL:
         raise InputError(f"--backend {backend}: {robot}")
-    if backend not in SIMULATORS:
-        raise unknown_name("backend", backend, SIMULATORS, "--backend")
+    check_simulator(backend, "--backend")
 
 
 def require_threads(threads: int | None) -> None:

@@ -11,6 +11,7 @@ from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
+from wlr_gym.physics.plants import check_simulator
 from wlr_gym.policy.agents import (
     Training,
     TrainingProgress,
@@ -185,6 +186,8 @@ def check_environment_settings(settings: Mapping[str, Any]) -> None:
     for name in environment if isinstance(environment, Mapping) else ():
         if name not in valid:
             raise InputError(f"unknown setting 'environment.{name}'{nearest(name, valid)}; valid: {', '.join(valid)}")
+    if isinstance(environment, Mapping) and isinstance(backend := environment.get("backend"), str):
+        check_simulator(backend)
 
 
 def unused(folder: Path) -> Path:

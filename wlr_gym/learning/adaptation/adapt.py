@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from wlr_gym.base.errors import InputError, require_package, unknown_name
+from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import alone_in
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.settings import parse_config, parse_options, read_yaml
@@ -24,7 +24,7 @@ from wlr_gym.learning.adaptation.robots import AdaptedRobot, EmulatedRobot, Real
 from wlr_gym.learning.adaptation.uncertainty import Uncertainty
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 from wlr_gym.physics.effects import Source, load_patch, save_patch
-from wlr_gym.physics.plants import SIMULATORS
+from wlr_gym.physics.plants import check_simulator
 from wlr_gym.policy import agent_names, make_policy, policy_environment, trained_environment
 from wlr_gym.robot import Robot, RobotSource, load_robot
 
@@ -96,8 +96,7 @@ def adapt(
     chosen = environment or trained_environment(policy) or "WLR-Velocity-v0"
     own = load_robot(robot if robot is not None else policy_environment(policy).get("robot") or "nominal")
     patch = load_patch(effects)
-    if backend not in SIMULATORS:
-        raise unknown_name("backend", backend, SIMULATORS, "--backend")
+    check_simulator(backend, "--backend")
     if robot_runs is not None and patch:
         raise InputError("--effects: measured runs have what their robot has; they are for --emulated")
     if driven is None and robot_runs is None:
