@@ -64,7 +64,7 @@ def run(options: PaperOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import output_folder, refuse_existing
+    from wlr_gym.base.files import output_folder
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.hardware.loop import StoppedError
@@ -76,7 +76,7 @@ def run(options: PaperOptions) -> int:
 
     _check(options)
     robot = load_robot(options.robot or "nominal")
-    refuse_existing(options.out / "report.md", options.force)
+    options.refuse_results(options.out, "report.md")
     console, records = Console(), {}
     with output_folder(options.out), progress(console, shown=options.progress) as tell:
         try:

@@ -89,7 +89,7 @@ def run(options: ReplayOptions) -> int:
         check_video(options.video)
     runs = read_runs(options.runs)
     patch = options.patch()
-    refuse_existing(options.out / ERRORS_FILE, options.force)
+    options.refuse_results(options.out, ERRORS_FILE)
     for film in _films(options, [one.name for one in runs]):
         refuse_existing(film, options.force, "--video")
     for measured in runs:  # a refusal leaves no folder behind
