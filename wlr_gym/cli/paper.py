@@ -118,8 +118,8 @@ def _check(options: PaperOptions) -> None:
             raise unknown_name("model", model, MODELS)
     if set(REAL) & set(options.plant):
         options.load_hardware()
-    elif options.emulated or options.port:
-        raise InputError("--emulated and --port are about the robot: add dynamixel to --plant")
+    else:
+        options.refuse_robot_options("add dynamixel to --plant")
     for name, low, high in (("draws", 0, 10_000), ("levels", 1, 3), ("threads", 1, 256)):
         value = getattr(options, name)
         if not low <= value <= high:
