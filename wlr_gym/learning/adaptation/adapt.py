@@ -15,7 +15,7 @@ from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import same_profile
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.gap.decision import Decided
-from wlr_gym.learning.adaptation.driving import drive_after, drive_before, record_runs
+from wlr_gym.learning.adaptation.driving import check_runs, drive_after, drive_before, record_runs
 from wlr_gym.learning.adaptation.identification import find_gap, state_uncertainty
 from wlr_gym.learning.adaptation.page import write_page
 from wlr_gym.learning.adaptation.plan import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder
@@ -125,8 +125,10 @@ def adapt(
         "seed": seed,
     }
     asked = parse_options(Asked, given)
-    if robot_runs is not None and not Path(robot_runs).is_dir():
-        raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
+    if robot_runs is not None:
+        if not Path(robot_runs).is_dir():
+            raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
+        check_runs(Path(robot_runs), own)  # before anything is written
     progress = open_folder(Path(out), asked, tell, threads)
     with alone_in(progress.out):
         if not progress.steps:
