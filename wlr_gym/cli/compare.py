@@ -84,6 +84,8 @@ def run(options: CompareOptions) -> int:
 
     require_threads(options.threads)
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
+    if first == second:
+        raise InputError(f"--plants {' '.join(options.plants)}: the same plant twice; expected two that differ")
     if not options.threshold > 0.0:
         raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")
     motions, robot = _motions(options)
