@@ -80,9 +80,9 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
     _check_faults(options)
     require_output_place(options.out)
     if options.mcap is not None:
+        if options.mcap.exists():
+            raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
         require_ending(options.mcap, (".mcap",), "--mcap")
-    if options.mcap is not None and options.mcap.exists():
-        raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
     return _command(options)
 
 
