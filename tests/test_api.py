@@ -54,7 +54,7 @@ def test_names_of_the_hardware_load(name: str) -> None:
 
 def test_a_training_does_not_write_into_a_used_folder(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(InputError, match="not empty"):
+    with pytest.raises(InputError, match=r"not empty; give another folder$"):
         wlr_gym.train("WLR-Velocity-v0", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(InputError, match=r"did you mean 'WLR-Velocity-v0'"):

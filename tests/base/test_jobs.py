@@ -1,4 +1,4 @@
-"""Jobs: processes that end in good order, whatever ends who waits for them."""
+"""Jobs: processes that end in good order, whatever ends who waits for them. Locks; threads that are interrupted."""
 
 import os
 import signal
@@ -13,6 +13,7 @@ from waiting import wait_until
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
 from wlr_gym.base.jobs import Job, follow, spread
+from wlr_gym.base.threads import in_threads
 
 #: Says what it sees, and leaves a file when it is ended in good order.
 MODULE = """
@@ -88,6 +89,15 @@ def test_jobs_end_in_good_order_when_who_waits_is_killed(job, tmp_path):
     waiting.send_signal(signal.SIGKILL)
     waiting.wait()
     wait_until((tmp_path / "ended").exists)
+
+
+def test_threads_that_end_their_work_first_say_so(capsys):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_threads(2, interrupted, [1, 2])
+    assert capsys.readouterr().err == "interrupting ...\n"
 
 
 def test_a_lock_is_held_among_processes_and_freed_by_death(tmp_path):

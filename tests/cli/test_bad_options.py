@@ -46,7 +46,8 @@ def test_a_seed_out_of_range(capsys, command, seed):
     ("arguments", "words"),
     [
         (["train", "--backend", "mujoco"], "precision 'float32': the MuJoCo plant has float64 only"),
-        (["train", "--backend", "mujco"], "did you mean 'mujoco'"),
+        (["train", "--backend", "dynamixel"], "wlr: unknown backend 'dynamixel'; valid: gibbs_appell, mujoco\n"),
+        (["train", "--backend", "mujco"], "did you mean 'mujoco'?); valid: gibbs_appell, mujoco\n"),
         (["evaluate", "do_nothing", "--backend", "mujco"], "did you mean 'mujoco'"),
     ],
 )

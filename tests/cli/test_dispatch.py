@@ -1,8 +1,11 @@
 """The ``wlr`` command: exit codes and messages."""
 
+import importlib
 import os
+import signal
 import subprocess
 import sys
+import time
 import types
 from dataclasses import dataclass
 
@@ -22,13 +25,13 @@ class NoOptions:
 
 @pytest.fixture
 def command(monkeypatch):
-    """Return a function that makes ``wlr probe`` raise what it is given."""
+    """Return a function that makes ``wlr probe`` raise, return or call what it is given."""
 
     def make(outcome):
         def run(options):
             if isinstance(outcome, BaseException):
                 raise outcome
-            return outcome
+            return outcome() if callable(outcome) else outcome
 
         module = types.ModuleType("wlr_gym.cli.probe")
         module.__dict__.update(ProbeOptions=NoOptions, run=run)
@@ -68,6 +71,29 @@ def test_unknown_command_names_the_nearest(capsys):
 def test_exit_codes(command, outcome, code):
     command(outcome)
     assert cli.main(["probe"]) == code
+
+
+LOSES_IT = {
+    "package": "try:\n    signal.raise_signal(signal.SIGINT)\nexcept BaseException:\n    pass\n",
+    "callback": "class Lost:\n    def __del__(self):\n        signal.raise_signal(signal.SIGINT)\n",
+}
+
+
+@pytest.mark.parametrize("how", LOSES_IT)
+def test_an_interruption_that_a_package_or_a_callback_loses_comes_again(how, command, tmp_path, monkeypatch, capsys):
+    (tmp_path / f"loses_it_{how}.py").write_text(f"import signal\n{LOSES_IT[how]}")
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def work():
+        module = importlib.import_module(f"loses_it_{how}")
+        getattr(module, "Lost", object)()
+        for _ in range(500):
+            time.sleep(0.01)
+
+    command(work)
+    assert cli.main(["probe"]) == cli.INTERRUPTED
+    assert capsys.readouterr().err == "wlr: interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_input_error_is_one_line_without_traceback(command, capsys):

@@ -31,8 +31,12 @@ def test_effects_are_explained(capsys):
 def test_formulas_are_explained(capsys):
     assert main(["effects", "unknown_effect"]) == 0
     text = capsys.readouterr().out
+    assert main(["effects", "unknown_effect", "supply_sag", "--json"]) == 0
+    formulas, sag = json.loads(as_json := capsys.readouterr().out)
+    assert (formulas["name"], sag["name"]) == ("unknown_effect", "supply_sag")
     for word in ("body_torque_yaw", "floor_force_x", "leg_angle", "slip_speed", "m/s"):
         assert word in text
+        assert word in as_json
 
 
 def test_check_prints_what_changes(tmp_path, capsys, monkeypatch):

@@ -1,6 +1,7 @@
 """``wlr emulate``: what it prints, takes and refuses."""
 
 import os
+import socket
 import subprocess
 import sys
 
@@ -33,7 +34,7 @@ def test_prints_ports_and_ends(tmp_path, capsys):
     ("changes", "words"),
     [
         ({"fault": ("dorp legs",)}, "did you mean 'drop'"),
-        ({"backend": "mujocoo"}, "backend"),
+        ({"backend": "dynamixel"}, "--backend: unknown backend 'dynamixel'; valid: gibbs_appell, mujoco$"),
         ({"robot": "nominl"}, "did you mean 'nominal'"),
         ({"hardware": "nominl"}, "did you mean 'nominal'"),
         ({"tick": 0.0}, "--tick 0: expected more than 0"),
@@ -44,6 +45,44 @@ def test_prints_ports_and_ends(tmp_path, capsys):
 def test_refusals(changes, words):
     with pytest.raises(InputError, match=words):
         emulate.run(options(**changes))
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"control": "mine"}, "--control .*mine: is there and no socket"),
+        ({"links": "links"}, "--links .*links: 'legs' in it is no link"),
+        ({"links": "mine"}, "--links .*mine: cannot be a folder: it is a file"),
+        ({"poses": "mine"}, "--poses .*mine: is there and no file of poses"),
+    ],
+)
+def test_what_is_there_is_left_alone(tmp_path, option, words):
+    (tmp_path / "links").mkdir()
+    mine = [tmp_path / "mine", tmp_path / "links" / "legs"]
+    for path in mine:
+        path.write_text("precious")
+    with pytest.raises(InputError, match=words):
+        emulate.run(options(stepped=True, **{name: tmp_path / value for name, value in option.items()}))
+    assert [path.read_text() for path in mine] == ["precious"] * 2
+    assert not any(path.is_symlink() for path in (tmp_path / "links").iterdir())
+
+
+def test_what_an_emulator_left_is_replaced(tmp_path):
+    places = {name: tmp_path / name for name in ("control", "links", "poses")}
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "legs").symlink_to("/dev/pts/gone")
+    with socket.socket(socket.AF_UNIX) as stale:
+        stale.bind(str(tmp_path / "control"))
+    for _ in range(2):
+        assert emulate.run(options(stepped=True, **places)) == 0
+
+
+def test_the_control_socket_of_another_emulator_is_left_alone(tmp_path):
+    with socket.socket(socket.AF_UNIX) as other:
+        other.bind(str(tmp_path / "control"))
+        other.listen()
+        with pytest.raises(InputError, match="another emulator listens there"):
+            emulate.run(options(stepped=True, control=tmp_path / "control"))
 
 
 @pytest.mark.parametrize(

@@ -125,6 +125,23 @@ def test_a_comparison_is_not_replaced(tmp_path, capsys):
     refused([*words, "--plants", "gibbs_appell", "gibbs_appell:physics_step=0.0005", "--out", str(tmp_path / "c")], capsys)
 
 
+@pytest.mark.parametrize(
+    ("command", "there"),
+    [
+        ("evaluate pid --no-progress", "config.yaml"),
+        ("replay RUNS --no-plots", "provenance.yaml"),
+        ("compare --excitation straight --seconds 0.2", "meta.yaml"),
+        ("commission --emulated", "meta.yaml"),
+        ("paper", "config.yaml"),
+    ],
+)
+def test_nothing_is_written_among_results_of_another_command(tmp_path, runs, capsys, command, there):
+    (tmp_path / there).write_text("of another")
+    assert main([*command.replace("RUNS", str(runs)).split(), "--out", str(tmp_path)]) == 2
+    assert f"--out {tmp_path}: '{there}' of another command is in it; choose another folder" in capsys.readouterr().err
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(there, "of another")]
+
+
 def test_setpoints_are_not_replaced(tmp_path, capsys):
     refused(["record", "--excitation", "straight", "--commands-only", "--out", str(tmp_path / "motions")], capsys)
 

@@ -68,7 +68,28 @@ COMMANDS = {
     "a motion": (["record", "--excitation", "strait", "--out", "x"], "did you mean 'straight'?"),
     "a policy file's name": (
         ["export", "velocity_blind", "--out", "z.txt"],
-        "--out z.txt: expected a file name that ends in .onnx",
+        "--out z.txt: expected a file that ends in .onnx",
+    ),
+    "a policy file to export": (
+        ["export", "velocity_blind", "--out", "z.onnx"],
+        "velocity_blind.onnx: is a policy file already: copy it",
+    ),
+    "a folder without runs": (["export", ".", "--to", "mcap"], ".: no run_*.csv or run_*.parquet"),
+    "a folder without a card": (
+        ["export", "velocity_blind", "--card", "."],
+        "--card .: no card.json; expected a folder that wlr evaluate --out wrote",
+    ),
+    "two formats": (["robot", "export", "nominal", "--out", "r.urdf", "--format", "mjcf"], "a name of urdf, and --format mjcf"),
+    "a robot file's name": (
+        ["robot", "new", "--out", "r.txt", "--yes"],
+        "--out r.txt: expected a file that ends in .yaml, .yml",
+    ),
+    "a stream's name": (["deploy", "pid", "--emulated", "--mcap", "x.txt"], "--mcap x.txt: expected a file that ends in .mcap"),
+    "a report's name": (["bench", "import", "--save", "y.txt"], "--save y.txt: expected a file that ends in .json"),
+    "another measurement's option": (["bench", "import", "--sets", "4"], "--sets: for gap or vision with --out; got import"),
+    "one plant twice": (
+        ["compare", "--plants", "mujoco", "mujoco", "--out", "c"],
+        "--plants mujoco mujoco: the same plant twice",
     ),
     "a shell": (["--completion", "bsh"], "expected one of bash, zsh, fish"),
 }

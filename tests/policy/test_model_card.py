@@ -124,11 +124,16 @@ def test_scores_of_other_policies_are_refused(policy):
 def test_command_line(policy, tmp_path, capsys):
     (tmp_path / "scores").mkdir()
     assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 2
-    assert "no card.md of wlr evaluate there" in capsys.readouterr().err
+    assert "scores: no card.json; expected a folder that wlr evaluate --out wrote" in capsys.readouterr().err
+    (tmp_path / "scores" / "card.json").touch()
     (tmp_path / "scores" / "card.md").write_text(scores(policy))
     assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 0
     card_of(policy)
     assert main(["export", str(policy), "--card", str(tmp_path / "scores"), "--out", "x.onnx"]) == 2
+    capsys.readouterr()
+    assert main(["export", "velocity_blind", "--card", str(tmp_path / "scores")]) == 2
+    assert "the shipped policy 'velocity_blind' has its model card" in (said := capsys.readouterr().err)
+    assert "--force" not in said
 
 
 @pytest.mark.parametrize("name", shipped_names())

@@ -231,7 +231,7 @@ def test_what_cannot_be_exported(trained, exported, environment, tmp_path):
     seen, out = rows(environment, 1), tmp_path / "p.onnx"
     with pytest.raises(InputError, match=r"policy\.onnx: is a policy file already"):
         export_policy(exported, out, seen)
-    with pytest.raises(InputError, match=r"expected a file name that ends in \.onnx"):
+    with pytest.raises(InputError, match=r"expected a file that ends in \.onnx"):
         export_policy(trained, tmp_path / "p.pt", seen)
     with pytest.raises(InputError, match=r"p\.onnx: cannot be written"):
         export_policy(trained, tmp_path / "nowhere" / "p.onnx", seen)

@@ -6,7 +6,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{option} {path}: cannot be a folder: {error.strerror}") from None
+        why = "it is a file" if path.is_file() else error.strerror
+        raise InputError(f"{option} {path}: cannot be a folder: {why}") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(f"{option} {path}: cannot be written to")
 
@@ -76,6 +77,29 @@ def refuse_existing(path: Path, force: bool, option: str = "--out") -> None:
     """
     if path.exists() and not force:
         raise InputError(f"{option} {path}: exists; choose another name, or replace it with --force")
+
+
+def require_empty(folder: Path, resume: str) -> None:
+    """Refuse a folder that something is in; ``resume`` is the command that goes on with it, empty = none does.
+
+    Raises:
+        InputError: something is in it, or it is a file.
+    """
+    if folder.is_file():
+        raise InputError(f"{folder}: cannot be a folder: it is a file")
+    if folder.is_dir() and any(folder.iterdir()):
+        hint = f", or resume what is there: {resume} --resume {folder}" if resume else ""
+        raise InputError(f"{folder}: not empty; give another folder{hint}")
+
+
+def require_ending(path: Path, endings: Iterable[str], option: str = "--out") -> None:
+    """Refuse a file of another kind.
+
+    Raises:
+        InputError: its name ends in none of the ``endings``.
+    """
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{option} {path}: expected a file that ends in {', '.join(endings)}")
 
 
 def resumes(folder: Path, file: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -15,4 +16,8 @@ def in_threads(threads: int, work: Callable[[_Item], _Result], items: Iterable[_
     if threads == 1:
         return [work(item) for item in items]
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, items))
+        try:
+            return list(pool.map(work, items))
+        except KeyboardInterrupt:
+            print("interrupting ...", file=sys.stderr, flush=True)  # what has begun ends first
+            raise

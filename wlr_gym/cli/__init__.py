@@ -16,6 +16,7 @@ from typing import Any
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError, MissingPackageError, nearest, unknown_name
+from wlr_gym.cli.interruption import interruptible
 
 #: Exit codes; an interrupted command ends as a shell reports SIGINT (128 + 2).
 OK = 0
@@ -78,7 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _answered(words: list[str]) -> int:
     """Do what the words say, and tell mistakes and interruption in one line."""
     try:
-        return _dispatch(words)
+        with interruptible():
+            return _dispatch(words)
     except (InputError, MissingPackageError) as error:
         _say(str(error), "red")
         return BAD_INPUT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import refuse_existing, write_json
+from wlr_gym.base.files import refuse_existing, require_ending, write_json
 from wlr_gym.base.progress import progress
 from wlr_gym.base.text import tally
 from wlr_gym.cli import OK
@@ -52,6 +52,16 @@ ADAPT_STUDY = "adapt"
 #: Another: how soon, and how rightly, the gap workflow decides when it chooses the runs. See docs/gap.md.
 DECIDE_STUDY = "decide"
 _ALONE = (ADAPT_STUDY, BLIND_TEST, DECIDE_STUDY)
+#: Another: films of a lab, as ``vision`` has them with ``--out``.
+LAB_FILMS = "vision with --out"
+#: Option -> those of the above that take it.
+_TAKEN_BY = {
+    **dict.fromkeys(("cases", "contenders"), (ADAPT_STUDY, DECIDE_STUDY)),
+    **dict.fromkeys(("ray", "answers", "classifier", "speed", "threads"), (BLIND_TEST,)),
+    "sets": (BLIND_TEST, LAB_FILMS),
+    "seed": (LAB_FILMS,),
+    "processes": (BLIND_TEST, DECIDE_STUDY),
+}
 SCHEMA = 1
 
 
@@ -106,10 +116,15 @@ def run(options: BenchOptions) -> int:
     if options.save is not None:
         if not options.save.parent.is_dir():
             raise InputError(f"--save {options.save}: folder {options.save.parent} does not exist")
+        require_ending(options.save, (".json",), "--save")
         refuse_existing(options.save, options.force, "--save")
     for name in _ALONE:
         if name in asked and len(asked) > 1:
             raise InputError(f"{name} takes hours and is run alone, not with {', '.join(set(asked) - {name})}")
+    study = next((name for name in asked if name in _ALONE), "" if options.out is None else LAB_FILMS)
+    for one in fields(options):
+        if study not in _TAKEN_BY.get(one.name, (study,)) and getattr(options, one.name) != one.default:
+            raise InputError(f"--{one.name}: for {' or '.join(_TAKEN_BY[one.name])}; got {', '.join(asked) or 'nothing'}")
     if ADAPT_STUDY in asked:
         return _adapt_study(options)
     if DECIDE_STUDY in asked:

@@ -82,7 +82,7 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
         raise InputError("--out: expected a folder for runs and results")
     if options.fault and not options.emulated:
         raise InputError("--fault is for the emulated robot: add --emulated")
-    refuse_existing(options.out / REPORT, options.force)
+    options.refuse_results(options.out, REPORT)
     if not (options.out / REPORT).is_file():  # a hardware file that no session wrote
         refuse_existing(options.out / COPY, options.force)
     make_output_folder(options.out)

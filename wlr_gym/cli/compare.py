@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import output_folder, refuse_existing, write_json, write_text
+from wlr_gym.base.files import output_folder, write_json, write_text
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
@@ -84,11 +84,13 @@ def run(options: CompareOptions) -> int:
 
     require_threads(options.threads)
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
+    if first == second:
+        raise InputError(f"--plants {' '.join(options.plants)}: the same plant twice; expected two that differ")
     if not options.threshold > 0.0:
         raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")
     motions, robot = _motions(options)
     patches = _patches(options, motions, robot)
-    refuse_existing(options.out / "compare.json", options.force)
+    options.refuse_results(options.out, "compare.json")
     console, comparisons = Console(), []
     with output_folder(options.out):
         for comparison in _compare_all(options, motions, (first, second), robot, patches, console):

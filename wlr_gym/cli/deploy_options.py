@@ -9,7 +9,7 @@ from pathlib import Path
 import tyro
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import require_output_place
+from wlr_gym.base.files import require_ending, require_output_place
 from wlr_gym.base.text import pairs
 from wlr_gym.cli.options import JsonOption, PatchOption
 from wlr_gym.cli.robot_options import read_camera
@@ -79,8 +79,10 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
     options.patch()  # a bad one is refused before a robot is started for it
     _check_faults(options)
     require_output_place(options.out)
-    if options.mcap is not None and options.mcap.exists():
-        raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
+    if options.mcap is not None:
+        if options.mcap.exists():
+            raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
+        require_ending(options.mcap, (".mcap",), "--mcap")
     return _command(options)
 
 

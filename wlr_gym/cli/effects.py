@@ -51,7 +51,7 @@ def run(options: EffectsOptions) -> int:
         case (word, *_) if word not in EFFECTS and (hint := nearest(word, ["check"])):
             raise InputError(f"unknown word '{word}'{hint}; see: wlr effects --help")
         case names if options.json:
-            print_json([_content(_effect(name)) for name in names])
+            print_json([_formulas() if name == UNKNOWN_EFFECT else _content(_effect(name)) for name in names])
         case names:
             for name in names:
                 if name == UNKNOWN_EFFECT:
@@ -109,6 +109,13 @@ def _explain_formulas() -> None:
     )
     features = [(name, one.unit, one.doc, one.scope) for name, one in FEATURES.items()]
     _show(("name", "unit", "meaning", "of the"), features, "what it may depend on")
+
+
+def _formulas() -> dict[str, Any]:
+    """Return what :func:`_explain_formulas` prints, as JSON has it."""
+    acts = [{"names": names, "unit": unit, "what": text} for names, unit, text in coordinates()]
+    features = [{"name": name, "unit": one.unit, "what": one.doc, "of": one.scope} for name, one in FEATURES.items()]
+    return {"name": UNKNOWN_EFFECT, "may_act": acts, "may_depend_on": features}
 
 
 def _check(patches: Sequence[Patch], together: Patch, options: EffectsOptions) -> None:

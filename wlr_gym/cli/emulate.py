@@ -98,9 +98,11 @@ def machine_of(options: EmulateOptions) -> Machine:
     from wlr_gym.hardware.emulator.link import with_flow_port
     from wlr_gym.hardware.emulator.stand import EmulatedStand
     from wlr_gym.physics.effects import apply_patch
+    from wlr_gym.physics.plants import check_simulator
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters
 
+    check_simulator(options.backend, "--backend")
     if not options.tick > 0:
         raise InputError(f"--tick {options.tick:g}: expected more than 0")
     for name in ("usb_latency", "seconds"):

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.text import Text
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.files import make_output_folder, refuse_existing, require_ending
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
@@ -108,8 +108,7 @@ def _content(env_id: str, task: Task, randomization: Randomization) -> dict[str,
 def _draw(path: Path, randomization: Randomization, force: bool) -> None:
     from wlr_gym.learning.evaluation.floor_plots import draw_floors
 
-    if path.suffix not in PICTURES:
-        raise InputError(f"--picture {path}: expected a file that ends in {', '.join(PICTURES)}")
+    require_ending(path, PICTURES, "--picture")
     refuse_existing(path, force, "--picture")
     make_output_folder(path.parent, "--picture")
     draw_floors(path, [randomization])

@@ -128,7 +128,7 @@ def run(options: EvaluateOptions) -> int:
     _check(options)
     patch = options.patch()
     if options.out is not None:
-        refuse_existing(options.out / "card.json", options.force)
+        options.refuse_results(options.out, "card.json")
     with output_folder(options.out):
         card, samples = _play(options, patch)
     if options.json:

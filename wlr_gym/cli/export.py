@@ -19,7 +19,7 @@ import tyro
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.files import make_output_folder, refuse_existing, require_ending
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, environment_of
 from wlr_gym.cli.results import print_json
@@ -81,30 +81,28 @@ def _do(options: ExportOptions) -> Any:
     if options.env or options.config or options.normalizer:
         raise InputError("--env, --config and --normalizer: of archives (.zip) only; other policies say themselves")
     if options.card is None:
-        return _export(options.policy[0], _target(options))
+        return _export(options)
     if options.out is None:
         return _write_card(options.policy[0], options.card, options.force)
     raise InputError("--card and --out: one or the other; a card is written beside its policy file")
 
 
 def _target(options: ExportOptions) -> Path:
-    """Return the file to write, whose folder is made."""
+    """Return the file to write."""
     out = options.out or Path("policy.onnx")
-    if out.suffix != ".onnx":
-        raise InputError(f"--out {out}: expected a file name that ends in .onnx")
+    require_ending(out, (".onnx",))
     refuse_existing(out, options.force)
-    make_output_folder(out.parent)
     return out
 
 
 def _export_runs(options: ExportOptions, form: str) -> list[Path]:
     from wlr_gym.data.logs import export_run
     from wlr_gym.data.logs.write import FORMATS
-    from wlr_gym.data.read import read_run, run_files
+    from wlr_gym.data.read import read_run, some_runs
 
     if any((options.card, options.env, options.config, options.normalizer, options.reseal, options.robot)):
         raise InputError(f"--to {form} writes runs: the options of policies do not go with it")
-    paths = [run for name in map(Path, options.policy) for run in (run_files(name) if name.is_dir() else [name])]
+    paths = [run for name in map(Path, options.policy) for run in (some_runs(name) if name.is_dir() else [name])]
     if not paths:
         raise InputError("--to: expected runs, or folders of runs")
     targets = [(options.out or path.parent) / f"{path.stem}{FORMATS[form]}" for path in paths]
@@ -144,11 +142,12 @@ def _reseal(options: ExportOptions) -> dict[str, list[str]]:
     return changes
 
 
-def _export(source: str, out: Path) -> dict[str, Any]:
-    from wlr_gym.policy import export_policy, find_policy
+def _export(options: ExportOptions) -> dict[str, Any]:
+    from wlr_gym.policy import export_policy, exportable
 
-    folder = find_policy(source)
-    print(f"exporting {source}, then comparing: some seconds", flush=True)
+    out, folder = _target(options), exportable(options.policy[0])
+    make_output_folder(out.parent)
+    print(f"exporting {options.policy[0]}, then comparing: some seconds", flush=True)
     parity = export_policy(folder, out, real_observations(folder), training_facts(folder))
     return _written(out, parity, "policy", f"{ROBOTS} episodes")
 
@@ -174,20 +173,23 @@ def _import(options: ExportOptions) -> dict[str, Any]:
         raise InputError(f"{options.policy[0]}: an archive does not say what it was trained in: give --env ID")
     settings = load_agent_config(options.config, (), task_name_of(options.env)) if options.config else {}
     out = _target(options)
+    make_output_folder(out.parent)
     env = gymnasium.make(options.env, robot=options.robot, **fed_environment(settings.get("environment") or {}))
     parity = import_policy(options.policy[0], env, out, normalizer=options.normalizer)
     return _written(out, parity, "archive", "robots that it drives")
 
 
 def _write_card(source: str, evaluation: Path, force: bool) -> dict[str, Any]:
-    from wlr_gym.policy import find_policy, write_model_card
+    from wlr_gym.policy import find_policy, shipped_names, write_model_card
 
     policy = find_policy(source)
+    for name in ("card.json", "card.md"):
+        if not (evaluation / name).is_file():
+            raise InputError(f"--card {evaluation}: no {name}; expected a folder that wlr evaluate --out wrote")
+    if source in shipped_names() and not force:
+        raise InputError(f"--card: the shipped policy '{source}' has its model card: {policy.with_suffix('.md')}")
     refuse_existing(policy.with_suffix(".md"), force, "--card")
-    try:
-        text = (evaluation / "card.md").read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--card {evaluation}: no card.md of wlr evaluate there: {error.strerror}") from None
+    text = (evaluation / "card.md").read_text(encoding="utf-8")
     card = write_model_card(policy, text)
     print(f"written: {card}")
     return {"card": card}

@@ -130,14 +130,13 @@ def _check(options: GapOptions) -> None:
     from wlr_gym.data.read import run_files
     from wlr_gym.gap.opened import OWN_RIG, RIGS
     from wlr_gym.gap.rig.own import load_rig
-    from wlr_gym.physics.plants import SIMULATORS
+    from wlr_gym.physics.plants import check_simulator
     from wlr_gym.robot import load_robot
 
     if not options.data.is_dir():
         what = "is a file" if options.data.exists() else "no such folder"
         raise InputError(f"{options.data}: {what}; expected a folder of runs")
-    if options.backend not in SIMULATORS:
-        raise unknown_name("backend", options.backend, SIMULATORS, "--backend")
+    check_simulator(options.backend, "--backend")
     if options.rig is not None and options.rig not in RIGS and not options.rig.endswith(OWN_RIG):
         raise unknown_name("rig", options.rig, RIGS)
     if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):

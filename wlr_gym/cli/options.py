@@ -6,7 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import refuse_existing
+from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
 
 if TYPE_CHECKING:
     from wlr_gym.physics.effects import Patch
@@ -45,6 +47,18 @@ class ForceOption:
     force: bool = False
     """Replace results that are there."""
 
+    def refuse_results(self, folder: Path, own: str) -> None:
+        """Refuse, without ``--force``, to write over the results of this command, its ``own`` file, or among those of another.
+
+        Raises:
+            InputError: they are there.
+        """
+        refuse_existing(folder / own, self.force)
+        for name in (CONFIG_FILE, PROVENANCE_FILE, "meta.yaml"):
+            if (folder / name).exists() and not self.force:
+                what = f"'{name}' of another command is in it"
+                raise InputError(f"--out {folder}: {what}; choose another folder, or write into it with --force")
+
 
 @dataclass(frozen=True, kw_only=True)
 class SensorsOption:
@@ -67,12 +81,11 @@ class SensorsOption:
 
 def require_simulator(backend: str, robot: str) -> None:
     """Raise :class:`InputError` where ``--backend`` is no simulator; ``robot`` says what a real robot is for."""
-    from wlr_gym.physics.plants import REAL, SIMULATORS
+    from wlr_gym.physics.plants import REAL, check_simulator
 
     if backend in REAL:
         raise InputError(f"--backend {backend}: {robot}")
-    if backend not in SIMULATORS:
-        raise unknown_name("backend", backend, SIMULATORS, "--backend")
+    check_simulator(backend, "--backend")
 
 
 def require_threads(threads: int | None) -> None:

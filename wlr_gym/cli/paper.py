@@ -64,7 +64,7 @@ def run(options: PaperOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import output_folder, refuse_existing
+    from wlr_gym.base.files import output_folder
     from wlr_gym.base.provenance import record_provenance
     from wlr_gym.cli import FAILED, OK
     from wlr_gym.hardware.loop import StoppedError
@@ -76,7 +76,7 @@ def run(options: PaperOptions) -> int:
 
     _check(options)
     robot = load_robot(options.robot or "nominal")
-    refuse_existing(options.out / "report.md", options.force)
+    options.refuse_results(options.out, "report.md")
     console, records = Console(), {}
     with output_folder(options.out), progress(console, shown=options.progress) as tell:
         try:
@@ -118,8 +118,8 @@ def _check(options: PaperOptions) -> None:
             raise unknown_name("model", model, MODELS)
     if set(REAL) & set(options.plant):
         options.load_hardware()
-    elif options.emulated or options.port:
-        raise InputError("--emulated and --port are about the robot: add dynamixel to --plant")
+    else:
+        options.refuse_robot_options("add dynamixel to --plant")
     for name, low, high in (("draws", 0, 10_000), ("levels", 1, 3), ("threads", 1, 256)):
         value = getattr(options, name)
         if not low <= value <= high:

@@ -85,8 +85,8 @@ def run(options: RecordOptions) -> int:
         return OK
     if options.noise_seed is not None and not options.emulated:
         raise InputError("--noise-seed is for the emulated robot: add --emulated")
-    if options.backend not in REAL and (options.emulated or options.port or options.camera):
-        raise InputError(f"--emulated, --port and --camera are about the robot: leave --backend {options.backend} out")
+    if options.backend not in REAL:
+        options.refuse_robot_options(f"leave --backend {options.backend} out")
     if options.out is None:
         raise InputError("--out: expected a folder for the runs")
     motions = read_motions(options, robot)

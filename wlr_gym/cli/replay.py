@@ -81,15 +81,15 @@ def run(options: ReplayOptions) -> int:
     console = Console()
     check_backend(options.backend)
     on_robot = options.backend in REAL
-    if not on_robot and (options.emulated or options.port):
-        raise InputError("--emulated and --port are about the robot: add --backend dynamixel")
+    if not on_robot:
+        options.refuse_robot_options("add --backend dynamixel")
     if on_robot and options.video is not None:
         raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
     if options.video is not None:
         check_video(options.video)
     runs = read_runs(options.runs)
     patch = options.patch()
-    refuse_existing(options.out / ERRORS_FILE, options.force)
+    options.refuse_results(options.out, ERRORS_FILE)
     for film in _films(options, [one.name for one in runs]):
         refuse_existing(film, options.force, "--video")
     for measured in runs:  # a refusal leaves no folder behind

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import refuse_existing
+from wlr_gym.base.files import refuse_existing, require_ending
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
@@ -98,11 +98,10 @@ def _show(options: ShowOptions) -> int:
     from wlr_gym.cli.tables import print_table
     from wlr_gym.robot import load_robot, robot_hash
 
-    if options.picture is not None and options.picture.suffix.lower() not in PICTURES:
-        raise InputError(f"--picture {options.picture}: expected a file that ends in {', '.join(PICTURES)}")
-    if options.picture is not None and not options.picture.parent.is_dir():
-        raise InputError(f"--picture {options.picture}: folder {options.picture.parent} does not exist")
     if options.picture is not None:
+        require_ending(options.picture, PICTURES, "--picture")
+        if not options.picture.parent.is_dir():
+            raise InputError(f"--picture {options.picture}: folder {options.picture.parent} does not exist")
         refuse_existing(options.picture, options.force, "--picture")
     robot = load_robot(options.robot)
     numbers = _numbers(robot)

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import write_text
+from wlr_gym.base.files import require_ending, write_text
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_new import print_findings
+from wlr_gym.cli.robot_new import ENDINGS, print_findings
 
 if TYPE_CHECKING:
     from wlr_gym.robot.interchange import ImportedRobot, LinkTree
@@ -67,6 +67,7 @@ def import_robot(options: RobotImportOptions) -> int:
     from wlr_gym.robot.interchange import recognise
     from wlr_gym.robot.interchange.robot_file import base_beside, new_file, of_all, robot_over, robot_text
 
+    require_ending(options.out, ENDINGS)
     new_file(options.out, force=options.force)
     found = recognise(_read(options.file), idealise=options.idealise)
     name = options.name or found.name or options.out.stem
@@ -114,9 +115,12 @@ def export_robot(options: RobotExportOptions) -> int:
     from wlr_gym.robot.interchange.robot_file import new_file
     from wlr_gym.robot.interchange.urdf import NOT_IN_URDF
 
-    kind = options.format or SUFFIXES.get(options.out.suffix.lower())
+    by_name = SUFFIXES.get(options.out.suffix.lower())
+    kind = options.format or by_name
     if kind is None:
         raise InputError(f"--out {options.out}: expected a file that ends in {', '.join(SUFFIXES)}, or --format")
+    if by_name not in (None, kind):
+        raise InputError(f"--out {options.out}: a name of {by_name}, and --format {kind}; leave one of them out")
     new_file(options.out, force=options.force)
     robot = load_robot(options.robot)
     text, lost = (mjcf_text(robot), NOT_IN_MJCF) if kind == "mjcf" else (urdf_text(robot), NOT_IN_URDF)

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from wlr_gym.robot import Robot
     from wlr_gym.robot.outline import Question
 
+#: Of a robot file.
+ENDINGS = (".yaml", ".yml")
+
 
 @dataclass(frozen=True)
 class NewOptions(JsonOption, ForceOption):
@@ -49,12 +52,13 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     Raises:
         InputError: a bad option, or answers that no robot file can hold; nothing is written.
     """
-    from wlr_gym.base.files import write_text
+    from wlr_gym.base.files import require_ending, write_text
     from wlr_gym.physics.feasibility import examine_robot
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.interchange.robot_file import base_beside, new_file, of_all, robot_over, robot_text
     from wlr_gym.robot.outline import QUESTIONS, derived_numbers, question_of
 
+    require_ending(options.out, ENDINGS)
     new_file(options.out, force=options.force)
     base, name = load_robot(options.base), options.name or options.out.stem
     words = pairs("--set", options.set, "body.mass=12")

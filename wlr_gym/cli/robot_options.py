@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.plant import RobotPlant
     from wlr_gym.physics.effects import Patch
     from wlr_gym.robot import Robot
+
+
+#: Options that mean nothing to a simulator.
+_ROBOT_ONLY = ("hardware", "port", "emulated", "camera", "yes")
 
 
 def noise_seed(folder: Path, seed: int | None) -> int:
@@ -109,6 +113,16 @@ class HardwareOption(WiringOption):
 
     emulated: bool = False
     """An emulated robot in this process and in emulated time, instead of the ports."""
+
+    def refuse_robot_options(self, remedy: str) -> None:
+        """Refuse options that are about the robot where none is driven; ``remedy`` says what to do.
+
+        Raises:
+            InputError: one is given.
+        """
+        for one in fields(self):
+            if one.name in _ROBOT_ONLY and getattr(self, one.name) != one.default:
+                raise InputError(f"--{one.name} is about the robot: {remedy}")
 
 
 @dataclass(frozen=True, kw_only=True)

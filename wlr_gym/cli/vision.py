@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import OK
@@ -96,7 +96,7 @@ def run(options: VisionOptions) -> int:
     camera, body, floor = load_camera(options.camera), load_target(options.markers), load_target(options.floor)
     if options.out.resolve() == options.run.resolve().parent:
         raise InputError(f"--out {options.out}: is the run's own folder; the run would be overwritten")
-    refuse_existing(options.out / "summary.json", options.force)
+    options.refuse_results(options.out, "summary.json")
     fresh = not options.out.exists()
     make_output_folder(options.out)
     console = Console(highlight=False, soft_wrap=True)

@@ -15,7 +15,7 @@ from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import standing_at
 from wlr_gym.physics.effects import Patch, apply_patch
-from wlr_gym.physics.plants import SIMULATORS, make_plant
+from wlr_gym.physics.plants import check_simulator, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, Sensors, Truth
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -59,8 +59,7 @@ def parse_plant(text: str, physics_step: float = 0.001) -> ComparedPlant:
         InputError: unknown backend or option, a step that does not divide the control period, an unknown precision.
     """
     backend, _, options = text.partition(":")
-    if backend not in SIMULATORS:  # a real robot has no truth to compare, and none of the guards of wlr record here
-        raise unknown_name("backend", backend, SIMULATORS, f"plant '{text}'")
+    check_simulator(backend, f"plant '{text}'")  # a real robot has no truth to compare, nor the guards of wlr record here
     plant = ComparedPlant(backend, physics_step)
     for option in filter(None, options.split(",")):
         name, _, value = option.partition("=")

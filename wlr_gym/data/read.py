@@ -93,6 +93,19 @@ def read_dataset(folder: str | Path) -> DataSet:
         InputError: no runs in the folder, the same run in both formats, or a run that is refused.
     """
     folder = Path(folder)
+    paths = some_runs(folder)
+    for before, after in pairwise(paths):
+        if before.stem == after.stem:
+            raise InputError(f"{folder}: {before.name} and {after.name} are the same run; keep one of them")
+    return DataSet(tuple(read_run(path) for path in paths), read_meta(folder), folder)
+
+
+def some_runs(folder: Path) -> list[Path]:
+    """Return the runs of a folder.
+
+    Raises:
+        InputError: there are none.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     paths = run_files(folder)
@@ -100,10 +113,7 @@ def read_dataset(folder: str | Path) -> DataSet:
         inside = sorted(child.name for child in folder.iterdir() if child.is_dir() and run_files(child))
         hint = f"; its folders {', '.join(inside)} have some: name one" if inside else ""
         raise InputError(f"{folder}: no run_*.csv or run_*.parquet{hint}")
-    for before, after in pairwise(paths):
-        if before.stem == after.stem:
-            raise InputError(f"{folder}: {before.name} and {after.name} are the same run; keep one of them")
-    return DataSet(tuple(read_run(path) for path in paths), read_meta(folder), folder)
+    return paths
 
 
 def read_runs(path: str | Path) -> tuple[Run, ...]:

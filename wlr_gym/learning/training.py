@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.files import require_empty
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
+from wlr_gym.physics.plants import check_simulator
 from wlr_gym.policy.agents import (
     Training,
     TrainingProgress,
@@ -185,6 +187,8 @@ def check_environment_settings(settings: Mapping[str, Any]) -> None:
     for name in environment if isinstance(environment, Mapping) else ():
         if name not in valid:
             raise InputError(f"unknown setting 'environment.{name}'{nearest(name, valid)}; valid: {', '.join(valid)}")
+    if isinstance(environment, Mapping) and isinstance(backend := environment.get("backend"), str):
+        check_simulator(backend)
 
 
 def unused(folder: Path) -> Path:
@@ -193,8 +197,10 @@ def unused(folder: Path) -> Path:
     Raises:
         InputError: something is in it.
     """
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: cannot be a folder for the run: it is a file")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise InputError(f"{folder}: not empty; give another folder, or resume what is there: wlr train --resume {folder}")
+    require_empty(folder, "wlr train" if can_resume(folder) else "")
     return folder
+
+
+def can_resume(folder: Path) -> bool:
+    """Whether a training was in a folder, and left a checkpoint."""
+    return (folder / CONFIG_FILE).is_file() and any(folder.glob("checkpoints/*"))

@@ -1,7 +1,7 @@
 """Policies and agents: how they are called, loaded by name, saved with their contract, and refused where they do not fit."""
 
 from wlr_gym.policy.agents import Agent, Policy, Training, TrainingProgress, agent_names, load_agent, load_agent_config
-from wlr_gym.policy.export import Parity, export_policy
+from wlr_gym.policy.export import Parity, export_policy, exportable
 from wlr_gym.policy.file import check_contract, needs_camera, read_contract, write_contract
 from wlr_gym.policy.model_card import write_model_card
 from wlr_gym.policy.reseal import reseal
@@ -29,6 +29,7 @@ __all__ = [
     "contract_of",
     "environment_for",
     "export_policy",
+    "exportable",
     "fed_environment",
     "find_policy",
     "is_policy",

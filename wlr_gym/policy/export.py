@@ -54,14 +54,24 @@ def export_policy(
             answers differently from the policy.
         MissingPackageError: a package is not installed.
     """
-    folder = find_policy(source)
-    if folder.is_file():
-        raise InputError(f"{folder}: is a policy file already; what can be exported is a policy or run folder")
+    folder = exportable(source)
     content = read_contract(folder)
     graph = agent_function(content["agent"], "export_network")(folder, content)
     policy = agent_function(content["agent"], "load_policy")(folder, content)
     content["training"] = {**content.get("training", {}), **(training or {})}
     return write_policy_file(path, graph, content, policy, observations)
+
+
+def exportable(source: str | Path) -> Path:
+    """Return the folder of a trained policy.
+
+    Raises:
+        InputError: there is none, or it is a policy file.
+    """
+    folder = find_policy(source)
+    if folder.is_file():
+        raise InputError(f"{folder}: is a policy file already: copy it; what can be exported is a policy or run folder")
+    return folder
 
 
 def write_policy_file(
@@ -81,7 +91,7 @@ def write_policy_file(
         MissingPackageError: a package is not installed.
     """
     if path.suffix != SUFFIX:
-        raise InputError(f"{path}: expected a file name that ends in {SUFFIX}")
+        raise InputError(f"{path}: expected a file that ends in {SUFFIX}")
     require_package("onnx", "export")
     require_package("onnxruntime", "export")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import replace_file, require_ending
 
 Picture = NDArray[np.uint8]
 
@@ -27,8 +27,7 @@ def check_video(path: Path, option: str = "--video") -> None:
         InputError: no such folder, or a suffix that is no film.
         MissingPackageError: MP4 without ``imageio-ffmpeg``.
     """
-    if path.suffix.lower() not in _WRITERS:
-        raise InputError(f"{option} {path}: expected a file that ends in {', '.join(_WRITERS)}")
+    require_ending(path, _WRITERS, option)
     if not path.parent.is_dir():
         raise InputError(f"{option} {path}: folder {path.parent} does not exist")
     if path.is_dir():

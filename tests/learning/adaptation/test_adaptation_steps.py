@@ -2,6 +2,7 @@
 
 import importlib
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -359,6 +360,7 @@ def test_a_folder_of_another_command_is_refused(tmp_path):
         ((), "nothing to adapt to: give measured runs"),
         (("--emulated", "--robot-runs", "x"), "--emulated: an emulated robot, a real one"),
         (("--robot-runs", "nowhere"), "--robot-runs nowhere: no such folder"),
+        (("--robot-runs", str(Path(__file__).parent)), "no run_*.csv or run_*.parquet"),
         (("--emulated", "--env", "WLR-Path-v0"), "was made for another environment, WLR-Velocity-v0"),
         (("--emulated", "--drives", "0"), "drives"),
         (("--emulated", "--sensors", "camera"), "driven without a camera"),

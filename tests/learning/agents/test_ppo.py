@@ -289,7 +289,7 @@ def test_runs_of_different_settings_have_different_folders():
 
 def test_a_full_folder_is_not_overwritten(run, capsys):
     assert main(["train", ENVIRONMENT, "--out", str(run)]) == 2
-    assert "not empty" in capsys.readouterr().err
+    assert f"not empty; give another folder, or resume what is there: wlr train --resume {run}" in capsys.readouterr().err
 
 
 def test_a_start_from_a_controller_drives_like_it_and_is_reproducible(tmp_path):

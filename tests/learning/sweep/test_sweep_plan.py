@@ -207,5 +207,8 @@ def test_one_is_one(tmp_path):
 
 def test_a_used_folder_is_refused(tmp_path):
     (tmp_path / "something").touch()
+    with pytest.raises(InputError, match=r"not empty; give another folder$"):
+        wlr_gym.sweep(ENVIRONMENT, tmp_path)
+    (tmp_path / "sweep.yaml").touch()
     with pytest.raises(InputError, match=r"not empty.*--resume"):
         wlr_gym.sweep(ENVIRONMENT, tmp_path)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.perception.scene import ScenePose
 from wlr_gym.physics.model.dynamics import rotation_matrix
 
@@ -41,13 +42,21 @@ class PoseFeed:
     """The ring; one process writes, another reads.
 
     Args:
-        path: of its file. create: make it.
+        path: of its file. create: make it, or begin anew with one that is there.
+
+    Raises:
+        InputError: another file is there, or it cannot be made.
     """
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
         size = _COUNT.size + 8 * _ROW * LENGTH
         if create:
-            path.write_bytes(bytes(size))
+            if path.is_file() and path.stat().st_size != size:
+                raise InputError(f"--poses {path}: is there and no file of poses; expected a new file")
+            try:
+                path.write_bytes(bytes(size))
+            except OSError as error:
+                raise InputError(f"--poses {path}: cannot be written: {error.strerror}") from None
         with path.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), size)
         self._rows = np.frombuffer(self._memory, np.float64, _ROW * LENGTH, _COUNT.size).reshape(LENGTH, _ROW)

@@ -15,11 +15,12 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder
 from wlr_gym.hardware.emulator.commands import run_command
 from wlr_gym.hardware.emulator.machine import Machine
 
@@ -121,8 +122,11 @@ class Server:
         self.slipped = 0.0
         self.failure: Exception | None = None
         self._real_time = real_time
-        self._ports = self._make_ports(links)
+        self._names = [*machine.hardware.buses, *machine.sensors]
+        if links is not None:
+            _make_folder(links, self._names)
         self._control = _listen(control) if control is not None else None
+        self._ports = self._make_ports(links)
         self._control_path = control
         self._clients: list[socket.socket] = []
         self._wake, self._waker = os.pipe()
@@ -135,11 +139,8 @@ class Server:
         self.origin = 0.0
 
     def _make_ports(self, links: Path | None) -> dict[str, Port]:
-        names = [*self.machine.hardware.buses, *self.machine.sensors]
         try:
-            if links is not None:
-                links.mkdir(parents=True, exist_ok=True)
-            return {name: Port(name, None if links is None else links / name) for name in names}
+            return {name: Port(name, None if links is None else links / name) for name in self._names}
         except OSError as error:
             raise InputError(f"ports cannot be made: {error}") from None
 
@@ -346,12 +347,23 @@ class Server:
                 peer.sendall(answer.encode() + b"\n\n")
 
 
+def _make_folder(links: Path, names: Sequence[str]) -> None:
+    make_output_folder(links, "--links")
+    for path in (links / name for name in names):
+        if path.exists() and not path.is_symlink():
+            raise InputError(f"--links {links}: '{path.name}' in it is no link; expected another folder")
+
+
 def _listen(path: Path) -> socket.socket:
     control = socket.socket(socket.AF_UNIX)
+    if path.exists() and not path.is_socket():
+        raise InputError(f"--control {path}: is there and no socket; expected a new path")
     try:
+        if control.connect_ex(str(path)) == 0:
+            raise InputError(f"--control {path}: another emulator listens there; expected a new path")
         path.unlink(missing_ok=True)
         control.bind(str(path))
     except OSError as error:
-        raise InputError(f"control socket {path}: {error}") from None
+        raise InputError(f"--control {path}: cannot be a socket: {error.strerror or error}") from None
     control.listen()
     return control

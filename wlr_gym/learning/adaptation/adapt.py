@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from wlr_gym.base.errors import InputError, require_package, unknown_name
+from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import alone_in
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.settings import parse_config, parse_options, read_yaml
@@ -15,7 +15,7 @@ from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import same_profile
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.gap.decision import Decided
-from wlr_gym.learning.adaptation.driving import drive_after, drive_before, record_runs
+from wlr_gym.learning.adaptation.driving import check_runs, drive_after, drive_before, record_runs
 from wlr_gym.learning.adaptation.identification import find_gap, state_uncertainty
 from wlr_gym.learning.adaptation.page import write_page
 from wlr_gym.learning.adaptation.plan import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder
@@ -24,7 +24,7 @@ from wlr_gym.learning.adaptation.robots import AdaptedRobot, EmulatedRobot, Real
 from wlr_gym.learning.adaptation.uncertainty import Uncertainty
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 from wlr_gym.physics.effects import Source, load_patch, save_patch
-from wlr_gym.physics.plants import SIMULATORS
+from wlr_gym.physics.plants import check_simulator
 from wlr_gym.policy import agent_names, make_policy, policy_environment, trained_environment
 from wlr_gym.robot import Robot, RobotSource, load_robot
 
@@ -96,8 +96,7 @@ def adapt(
     chosen = environment or trained_environment(policy) or "WLR-Velocity-v0"
     own = load_robot(robot if robot is not None else policy_environment(policy).get("robot") or "nominal")
     patch = load_patch(effects)
-    if backend not in SIMULATORS:
-        raise unknown_name("backend", backend, SIMULATORS, "--backend")
+    check_simulator(backend, "--backend")
     if robot_runs is not None and patch:
         raise InputError("--effects: measured runs have what their robot has; they are for --emulated")
     if driven is None and robot_runs is None:
@@ -126,8 +125,10 @@ def adapt(
         "seed": seed,
     }
     asked = parse_options(Asked, given)
-    if robot_runs is not None and not Path(robot_runs).is_dir():
-        raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
+    if robot_runs is not None:
+        if not Path(robot_runs).is_dir():
+            raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
+        check_runs(Path(robot_runs), own)  # before anything is written
     progress = open_folder(Path(out), asked, tell, threads)
     with alone_in(progress.out):
         if not progress.steps:

@@ -83,7 +83,7 @@ def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> A
     """
     asked = progress.asked
     if asked.robot_runs is not None:
-        return _given_runs(Path(asked.robot_runs), own)
+        return check_runs(Path(asked.robot_runs), own)
     assert robot is not None
     folder = progress.folder("runs")
     noted = folder / "driven.json"
@@ -114,7 +114,8 @@ def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> A
     )
 
 
-def _given_runs(folder: Path, own: Robot) -> AdaptStep:
+def check_runs(folder: Path, own: Robot) -> AdaptStep:
+    """Read the runs that were given; errors as of :func:`record_runs`."""
     runs = read_dataset(folder).runs
     for run in runs:
         measured = robot_of(run)

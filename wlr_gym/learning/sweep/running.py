@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.files import locked, make_output_folder
+from wlr_gym.base.files import locked, make_output_folder, require_empty
 from wlr_gym.base.jobs import PATIENCE, Ended, Job, spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
@@ -128,8 +128,7 @@ def start_sweep(
 ) -> SweepResult:
     """Run a plan in a new folder; arguments, result and errors as of :func:`sweep`."""
     folder = Path(out)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: not empty; give another folder, or resume what is there: wlr sweep --resume {folder}")
+    require_empty(folder, "wlr sweep" if (folder / PLAN_FILE).is_file() else "")
     whole = resolve(plan)
     _check_machines(whole, ray, workers)
     make_output_folder(folder)

@@ -20,10 +20,10 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
 from wlr_gym.base.jobs import PATIENCE, Job, Send, import_modules, serve
 from wlr_gym.base.paths import PACKAGE
-from wlr_gym.base.provenance import CONFIG_FILE, git_commit
+from wlr_gym.base.provenance import git_commit
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, check_settings, draw, trial_of, whole_settings
 from wlr_gym.learning.sweep.results import is_complete, scores_of
-from wlr_gym.learning.training import resume_training, run_training
+from wlr_gym.learning.training import can_resume, resume_training, run_training
 from wlr_gym.policy import Training, TrainingProgress
 
 TRIALS = "trials"
@@ -101,7 +101,7 @@ def _train(task: Mapping[str, Any], folder: Path, reporter: _Reporter) -> None:
                 until_compiled.close()
             reporter.tell(progress.held_out)
 
-        if (folder / CONFIG_FILE).is_file() and any(folder.glob("checkpoints/*")):
+        if can_resume(folder):
             resume_training(folder, on_update=on_update)
             return
         shutil.rmtree(folder, ignore_errors=True)

@@ -82,6 +82,12 @@ def robot_file(hardware: RobotOptions) -> str | None:
     return importlib.import_module("wlr_gym.hardware.config").load_hardware(hardware.hardware).robot
 
 
+def check_simulator(backend: str, where: str = "") -> None:
+    """Raise :class:`InputError` for a backend that is no simulator; ``where`` names what gave it, such as ``--backend``."""
+    if backend not in SIMULATORS:
+        raise unknown_name("backend", backend, SIMULATORS, where)
+
+
 def check_backend(backend: str) -> None:
     """Raise :class:`InputError` for a backend that does not exist, before anything is made or written for it."""
     if backend not in BACKENDS:
