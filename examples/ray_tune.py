@@ -1,7 +1,7 @@
 """Ray Tune in 20 lines: every trial reports its held-out scores while it learns, and ASHA stops the worse ones.
 
-Needs ``pip install -e '.[sweep]'`` in the clone. Minutes (``--quick``: one). ``wlr sweep`` does the same and resumes; this is for
-a search of your own.
+Needs ``pip install -e '.[sweep]'`` in the clone. Minutes (``--quick``: one). ``wlr sweep`` does the same and resumes; this
+is for a search of your own.
 
     python examples/ray_tune.py [--quick]
 """
