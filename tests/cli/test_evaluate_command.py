@@ -89,6 +89,11 @@ def test_a_policy_of_another_task_is_told_where_it_was_trained(capsys):
     assert "was trained in" not in capsys.readouterr().err
 
 
+def test_an_agent_before_any_training_is_noted(capsys):
+    assert main(["evaluate", "a=ppo", "--episodes", "2", "--baselines", "--no-progress"]) == 0
+    assert "note: 'ppo' is the agent before any training; trained ones: path_blind" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -17,7 +17,7 @@ from rich.console import Console
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.deploy_options import DeployOptions, checked_command
-from wlr_gym.cli.options import environment_of
+from wlr_gym.cli.options import environment_of, note_untrained
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
@@ -53,6 +53,7 @@ def run(options: DeployOptions) -> int:
 
     command = checked_command(options)
     environment = environment_of(options.env, options.policy)
+    note_untrained([options.policy])
     robot = driven_robot(options)
     policy = _make_policy(options, environment, robot, command)
     console = Console()
@@ -91,7 +92,7 @@ def run(options: DeployOptions) -> int:
 
 def _results(result: Deployment, loop: ControlLoop) -> dict[str, Any]:
     """Return what ``--json`` prints; ``statistics`` count the steps of the ramp to the start pose too."""
-    found = {name: getattr(result, name) for name in ("reason", "well", "run")}
+    found = {name: getattr(result, name) for name in ("reason", "well", "run")} | {"files": loop.recorder.files}
     statistics = {f"{name}_ms" if _is_time(value) else name: value for name, value in result.statistics.items()}
     steps = {"steps": result.ticks, "steps_with_ramp": statistics.pop("ticks")}
     return found | steps | {"statistics": statistics, "limited": dict(loop.interventions)}
@@ -264,16 +265,16 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
 
 def _say_what_is_not_known(core: Core, policy: str, console: Console) -> None:
-    from wlr_gym.policy import contract_of, needs_camera
+    from wlr_gym.cli.robot_options import camera_note
+    from wlr_gym.policy import contract_of
 
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
     try:
         trained = contract_of(policy)["environment"]
     except InputError:  # an agent that was not trained
         trained = core.contract()
-    if needs_camera(trained) and not core.settings.has_camera:
-        note = "note: the slip observer is meant to have a camera, and none is named (--camera): expect worse tracking"
-        console.print(note, style="yellow")
+    if not core.settings.has_camera and (note := camera_note(trained)):
+        console.print(f"note: {note}", style="yellow")
 
 
 @contextlib.contextmanager
@@ -326,5 +327,5 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     console.print(f"command limiter, steps: {limited}")
     if camera := statistics.get("camera"):
         console.print(camera_line(camera))
-    if result.run is not None:
-        console.print(f"written: {result.run}", soft_wrap=True)
+    if written := [result.run] if result.run is not None else loop.recorder.files:
+        console.print(f"written: {', '.join(map(str, written))}", soft_wrap=True)

@@ -16,7 +16,7 @@ from wlr_gym.base.files import output_folder, refuse_existing
 from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, settings_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, note_untrained, settings_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import task_name_of
@@ -122,6 +122,8 @@ def run(options: EvaluateOptions) -> int:
     if not options.policy:
         raise InputError("no policy given; see: wlr evaluate --help")
     options.present()  # what cannot be is refused before anything is written
+    named = read_subjects([options.policy, *(options.baselines or ())])
+    note_untrained(source for subject in named for source in subject.sources)
     if options.accept:
         return _accept(options)
     options = _complete(options)

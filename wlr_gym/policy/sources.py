@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.settings import merge_changes
-from wlr_gym.policy.agents import Contract, Policy, agent_function, agent_names, load_agent_config
+from wlr_gym.policy.agents import Contract, Policy, agent_function, agent_names, load_agent, load_agent_config
 from wlr_gym.policy.file import CONTRACT_FILE, check_contract, read_contract
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy
 
@@ -59,6 +59,13 @@ def _policy_place(source: str | Path) -> Path | None:
 def is_policy(source: str | Path) -> bool:
     """Whether there is an agent or a trained policy of this name or at this path."""
     return str(source) in agent_names() or _policy_place(source) is not None
+
+
+def untrained(source: str | Path) -> str:
+    """Return what to say of the name of an agent whose training begins with a random policy; empty = it is none."""
+    if str(source) not in agent_names() or not hasattr(load_agent(str(source)), "settings_to_start_from"):
+        return ""
+    return f"'{source}' is the agent before any training; trained ones: {', '.join(shipped_names())}"
 
 
 def find_policy(source: str | Path) -> Path:
