@@ -203,11 +203,18 @@ def test_a_whole_run_is_a_motion_too(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("t,cmd_leg_lf\n0,1\n", "column 'cmd_leg_rf' is missing"),
+        ("t,cmd_leg_lf\n0,1\n", "column 'cmd_leg_rf' is missing; found: t, cmd_leg_lf$"),
+        ("t;cmd_leg_lf\n0;1\n", "column 't' is missing; separated by ';'. expected ','"),
         ("HEADER\n0,1,1,1,1,0,0,0,0\n", "two rows or more"),
         ("HEADER\n0,1,1,1,1,0,0,0,0\n0,1,1,1,1,0,0,0,0\n", "increasing"),
-        ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,90,1,1,0,0,0,0\n", "row 1, column 'cmd_leg_rf': 90: expected rad"),
-        ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,1,0,inf,0,0\n", "row 1, column 'cmd_wheel_rf': inf"),
+        (
+            "HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,90,1,1,0,0,0,0\n",
+            r"row 1 \(line 3\), column 'cmd_leg_rf': 90: expected -6.28 to 6.28 rad; in degrees\?",
+        ),
+        (
+            "HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,1,0,inf,0,0\n",
+            r"row 1 \(line 3\), column 'cmd_wheel_rf': inf: expected -30 to 30 rad/s",
+        ),
         ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,x,0,0,0,0\n", "cannot be read"),
     ],
 )
