@@ -16,7 +16,16 @@ from wlr_gym.base.files import output_folder, refuse_existing
 from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, note_untrained, settings_of
+from wlr_gym.cli.options import (
+    ForceOption,
+    JsonOption,
+    PatchOption,
+    SensorsOption,
+    environment_of,
+    note_untrained,
+    require_counts,
+    settings_of,
+)
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import task_name_of
@@ -121,6 +130,7 @@ def run(options: EvaluateOptions) -> int:
     """Play, print the card, write it."""
     if not options.policy:
         raise InputError("no policy given; see: wlr evaluate --help")
+    require_counts(options, "episodes", "blocks", "other_episodes", "sweep_episodes", "threads")
     options.present()  # what cannot be is refused before anything is written
     named = read_subjects([options.policy, *(options.baselines or ())])
     note_untrained(source for subject in named for source in subject.sources)

@@ -77,10 +77,12 @@ def require_simulator(backend: str, robot: str) -> None:
         raise unknown_name("backend", backend, SIMULATORS, "--backend")
 
 
-def require_threads(threads: int | None) -> None:
-    """Raise :class:`InputError` where ``--threads`` is below 1; None = all cores."""
-    if threads is not None and threads < 1:
-        raise InputError(f"--threads {threads}: expected 1 or more")
+def require_counts(options: object, *names: str, least: int = 1) -> None:
+    """Raise :class:`InputError` for the first of some options that is below the least; None = left open."""
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and not value >= least:
+            raise InputError(f"--{name.replace('_', '-')} {value:g}: expected {least} or more")
 
 
 def note_untrained(sources: Iterable[str]) -> None:
