@@ -106,10 +106,16 @@ def test_a_mistake_on_the_command_line(words, expected, capsys, tmp_path, monkey
 
 KEYWORDS = {
     "an option": ({"bakend": "mujoco"}, "did you mean 'backend'?"),
+    "how many": ({"num_envs": 4}, "'num_envs'; several at once: gymnasium.make_vec(ID, num_envs=4); valid: backend,"),
+    "a seed": ({"seed": 3}, "'seed'; it goes to env.reset(seed=3); valid: backend,"),
+    "sensors": ({"sensors": "cam"}, "'sensors'; it is of the task: task={\"sensors\": {\"camera\": 1.0}}; valid: backend,"),
+    "nothing like it": ({"foo": 1}, "got an unexpected keyword argument 'foo'; valid: backend,"),
+    "no effects": ({"effects": 3}, "effects = 3: expected a name, a path, a mapping or a list of these"),
+    "no keys": ({"task": {"sensors": ["camera"]}}, "sensors = ['camera']: expected keys and values; keys: camera, flow"),
     "a simulator": ({"backend": "mujco"}, "did you mean 'mujoco'?"),
     "a randomization": ({"randomization": "wyde"}, "did you mean 'wide'?"),
     "a robot": ({"robot": "nominall"}, "did you mean 'nominal'?"),
-    "a precision": ({"precision": "float16"}, "valid: float64, float32"),
+    "a precision": ({"precision": "float16"}, "unknown precision 'float16' (did you mean 'float64'?); valid: float32, float64"),
     "a time in words": ({"episode_length": "long"}, "episode_length = 'long': expected a time above 0 s"),
     "a task": ({"task": "velocty"}, "did you mean 'velocity'?"),
     "an effect where a patch goes": ({"effects": ["backlash"]}, "'backlash' is an effect"),
