@@ -232,6 +232,7 @@ def test_command_line_in_emulated_time(tmp_path, capsys):
     assert run_command("deploy", words(tmp_path, "--command", "linear_velocity_x=0.05", "yaw_rate=0")) == OK
     said = capsys.readouterr().out
     assert "p95" not in said  # of times that are all zero
+    assert "space: motors off at once" not in said  # there is no terminal
     assert "ended: time is over" in said
     assert "track_linear_velocity" in said
     log = read_policy_log(tmp_path / "run_01.csv")
@@ -367,7 +368,10 @@ def test_faults_are_for_the_emulated_robot(tmp_path):
 
 def test_nobody_there_to_start_the_robot(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    there = ["--port", "legs=/dev/null", "wheels=/dev/null", "imu=/dev/null"]
     with pytest.raises(InputError, match="nobody there to start the robot"):
+        run_command("deploy", ["pid", "--out", str(tmp_path), *there])
+    with pytest.raises(InputError, match="legs port /dev/ttyUSB0: not there"):  # nobody is asked
         run_command("deploy", ["pid", "--out", str(tmp_path)])
 
 

@@ -46,8 +46,9 @@ def run(options: DeployOptions) -> int:
         InputError: bad options, a policy that does not fit, ports that cannot be opened.
     """
     from wlr_gym.hardware.deployment import deploy, loop_of
-    from wlr_gym.hardware.operator import Keys, stop_on_signals
+    from wlr_gym.hardware.operator import HELP, Keys, stop_on_signals
     from wlr_gym.hardware.realtime import real_time
+    from wlr_gym.hardware.safety.preflight import require_ports
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import environment_for
 
@@ -71,12 +72,15 @@ def run(options: DeployOptions) -> int:
         if options.realtime is not None:
             stack.enter_context(real_time(options.realtime))
         if not (options.yes or options.emulated or options.dry_run):
+            require_ports(loop.hardware)
             wait_for_enter(console, "The robot will move. Wheels off the ground? Hand on the switch?")
         if options.stepped:
             for fault in options.fault:
                 _machine_of(loop).inject(fault)
         stream = _stream(options.mcap, loop, last)
         keys = stack.enter_context(Keys())
+        if keys.is_terminal:
+            console.print(HELP, style="dim")
         stack.enter_context(stop_on_signals(loop.operator))
         stack.enter_context(_serving(loop, core, [keys, *pads], options.status and console.is_terminal, console))
         result = deploy(core, policy, options.seed, command, pads[0].command if pads else None)
@@ -285,9 +289,7 @@ def _serving(
     from rich.live import Live
 
     from wlr_gym.cli.robot_status import RobotView
-    from wlr_gym.hardware.operator import HELP
 
-    console.print(HELP, style="dim")
     live = Live(console=console, auto_refresh=False, transient=True) if show else None
     view, count = RobotView(loop, core), 0
 

@@ -132,12 +132,11 @@ def run(options: EvaluateOptions) -> int:
         raise InputError("no policy given; see: wlr evaluate --help")
     require_counts(options, "episodes", "blocks", "other_episodes", "sweep_episodes", "threads")
     options.present()  # what cannot be is refused before anything is written
-    named = read_subjects([options.policy, *(options.baselines or ())])
-    note_untrained(source for subject in named for source in subject.sources)
     if options.accept:
         return _accept(options)
     options = _complete(options)
     _check(options)
+    _note_untrained(options)
     patch = options.patch()
     if options.out is not None:
         refuse_existing(options.out / "card.json", options.force)
@@ -175,6 +174,7 @@ def _accept(options: EvaluateOptions) -> int:
     given = [name for name, value in card_only.items() if value]
     if given:
         raise InputError(f"--accept: {given[0]} is of the card; leave it out")
+    _note_untrained(options)
     if options.out is not None:
         refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
     with output_folder(options.out), _progress(options.progress) as tell:
@@ -199,6 +199,11 @@ def _accept(options: EvaluateOptions) -> int:
         print(f"written: {options.out / ACCEPTANCE_FILE}")
     print("accepted" if result.accepted else f"refused: {len(result.refused)} losses may be above {result.largest_loss:g} %")
     return OK if result.accepted else FAILED
+
+
+def _note_untrained(options: EvaluateOptions) -> None:
+    subjects = read_subjects([options.policy, *(options.baselines or ())])
+    note_untrained(source for subject in subjects for source in subject.sources)
 
 
 def _shown(card: Card, subject: Subject) -> Subject:
