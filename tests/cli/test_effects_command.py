@@ -70,12 +70,17 @@ def test_check_prints_what_changes(tmp_path, capsys, monkeypatch):
         (["check", "backlash"], ["'backlash' is an effect, not a patch", "wlr effects backlash"]),
         (["check", "unknown_effect"], ["'unknown_effect' is an effect, not a patch"]),
         (["check", "report/result.json"], ["report/result.json: not a patch", "the patch.yaml beside it"]),
+        (["check", "empty.yaml"], ["empty.yaml: is empty; expected a mapping with 'effects'"]),
+        (["check", "binary.yaml"], ["binary.yaml: is no text file; expected YAML in UTF-8"]),
         (["check", "nowhere.yaml"], ["nowhere.yaml"]),
         (["check", "icy_patch", "icy_patch", "icy_patch", "icy_patch", "icy_patch"], ["icy_patch.yaml: effect 1", "4 patches"]),
         (["check", "icy_patch", "--robot", "nominl"], ["nominl", "did you mean 'nominal'"]),
     ],
 )
-def test_bad_words_are_refused(capsys, arguments, words):
+def test_bad_words_are_refused(capsys, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty.yaml").write_text("")
+    (tmp_path / "binary.yaml").write_bytes(b"\x80")
     assert main(["effects", *arguments]) == 2
     text = capsys.readouterr().err
     for word in words:

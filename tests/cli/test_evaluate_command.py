@@ -89,14 +89,19 @@ def test_a_policy_of_another_task_is_told_where_it_was_trained(capsys):
     assert "was trained in" not in capsys.readouterr().err
 
 
+def test_an_agent_before_any_training_is_noted(capsys):
+    assert main(["evaluate", "a=ppo", "--episodes", "2", "--baselines", "--no-progress"]) == 0
+    assert "note: 'ppo' is the agent before any training; trained ones: path_blind" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["constant_comand"], "did you mean 'constant_command'"),
         (["do_nothing", "--randomization", "wid"], "did you mean 'wide'"),
         (["do_nothing", "--env", "WLR-Velocty-v0"], "unknown environment"),
-        (["do_nothing", "--episodes", "0"], "episodes = 0"),
-        (["do_nothing", "--blocks", "0"], "blocks = 0"),
+        (["do_nothing", "--episodes", "0"], "--episodes 0: expected 1 or more"),
+        (["do_nothing", "--blocks", "0"], "--blocks 0: expected 1 or more"),
         (["do_nothing", "--seed", "-1"], "--seed -1"),
         (["do_nothing", "--sweep", "slope"], "not for task 'velocity'"),
         (["do_nothing", "--backend", "mujoko"], "did you mean 'mujoco'"),
@@ -104,7 +109,7 @@ def test_a_policy_of_another_task_is_told_where_it_was_trained(capsys):
         (["do_nothing", "--video", "a.webp", "--video-seconds", "0"], "--video-seconds 0"),
         (["a=do_nothing", "--baselines", "a=pid"], "two policies are called 'a'"),
         (["do_nothing", "do_nothing"], "policy 'do_nothing' is given twice"),
-        (["pid", "--accept", "--baselines", "do_nothing", "--episodes", "0"], "episodes = 0"),
+        (["pid", "--accept", "--baselines", "do_nothing", "--episodes", "0"], "--episodes 0: expected 1 or more"),
         (["do_nothing", "--accept", "--baselines", "do_nothing"], "nothing to compare it with"),
     ],
 )

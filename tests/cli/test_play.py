@@ -118,6 +118,7 @@ def test_a_commanded_path_is_drawn_on_the_floor_it_was_commanded_on(shape):
     ("arguments", "words"),
     [
         ([], "no display here"),
+        (["--agent", "ppo"], "note: 'ppo' is the agent before any training; trained ones: path_blind"),
         (["--agent", "pidd"], "did you mean 'pid'?"),
         (["--agent", "pid", "--command", "1"], "--command '1': expected linear_velocity_x,yaw_rate"),
         (["WLR-Pth-v0"], "did you mean 'WLR-Path-v0'?"),

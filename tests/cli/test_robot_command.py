@@ -91,6 +91,7 @@ def test_nothing_is_replaced_without_being_told(big, capsys):
         ("body.size=3 m", "body.size = '3 m': expected 3 numbers in m, cm, mm"),
         ("leg.length=nan", "leg.length = 'nan': expected a number in m"),
         ("leg_limits=2 1", "leg_limits = [2.0, 1.0]"),
+        ("leg.length=300 m", "wlr: leg.length = 300 m: is unusual, expected 0.02 to 1 m; in mm? 300 mm = 0.3 m"),
     ],
 )
 def test_bad_answers_are_refused_and_nothing_is_written(tmp_path, word, message, capsys):
@@ -105,7 +106,7 @@ def test_a_refusal_of_all_answers_loses_none(tmp_path):
     with pytest.raises(
         InputError, match=r"your answers: --set body.mass=2.8 body.size='0.35 0.32 0.07' .*leg_limits='2.0 1.0'"
     ):
-        new_robot(NewOptions(out=tmp_path / "x.yaml", yes=True, set=("leg_limits=2 1",)))
+        new_robot(NewOptions(out=tmp_path / "x.yaml", set=("leg_limits=2 1",)), lambda text: "")
 
 
 def test_a_new_robot_that_cannot_stand_is_written_and_fails(tmp_path, capsys):

@@ -144,7 +144,7 @@ def test_text_in_a_cell(tmp_path, table):
     cells[3] = "n/a"
     lines[6] = ",".join(cells)
     path.write_text("\n".join(lines))
-    refused(path, "row 5", "'cmd_leg_lr'", "'n/a' is not a number")
+    refused(path, "row 5 (line 7)", "'cmd_leg_lr'", "'n/a' is not a number")
 
 
 def test_text_column_in_parquet(tmp_path, table):
@@ -359,7 +359,7 @@ def test_dataset_refuses_what_is_no_data_set(tmp_path, table):
 
 def test_writing_refuses_what_reading_refuses(tmp_path, table):
     table["gyro_x"][4] = np.inf
-    with pytest.raises(InputError, match="row 4, column 'gyro_x'"):
+    with pytest.raises(InputError, match=r"row 4 \(line 6\), column 'gyro_x'"):
         write_run(tmp_path / "run_01.csv", table)
     assert list(tmp_path.iterdir()) == []
 

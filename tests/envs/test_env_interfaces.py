@@ -153,7 +153,7 @@ def test_contract_names_the_task_robot_and_randomization(fake):
         ({"threads": True}, "threads = True: expected a whole number"),
         ({"backend": None}, "backend = None: expected a name"),
         ({"randomization": 3}, "randomization = 3: expected a name, a path or a mapping"),
-        ({"effects": 3}, "effects = 3: expected a path or a list"),
+        ({"effects": 3}, "effects = 3: expected a name, a path, a mapping or a list"),
         ({"effects": [{"name": "paylod"}]}, "did you mean 'payload'"),
         ({"effects": [{"name": "payload", "parameters": {"mass": "heavy"}}]}, "mass = 'heavy'"),
         ({"task": {"rewards": {"track_yaw_rate": {"width": 0}}}}, "width = 0: expected a number above 0"),

@@ -56,8 +56,9 @@ def test_every_verdict_is_written_and_answered(verdict, data, tmp_path, answer, 
     names = {path.name for path in out.iterdir()}
     assert names == {"result.json", "patch.yaml", "report.html", "plots", "config.yaml", "provenance.yaml"}
     shown = printed(capsys)
-    for path in ("report.html", "result.json", "patch.yaml"):
+    for path in ("report.html", "result.json"):
         assert str(out / path) in shown
+    assert ("patch: " in shown) is (verdict != "bad_data")
 
 
 def test_what_was_found_is_printed(data, tmp_path, answer, capsys):
@@ -119,6 +120,7 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
         (["--effects", "nothing_like_it"], "--effects: unknown effects config 'nothing_like_it'"),
         (["--effects", "knwon.yaml"], "--effects: effects config: no file 'knwon.yaml'"),
         (["--rig", "pendulum", "--effects", "icy_patch"], "unknown effect of the test rig 'friction_patch'"),
+        (["--until-decided", "--budget-runs", "-1"], "--budget-runs -1: expected 0 or more"),
         (["--budget-runs", "2"], "--budget-runs: it is for --until-decided"),
         (["--record", "emulated"], "--record: it is for --until-decided"),
         (["--hidden", "stiff_leg"], "--hidden: it is for --until-decided"),

@@ -232,10 +232,34 @@ def test_command_line_in_emulated_time(tmp_path, capsys):
     assert run_command("deploy", words(tmp_path, "--command", "linear_velocity_x=0.05", "yaw_rate=0")) == OK
     said = capsys.readouterr().out
     assert "p95" not in said  # of times that are all zero
+    assert "space: motors off at once" not in said  # there is no terminal
     assert "ended: time is over" in said
     assert "track_linear_velocity" in said
     log = read_policy_log(tmp_path / "run_01.csv")
     assert (log["command_linear_velocity_x"] == 0.05).all()
+
+
+def test_a_policy_trained_mostly_with_a_camera_is_said_to_lack_one(tmp_path, capsys):
+    pytest.importorskip("onnxruntime")
+    for policy, said in (("path_slip_aware", True), ("velocity_slip_aware", False)):
+        assert run_command("deploy", [policy, *words(tmp_path, "--seconds", "0.1")[1:]]) == OK
+        assert ("in 70% of its training the policy had a camera" in " ".join(capsys.readouterr().out.split())) is said
+
+
+def test_an_agent_before_any_training_is_noted_and_moves_no_real_robot(tmp_path, capsys):
+    assert run_command("deploy", ["ppo", *words(tmp_path, "--seconds", "0.1")[1:]]) == OK
+    assert "note: 'ppo' is the agent before any training; trained ones: path_blind" in capsys.readouterr().err
+    with pytest.raises(InputError, match="'ppo' is the agent before any training"):
+        run_command("deploy", ["ppo", "--yes"])
+
+
+def test_a_run_that_ends_on_the_way_to_the_start_pose_names_its_log(tmp_path, capsys):
+    stopped = words(tmp_path, "--fault", "drop wheels after=0.2")
+    assert run_command("deploy", stopped) == FAILED
+    names = [tmp_path / "ramp_01.csv", tmp_path / "run_01.events.jsonl"]
+    assert f"written: {', '.join(map(str, names))}" in capsys.readouterr().out
+    assert run_command("deploy", [*stopped, "--json"]) == FAILED
+    assert json.loads(capsys.readouterr().out)["files"] == [str(path).replace("_01", "_02") for path in names]
 
 
 def test_the_results_say_which_steps_they_count_and_their_units(tmp_path, capsys):
@@ -344,7 +368,10 @@ def test_faults_are_for_the_emulated_robot(tmp_path):
 
 def test_nobody_there_to_start_the_robot(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    there = ["--port", "legs=/dev/null", "wheels=/dev/null", "imu=/dev/null"]
     with pytest.raises(InputError, match="nobody there to start the robot"):
+        run_command("deploy", ["pid", "--out", str(tmp_path), *there])
+    with pytest.raises(InputError, match="legs port /dev/ttyUSB0: not there"):  # nobody is asked
         run_command("deploy", ["pid", "--out", str(tmp_path)])
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
@@ -24,6 +25,7 @@ from wlr_gym.robot import JOINTS, load_robot
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from wlr_gym.hardware.driving import DriveResult
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
@@ -203,11 +205,18 @@ def test_a_whole_run_is_a_motion_too(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("t,cmd_leg_lf\n0,1\n", "column 'cmd_leg_rf' is missing"),
+        ("t,cmd_leg_lf\n0,1\n", "column 'cmd_leg_rf' is missing; found: t, cmd_leg_lf$"),
+        ("t;cmd_leg_lf\n0;1\n", "column 't' is missing; separated by ';'. expected ','"),
         ("HEADER\n0,1,1,1,1,0,0,0,0\n", "two rows or more"),
         ("HEADER\n0,1,1,1,1,0,0,0,0\n0,1,1,1,1,0,0,0,0\n", "increasing"),
-        ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,90,1,1,0,0,0,0\n", "row 1, column 'cmd_leg_rf': 90: expected rad"),
-        ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,1,0,inf,0,0\n", "row 1, column 'cmd_wheel_rf': inf"),
+        (
+            "HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,90,1,1,0,0,0,0\n",
+            r"row 1 \(line 3\), column 'cmd_leg_rf': 90: expected -6.28 to 6.28 rad; in degrees\?",
+        ),
+        (
+            "HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,1,0,inf,0,0\n",
+            r"row 1 \(line 3\), column 'cmd_wheel_rf': inf: expected -30 to 30 rad/s",
+        ),
         ("HEADER\n0,1,1,1,1,0,0,0,0\n0.02,1,1,1,x,0,0,0,0\n", "cannot be read"),
     ],
 )
@@ -219,6 +228,12 @@ def test_command_files_that_are_none(tmp_path, text, words):
 
 
 # ---- the command line ----
+
+
+def test_one_step_is_no_steps(capsys):
+    drive = DriveResult(None, "", True, 1, {"interventions": {"slew": 1, "stale": 2}})
+    record._report(excite("straight"), drive, Console())
+    assert "command limiter: slew in 1 step, stale in 2 steps\n" in capsys.readouterr().out
 
 
 def test_list_shows_every_excitation(capsys):
@@ -248,9 +263,15 @@ def test_refusals(tmp_path, options, words):
     assert not (tmp_path / "runs").exists()
 
 
+#: Ports that are there.
+THERE = ("legs=/dev/null", "wheels=/dev/null", "imu=/dev/null")
+
+
 def test_a_real_robot_is_asked_for_first(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     with pytest.raises(InputError, match="nobody there to start the robot"):
+        recorded(tmp_path, excitation=("straight",), emulated=False, port=THERE)
+    with pytest.raises(InputError, match="legs port /dev/ttyUSB0: not there; plug it in"):
         recorded(tmp_path, excitation=("straight",), emulated=False)
     assert list(tmp_path.iterdir()) == []
 
@@ -272,6 +293,7 @@ class Operator:
 def emulated_as_real(monkeypatch):
     """What is connected is an emulated robot that the commands take for a real one."""
     link_to = HardwareOption.link_to
+    monkeypatch.setattr("wlr_gym.hardware.safety.preflight.require_ports", lambda hardware: None)
     monkeypatch.setattr(
         HardwareOption, "link_to", lambda options, *given: link_to(replace(options, emulated=True, port=()), *given)
     )

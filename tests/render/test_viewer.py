@@ -4,6 +4,7 @@
 # (MuJoCo fills its namespace when it is imported.)
 import contextlib
 import types
+import warnings
 
 import mujoco
 import numpy as np
@@ -192,6 +193,14 @@ def test_gamepad():
     assert [held.wants_reset(), held.wants_reset()] == [True, False]
     with pytest.raises(InputError, match="no gamepad found"):
         Gamepad(RANGES, pad([], present=False))
+
+
+def test_glfw_that_does_not_start_is_said_once(monkeypatch, recwarn):
+    glfw = pytest.importorskip("glfw")
+    monkeypatch.setattr(glfw, "init", lambda: warnings.warn("no display", glfw.GLFWError, stacklevel=1))
+    with pytest.raises(InputError, match="GLFW does not start"):
+        Gamepad(RANGES)
+    assert not recwarn.list
 
 
 NAMES = tuple(RANGES)

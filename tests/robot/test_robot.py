@@ -102,7 +102,7 @@ def test_an_edited_file_loads_from_its_path(edited):
         ({"body__mass": math.nan}, "body.mass = nan"),
         ({"gravity": math.inf}, "gravity = inf"),
         ({"body__size": [0.3, 0.2]}, "body.size.2' is missing"),
-        ({"body": 3.0}, "body = 3.0: expected keys and values$"),
+        ({"body": 3.0}, "body = 3.0: expected keys and values; keys: mass, size, inertia, com_offset$"),
         ({"leg__length": None}, "robot.yaml: 'leg.length' is missing"),
         ({"servo__wheel": None}, "'servo.wheel' is missing"),
         ({"joints": list(reversed(JOINTS))}, "joints must be"),
@@ -167,7 +167,7 @@ def test_a_file_without_keys_is_refused(tmp_path, text, words):
 def test_a_file_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "binary.yaml"
     path.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(InputError, match=r"binary.yaml: cannot be read"):
+    with pytest.raises(InputError, match=r"binary.yaml: is no text file"):
         load_robot(path)
 
 

@@ -18,7 +18,8 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """Return `` (did you mean 'x'?)`` for the valid name closest to ``name``, or an empty string."""
     options = list(valid)
     lowered = {option.lower(): option for option in options}
-    close = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.5)
+    begun = [option for option in lowered if name and option.startswith(name.lower())]
+    close = difflib.get_close_matches(name.lower(), lowered, n=3, cutoff=0.51) or begun
     swapped = [option for option in close if sorted(option) == sorted(name.lower())]  # letters in another order are likeliest
     return f" (did you mean '{lowered[(swapped or close)[0]]}'?)" if close else ""
 

@@ -104,9 +104,15 @@ def _fault(model: type[BaseModel], place: tuple[str, ...], problems: list[Any]) 
     if isinstance(refused := first.get("ctx", {}).get("error"), InputError):
         return str(refused)
     value = f"{field} = {shown(first['input'])}: " if field else ""  # what is about the whole file does not repeat it
-    return value + ", or ".join(
-        dict.fromkeys([expected(first), *(expected(one).removeprefix("expected ") for one in problems[1:])])
-    )
+    wanted = _fields_at(model, place) if field and first["type"] in ("dict_type", "model_type") else []
+    keys = f"; keys: {', '.join(wanted)}" if wanted else ""
+    return f"{value}{_either(problems)}{keys}"
+
+
+def _either(problems: Sequence[Any]) -> str:
+    """Return what was expected, or what else would have been."""
+    first, *others = map(expected, problems)
+    return ", or ".join(dict.fromkeys([first, *(one.removeprefix("expected ") for one in others)]))
 
 
 def _fields_at(model: Any, path: Iterable[str]) -> list[str]:

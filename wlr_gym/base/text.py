@@ -15,6 +15,11 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
 
 
+def row_words(path: object, row: int) -> str:
+    """Return which row of a table it is, from 0 below the header; of a CSV file also which line an editor shows it as."""
+    return f"row {row} (line {row + 2})" if str(path).lower().endswith(".csv") else f"row {row}"
+
+
 def duration(seconds: float) -> str:
     """Return ``3 min 20 s``; from an hour on ``2 h 5 min``."""
     whole = round(seconds)

@@ -19,7 +19,7 @@ import tyro
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption, PatchOption, SensorsOption, require_threads
+from wlr_gym.cli.options import JsonOption, PatchOption, SensorsOption, require_counts
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
@@ -133,7 +133,7 @@ def _check(options: AdaptOptions) -> None:
         raise InputError("--effects: a real robot has its own; they are for --emulated")
     if options.port and options.hardware is None:
         raise InputError("--port: it goes with --hardware")
-    require_threads(options.threads)
+    require_counts(options, "threads")
 
 
 def _real(options: AdaptOptions, console: Console) -> RealRobot:

@@ -14,7 +14,7 @@ from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.cli import OK
 from wlr_gym.cli.calibrate_flow import FlowOptions, calibrate_flow
 from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
-from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.options import ForceOption, JsonOption, require_counts
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
@@ -110,8 +110,8 @@ def _camera(options: CameraOptions) -> int:
 
     if not 0.001 < options.square < 0.5:
         raise InputError(f"--square {options.square:g}: expected metres, as measured on the print (28 mm = 0.028)")
-    if min(options.columns, options.rows) < 3 or options.every < 1:
-        raise InputError("--columns and --rows: expected 3 or more; --every: 1 or more")
+    require_counts(options, "columns", "rows", least=3)
+    require_counts(options, "every")
     if options.readout is not None and not -0.1 < options.readout < 0.1:
         raise InputError(f"--readout {options.readout:g}: expected seconds, less than 0.1 (20 ms = 0.02)")
     if options.out.suffix not in {".yaml", ".yml"} or not options.out.parent.is_dir():

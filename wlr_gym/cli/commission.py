@@ -45,7 +45,7 @@ class CommissionOptions(JsonOption, ForceOption, RobotOption, PatchOption):
     """Test a robot on a stand.
 
     Attributes:
-        out: folder for runs and results; made if it is not there.
+        out: folder for runs and results, made if it is not there; needed for all but --list.
         tests: which tests to make; none = all. See --list. With --force, results of the others in --out are kept.
         fault: with --emulated: what goes wrong, as in wlr emulate: "delay legs value=0.015".
         list: show the tests.

@@ -17,7 +17,7 @@ from wlr_gym.base.files import output_folder, write_json, write_text
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_threads, settings_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_counts, settings_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 
@@ -82,7 +82,9 @@ def run(options: CompareOptions) -> int:
     from wlr_gym.data.compared_plants import parse_plant
     from wlr_gym.data.comparison_report import markdown, summary_table, tables
 
-    require_threads(options.threads)
+    require_counts(options, "threads")
+    if not options.physics_step > 0.0:
+        raise InputError(f"--physics-step {options.physics_step:g}: expected more than 0 s")
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if first == second:
         raise InputError(f"--plants {' '.join(options.plants)}: the same plant twice; expected two that differ")

@@ -17,7 +17,7 @@ from rich.console import Console
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.deploy_options import DeployOptions, checked_command
-from wlr_gym.cli.options import environment_of
+from wlr_gym.cli.options import environment_of, note_untrained
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
 
@@ -46,13 +46,15 @@ def run(options: DeployOptions) -> int:
         InputError: bad options, a policy that does not fit, ports that cannot be opened.
     """
     from wlr_gym.hardware.deployment import deploy, loop_of
-    from wlr_gym.hardware.operator import Keys, stop_on_signals
+    from wlr_gym.hardware.operator import HELP, Keys, stop_on_signals
     from wlr_gym.hardware.realtime import real_time
+    from wlr_gym.hardware.safety.preflight import require_ports
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import environment_for
 
     command = checked_command(options)
     environment = environment_of(options.env, options.policy)
+    note_untrained([options.policy])
     robot = driven_robot(options)
     policy = _make_policy(options, environment, robot, command)
     console = Console()
@@ -70,12 +72,15 @@ def run(options: DeployOptions) -> int:
         if options.realtime is not None:
             stack.enter_context(real_time(options.realtime))
         if not (options.yes or options.emulated or options.dry_run):
+            require_ports(loop.hardware)
             wait_for_enter(console, "The robot will move. Wheels off the ground? Hand on the switch?")
         if options.stepped:
             for fault in options.fault:
                 _machine_of(loop).inject(fault)
         stream = _stream(options.mcap, loop, last)
         keys = stack.enter_context(Keys())
+        if keys.is_terminal:
+            console.print(HELP, style="dim")
         stack.enter_context(stop_on_signals(loop.operator))
         stack.enter_context(_serving(loop, core, [keys, *pads], options.status and console.is_terminal, console))
         result = deploy(core, policy, options.seed, command, pads[0].command if pads else None)
@@ -91,7 +96,7 @@ def run(options: DeployOptions) -> int:
 
 def _results(result: Deployment, loop: ControlLoop) -> dict[str, Any]:
     """Return what ``--json`` prints; ``statistics`` count the steps of the ramp to the start pose too."""
-    found = {name: getattr(result, name) for name in ("reason", "well", "run")}
+    found = {name: getattr(result, name) for name in ("reason", "well", "run")} | {"files": loop.recorder.files}
     statistics = {f"{name}_ms" if _is_time(value) else name: value for name, value in result.statistics.items()}
     steps = {"steps": result.ticks, "steps_with_ramp": statistics.pop("ticks")}
     return found | steps | {"statistics": statistics, "limited": dict(loop.interventions)}
@@ -264,16 +269,16 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
 
 def _say_what_is_not_known(core: Core, policy: str, console: Console) -> None:
-    from wlr_gym.policy import contract_of, needs_camera
+    from wlr_gym.cli.robot_options import camera_note
+    from wlr_gym.policy import contract_of
 
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
     try:
         trained = contract_of(policy)["environment"]
     except InputError:  # an agent that was not trained
         trained = core.contract()
-    if needs_camera(trained) and not core.settings.has_camera:
-        note = "note: the slip observer is meant to have a camera, and none is named (--camera): expect worse tracking"
-        console.print(note, style="yellow")
+    if not core.settings.has_camera and (note := camera_note(trained)):
+        console.print(f"note: {note}", style="yellow")
 
 
 @contextlib.contextmanager
@@ -284,9 +289,7 @@ def _serving(
     from rich.live import Live
 
     from wlr_gym.cli.robot_status import RobotView
-    from wlr_gym.hardware.operator import HELP
 
-    console.print(HELP, style="dim")
     live = Live(console=console, auto_refresh=False, transient=True) if show else None
     view, count = RobotView(loop, core), 0
 
@@ -326,5 +329,5 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     console.print(f"command limiter, steps: {limited}")
     if camera := statistics.get("camera"):
         console.print(camera_line(camera))
-    if result.run is not None:
-        console.print(f"written: {result.run}", soft_wrap=True)
+    if written := [result.run] if result.run is not None else loop.recorder.files:
+        console.print(f"written: {', '.join(map(str, written))}", soft_wrap=True)

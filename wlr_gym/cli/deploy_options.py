@@ -75,6 +75,7 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
     if options.realtime is not None:
         require_priority("--realtime", options.realtime)
     _check_emulation(options)
+    _check_training(options)
     read_camera(options.camera, options.emulated)
     options.patch()  # a bad one is refused before a robot is started for it
     _check_faults(options)
@@ -95,6 +96,14 @@ def _check_emulation(options: DeployOptions) -> None:
         raise InputError("--effects: a real robot has its own; add --emulated")
     if options.emulated and options.port:
         raise InputError("--port: the emulated robot brings its own ports")
+
+
+def _check_training(options: DeployOptions) -> None:
+    from wlr_gym.policy import untrained
+
+    words = untrained(options.policy)
+    if words and not (options.emulated or options.dry_run):
+        raise InputError(f"{words}; a real robot moves with one of these, or with your own")
 
 
 def _check_faults(options: DeployOptions) -> None:

@@ -127,7 +127,7 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
     """Return whether a policy was made for this robot, its observations and its control period, and for its sensors."""
     from wlr_gym.hardware.safety.check import Check
     from wlr_gym.learning.evaluation.rollout import make_core
-    from wlr_gym.policy import check_contract, contract_of, environment_for, needs_camera
+    from wlr_gym.policy import camera_share, check_contract, contract_of, environment_for
 
     remedy = "Choose another policy, train it for this robot, or name the robot file it was trained with (--robot)."
     try:
@@ -138,13 +138,16 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
     except InputError as error:
         return [Check("policy", "contract", False, str(error), "one that fits", remedy)]
     checks = [Check("policy", "contract", True, f"{policy['agent']}, {policy['environment']['task']}", "", "")]
-    share = (policy["environment"].get("sensors") or {}).get("camera", 1.0)
-    if not has_camera and 0.0 < share < 1.0:
+    share = camera_share(policy["environment"])
+    if has_camera or not share:
+        return checks
+    if share <= 0.5:
         found = f"none; the policy had one in {share:.0%} of its training (docs/policies.md: what each task loses without)"
         checks.append(Check("policy", "camera", True, found, "", ""))
-    if needs_camera(policy["environment"]) and not has_camera:
+    else:
+        expected = f"one, as in {share:.0%} of its training"
         remedy = "Its slip observer goes by wheels and IMU alone: expect worse tracking. Name the camera (--camera FILE)."
-        checks.append(Check("policy", "camera", False, "none on this robot", "the one of its training", remedy, False))
+        checks.append(Check("policy", "camera", False, "none on this robot", expected, remedy, False))
     return checks
 
 
@@ -181,7 +184,7 @@ def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) ->
     counts = f"{counted(faults, 'fault')}, {counted(len(wrong) - faults, 'warning')} in {len(checks)} checks."
     console.print(Text(counts, "bold red" if faults else "bold yellow"))
     first = wrong[0]
-    console.print(Text(f"Begin with: {first.where}, {first.what}.", "bold"))
+    console.print(Text(f"Look first at the {first.what} of {first.where}; its line above says what to do.", "bold"))
     if registers := mendable(checks):
         repair = f"{counted(len(registers), 'register')} can be written, after a question: {_mend_command(options)}"
         console.print(Text(repair, "bold"))

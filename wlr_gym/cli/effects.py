@@ -1,6 +1,6 @@
 """List the effects that can be added to the nominal model, explain some, or check patch files.
 
-Without words the whole library; with names of effects their laws and numbers (unknown_effect: where formulas may act, and
+Without names the whole library; with names of effects their laws and numbers (unknown_effect: where formulas may act, and
 what they may depend on); with "check FILE ..." patches are read and applied to the robot, and what they change is printed.
 """
 
@@ -29,15 +29,15 @@ from wlr_gym.robot.parameters import Parameters
 
 @dataclass(frozen=True)
 class EffectsOptions(JsonOption):
-    words: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Names of effects, or: check FILE ..."""
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Effects to explain; or check FILE ...: patch files (.yaml), or names in configs/effects/, to read and apply."""
     robot: str = "nominal"
     """Robot that check applies the patches to: robot file, or name in configs/robot/."""
 
 
 def run(options: EffectsOptions) -> int:
     """Print the library, one effect, or what patch files change."""
-    match options.words:
+    match options.names:
         case () if options.json:
             print_json([_content(effect) for effect in EFFECTS.values()])
         case ():
@@ -45,7 +45,7 @@ def run(options: EffectsOptions) -> int:
             _show(("name", "where", "what is missing, and its law"), rows)
             print("one of them, with its numbers: wlr effects NAME; beyond the library: wlr effects unknown_effect")
         case ("check",):
-            raise InputError("wlr effects check: give the patch files to check")
+            raise InputError("give the patch files to check: wlr effects check FILE ...")
         case ("check", *files):
             _check([load_patch(file) for file in files], load_patch(list(files)), options)
         case (word, *_) if word not in EFFECTS and (hint := nearest(word, ["check"])):

@@ -40,8 +40,9 @@ def run(options: EnvsOptions) -> int:
     """Print the list or the description."""
     if options.env is not None:
         _describe(options.env, options)
-    elif any(value is not None for value in (options.robot, options.randomization, options.picture)):
-        raise InputError("name the environment too, such as: wlr envs WLR-Velocity-v0 --randomization wide")
+    elif given := [name for name in ("robot", "randomization", "picture") if getattr(options, name) is not None]:
+        words = f"--{given[0]} {getattr(options, given[0])}"
+        raise InputError(f"{words}: name the environment too: wlr envs WLR-Velocity-v0 {words}")
     else:
         _list(options)
     return OK

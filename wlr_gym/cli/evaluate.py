@@ -16,7 +16,16 @@ from wlr_gym.base.files import output_folder, refuse_existing
 from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, settings_of
+from wlr_gym.cli.options import (
+    ForceOption,
+    JsonOption,
+    PatchOption,
+    SensorsOption,
+    environment_of,
+    note_untrained,
+    require_counts,
+    settings_of,
+)
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import task_name_of
@@ -121,11 +130,13 @@ def run(options: EvaluateOptions) -> int:
     """Play, print the card, write it."""
     if not options.policy:
         raise InputError("no policy given; see: wlr evaluate --help")
+    require_counts(options, "episodes", "blocks", "other_episodes", "sweep_episodes", "threads")
     options.present()  # what cannot be is refused before anything is written
     if options.accept:
         return _accept(options)
     options = _complete(options)
     _check(options)
+    _note_untrained(options)
     patch = options.patch()
     if options.out is not None:
         options.refuse_results(options.out, "card.json")
@@ -163,6 +174,7 @@ def _accept(options: EvaluateOptions) -> int:
     given = [name for name, value in card_only.items() if value]
     if given:
         raise InputError(f"--accept: {given[0]} is of the card; leave it out")
+    _note_untrained(options)
     if options.out is not None:
         refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
     with output_folder(options.out), _progress(options.progress) as tell:
@@ -187,6 +199,11 @@ def _accept(options: EvaluateOptions) -> int:
         print(f"written: {options.out / ACCEPTANCE_FILE}")
     print("accepted" if result.accepted else f"refused: {len(result.refused)} losses may be above {result.largest_loss:g} %")
     return OK if result.accepted else FAILED
+
+
+def _note_untrained(options: EvaluateOptions) -> None:
+    subjects = read_subjects([options.policy, *(options.baselines or ())])
+    note_untrained(source for subject in subjects for source in subject.sources)
 
 
 def _shown(card: Card, subject: Subject) -> Subject:

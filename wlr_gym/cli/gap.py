@@ -22,7 +22,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.progress import progress
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.gap_decide import DecideOptions, print_rounds, recorder_of
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_threads, settings_of
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_counts, settings_of
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
@@ -157,7 +157,8 @@ def _check(options: GapOptions) -> None:
     for name in options.heldout:
         if runs and name not in runs:
             raise unknown_name("run", name, runs, "--heldout")
-    require_threads(options.threads)
+    require_counts(options, "threads")
+    require_counts(options, "budget_runs", "budget_seconds", least=0)
 
 
 def _known(options: GapOptions) -> Patch:
@@ -174,6 +175,7 @@ def _known(options: GapOptions) -> Patch:
 
 
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
+    from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.report.folder import REPORT_FILE
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
     from wlr_gym.gap.report.text import closure, made_worse, sentence, title
@@ -183,7 +185,10 @@ def _print(analysis: Analysis, out: Path, console: Console) -> None:
     said = [sentence(analysis), *filter(None, [made_worse(analysis), closure(analysis)])]
     for line in (*said, *_findings(analysis), *_numbers(analysis), *_advice(analysis)):
         console.print(line, markup=False)
-    for label, name in (("report", REPORT_FILE), ("result", RESULT_FILE), ("patch", PATCH_FILE)):
+    files = [("report", REPORT_FILE), ("result", RESULT_FILE)]
+    if analysis.verdict != BAD_DATA:
+        files.append(("patch", PATCH_FILE))
+    for label, name in files:
         console.print(f"{label}: {out / name}", markup=False)
 
 

@@ -92,6 +92,8 @@ def _check(options: ImportOptions) -> None:
     for log in options.log:
         if not log.exists():
             raise InputError(f"{log}: no such file or folder")
+    if options.split is not None and not options.split > 0.0:
+        raise InputError(f"--split {options.split:g}: expected more than 0 s")
     if options.out is None and not options.suggest:
         raise InputError("--out: expected a folder for the runs")
 

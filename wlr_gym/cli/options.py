@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -88,10 +90,20 @@ def require_simulator(backend: str, robot: str) -> None:
     check_simulator(backend, "--backend")
 
 
-def require_threads(threads: int | None) -> None:
-    """Raise :class:`InputError` where ``--threads`` is below 1; None = all cores."""
-    if threads is not None and threads < 1:
-        raise InputError(f"--threads {threads}: expected 1 or more")
+def require_counts(options: object, *names: str, least: int = 1) -> None:
+    """Raise :class:`InputError` for the first of some options that is below the least; None = left open."""
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and not value >= least:
+            raise InputError(f"--{name.replace('_', '-')} {value:g}: expected {least} or more")
+
+
+def note_untrained(sources: Iterable[str]) -> None:
+    """Say which of some policies is one before any training."""
+    from wlr_gym.policy import untrained
+
+    for words in filter(None, map(untrained, sources)):
+        print(f"note: {words}", file=sys.stderr)
 
 
 def settings_of(options: Any) -> dict[str, Any]:

@@ -15,7 +15,15 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import tracked
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, SensorsOption, environment_of, require_simulator
+from wlr_gym.cli.options import (
+    ForceOption,
+    JsonOption,
+    PatchOption,
+    SensorsOption,
+    environment_of,
+    note_untrained,
+    require_simulator,
+)
 from wlr_gym.cli.results import print_json
 from wlr_gym.render.camera import CAMERAS
 from wlr_gym.render.display import require_display
@@ -91,6 +99,7 @@ def run(options: PlayOptions) -> int:
     keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
     keywords |= {"effects": options.patch(), **having(options.present())}
     own = environment_for(options.agent, keywords)
+    note_untrained([options.agent, *([options.beside] if options.beside else [])])
     keywords["robot"] = own["robot"]  # a second one drives the same robot
     with closing(make_core(environment_of(options.env, options.agent), 1, own)) as core:
         policy = make_policy(options.agent, core.contract())

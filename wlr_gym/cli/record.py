@@ -33,9 +33,9 @@ class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
     """Record runs.
 
     Attributes:
-        excitation: motions to drive, by name; several make a data set.
+        excitation: motions to drive, by name, see: wlr record --list; several make a data set.
         commands: files with setpoints to drive: of --commands-only, or of whole runs.
-        out: folder for the runs; made if it is not there.
+        out: folder for the runs, made if it is not there; needed for all but --list.
         backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
         seed: seed of the motions (default: 0), and of the noise of a simulator or an emulated robot.
         noise_seed: seed of an emulated robot's noise: noise_seed of a run's events repeats it (with the same --seed); default:
@@ -129,12 +129,14 @@ def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
 def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
     """Limited and logged; between the motions the operator carries the robot back."""
     from wlr_gym.hardware.driving import drive_robot
+    from wlr_gym.hardware.safety.preflight import require_ports
 
     assert options.out is not None
     found: list[dict[str, object]] = []
     code = OK
     for motion in motions:
         if not (options.emulated or options.yes):
+            require_ports(options.load_hardware())
             confirm(motion, robot, console)
         seed = noise_seed(options.out, options.seed) if options.noise_seed is None else options.noise_seed
         with closing(options.plant_of(options.load()[0], options.out, meta, options.patch(), seed)) as plant:
@@ -159,6 +161,7 @@ def _results(options: RecordOptions, found: Sequence[dict[str, object]]) -> None
 
 
 def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
+    from wlr_gym.base.text import counted
     from wlr_gym.data import read_run
 
     ended = drive.reason or "to its end"
@@ -168,7 +171,8 @@ def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
     )
     changed = drive.statistics["interventions"]
     if changed:
-        console.print(f"  command limiter: {', '.join(f'{rule} in {count} steps' for rule, count in changed.items())}")
+        limited = ", ".join(f"{rule} in {counted(count, 'step')}" for rule, count in changed.items())
+        console.print(f"  command limiter: {limited}")
     if drive.run is not None:
         console.print(f"  written: {drive.run}")
         for finding in read_run(drive.run).findings if drive.ticks > 1 else ():

@@ -73,7 +73,7 @@ def run(options: ReplayOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.data.read import read_runs
-    from wlr_gym.data.replay import prepare
+    from wlr_gym.data.replay import LEAD, prepare
     from wlr_gym.data.replay_plots import save_plots
     from wlr_gym.physics.plants import REAL, check_backend
     from wlr_gym.render.video import check_video
@@ -87,6 +87,8 @@ def run(options: ReplayOptions) -> int:
         raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
     if options.video is not None:
         check_video(options.video)
+    if not options.segment > LEAD:
+        raise InputError(f"--segment {options.segment:g}: expected more than {LEAD:g} s")
     runs = read_runs(options.runs)
     patch = options.patch()
     options.refuse_results(options.out, ERRORS_FILE)

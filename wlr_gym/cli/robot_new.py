@@ -74,7 +74,9 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     try:
         robot = robot_over(options.base, name, numbers, options.out, check=False)
     except InputError as error:
-        raise InputError(f"{error}; your answers: {_as_options(answers)}") from None
+        why = "; ".join(_unusual(answers)) or str(error)
+        kept = "" if options.yes else f"; your answers: {_as_options(answers)}"
+        raise InputError(f"{why}{kept}") from None
     title = (
         f"Written by wlr robot new. SI units, radians; what is not here is as in '{options.base}'.",
         "[given] an answer or its default; [derived] computed from the answers and the base.",
@@ -100,6 +102,14 @@ def _asked(question: Question, default: Any, ask: Callable[[str], str]) -> Any:
             return question.read(answer)
         except InputError as error:
             print(error)
+
+
+def _unusual(answers: Mapping[str, Any]) -> list[str]:
+    """Return what is outside the usual, in words."""
+    from wlr_gym.physics.feasibility import unusual
+
+    lists = {key: value if isinstance(value, list) else [value] for key, value in answers.items()}
+    return [str(finding) for key, values in lists.items() for finding in unusual(key, values)]
 
 
 def _as_options(answers: Mapping[str, Any]) -> str:

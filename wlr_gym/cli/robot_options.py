@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.seeds import LARGEST_SEED
@@ -189,6 +189,21 @@ def read_camera(source: str | None, is_emulated: bool) -> CameraFile | None:
             "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
         )
     return None if source is None else load_camera_file(source)
+
+
+def camera_note(environment: Mapping[str, Any]) -> str:
+    """Return what to expect of a policy without a camera that had one in most of its training; empty = nothing.
+
+    Args:
+        environment: its contract's.
+    """
+    from wlr_gym.policy import camera_share
+
+    share = camera_share(environment)
+    if share <= 0.5:
+        return ""
+    had = "the slip observer is meant to have" if share >= 1.0 else f"in {share:.0%} of its training the policy had"
+    return f"{had} a camera, and none is named (--camera): expect worse tracking"
 
 
 def confirm(motion: Motion, robot: Robot, console: Console) -> None:

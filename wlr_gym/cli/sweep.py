@@ -14,7 +14,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
 from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import JsonOption, ray_address
+from wlr_gym.cli.options import JsonOption, ray_address, require_counts
 from wlr_gym.cli.results import print_json
 from wlr_gym.learning.sweep.page import PAGE_FILE, name_of
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
@@ -53,6 +53,7 @@ class SweepOptions(JsonOption):
 def run(options: SweepOptions) -> int:
     """Train, say how it goes, and print where table and page are."""
     ray = ray_address(options.ray)
+    require_counts(options, "workers")
     if options.resume is not None:
         _require_own_plan(options)
         found = resume_sweep(options.resume, ray=ray, workers=options.workers, say=_say)
@@ -77,8 +78,7 @@ def _plan(options: SweepOptions) -> SweepPlan:
     """Return the plan of a file, of the options, or of a file with options laid over it."""
     if options.what is None:
         raise InputError("expected the file of a sweep, or an environment id (see: wlr envs)")
-    if options.seeds is not None and options.seeds < 1:
-        raise InputError(f"--seeds {options.seeds}: expected 1 or more")
+    require_counts(options, "seeds")
     changes: dict[str, Any] = {"imports": list(IMPORTED)} if IMPORTED else {}
     given = {"config": options.config, "agent": options.agent, "init": options.init, "seeds": options.seeds}
     changes |= {name: value for name, value in given.items() if value is not None}

@@ -17,7 +17,7 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
 from wlr_gym.cli.results import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
-from wlr_gym.policy import Training, TrainingProgress
+from wlr_gym.policy import Training, TrainingProgress, find_policy
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,9 @@ def run(options: TrainOptions) -> int:
     elif options.total_steps is not None:
         raise InputError(f"--total-steps goes with --resume; of a new training: --set total_steps={options.total_steps}")
     else:
-        environment = options.env or "WLR-Velocity-v0" if options.init is None else environment_of(options.env, options.init)
+        environment = (
+            options.env or "WLR-Velocity-v0" if options.init is None else environment_of(options.env, find_policy(options.init))
+        )
         config = _config(options, environment)
         folder = unused(options.out or default_folder(options, environment, config))
         training = Training(environment, folder, config, False, seconds, options.progress, options.init, updates.append)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.text import row_words
 from wlr_gym.data.format import CAMERA, CHANNELS, COLUMNS, FLOW, REQUIRED
 from wlr_gym.robot import JOINTS, WHEELS
 
@@ -141,10 +142,11 @@ def _check_values(table: Table, where: str) -> None:
         infinite = np.isinf(values)
         if infinite.any():
             row = int(np.argmax(infinite))
-            raise InputError(f"{where}: row {row}, column '{name}': {values[row]:g}; expected a finite number")
+            raise InputError(f"{where}: {row_words(where, row)}, column '{name}': {values[row]:g}; expected a finite number")
         nan = np.isnan(values)
         if nan.any() and COLUMNS[name].required and not COLUMNS[name].may_be_nan:
-            raise InputError(f"{where}: row {int(np.argmax(nan))}, column '{name}': no value, but this column must have one")
+            place = f"{where}: {row_words(where, int(np.argmax(nan)))}, column '{name}'"
+            raise InputError(f"{place}: no value, but this column must have one")
 
 
 def _check_clock(t: Array, where: str) -> None:
@@ -152,13 +154,14 @@ def _check_clock(t: Array, where: str) -> None:
     if back.any():
         row = int(np.argmax(back)) + 1
         raise InputError(
-            f"{where}: row {row}, column 't': {t[row]:.6f} s does not come after {t[row - 1]:.6f} s; t must increase: "
-            "split the run where a clock was set back, or record it again with a monotonic clock"
+            f"{where}: {row_words(where, row)}, column 't': {t[row]:.6f} s does not come after {t[row - 1]:.6f} s; "
+            "t must increase: split the run where a clock was set back, or record it again with a monotonic clock"
         )
     period = float(np.median(np.diff(t)))
     if period > 1.0:
         raise InputError(
-            f"{where}: row 1, column 't': rows are {period:g} s apart, expected {NOMINAL_PERIOD:g} s; looks like milliseconds"
+            f"{where}: {row_words(where, 1)}, column 't': rows are {period:g} s apart, expected {NOMINAL_PERIOD:g} s; "
+            "looks like milliseconds"
         )
 
 
@@ -185,7 +188,8 @@ def _magnitudes(table: Table, name: str, rate: bool) -> tuple[NDArray[np.intp], 
 
 
 def _unit_mistake(where: str, row: int, name: str, value: float, looks_like: str) -> InputError:
-    return InputError(f"{where}: row {row}, column '{name}': {value:g}; expected {COLUMNS[name].unit}, looks like {looks_like}")
+    place = f"{where}: {row_words(where, row)}, column '{name}'"
+    return InputError(f"{place}: {value:g}; expected {COLUMNS[name].unit}, looks like {looks_like}")
 
 
 def _check_consistency(table: Table, where: str) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.base.text import row_words
 from wlr_gym.data.check import Finding, check_names, check_table
 from wlr_gym.data.format import META_FILE, SUFFIXES, RunMeta
 from wlr_gym.data.simulation_record import Simulation, read_simulation
@@ -161,7 +162,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
     check_names(header, str(path))
     for index, row in enumerate(rows[1:]):
         if len(row) != len(header):
-            raise InputError(f"{path}: row {index} has {len(row)} values, the header {len(header)} columns")
+            raise InputError(f"{path}: {row_words(path, index)} has {len(row)} values, the header {len(header)} columns")
     cells = zip(*rows[1:], strict=True) if len(rows) > 1 else ([] for _ in header)
     return {name: _numbers(column, name, path) for name, column in zip(header, cells, strict=True)}
 
@@ -172,7 +173,7 @@ def _numbers(cells: tuple[str, ...] | list[str], name: str, path: Path) -> Array
         try:
             numbers.append(float(cell) if cell.strip() else np.nan)
         except ValueError:
-            raise InputError(f"{path}: row {row}, column '{name}': '{cell}' is not a number") from None
+            raise InputError(f"{path}: {row_words(path, row)}, column '{name}': '{cell}' is not a number") from None
     return np.array(numbers, np.float64)
 
 

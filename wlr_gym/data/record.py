@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.base.seeds import LARGEST_NOISE_SEED, require_seed
+from wlr_gym.base.text import row_words
 from wlr_gym.data.compared_plants import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
@@ -25,7 +26,7 @@ from wlr_gym.data.write import write_csv, write_meta, write_run
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.robot import JOINTS, WHEEL_SLICE, Robot
+from wlr_gym.robot import JOINTS, LEGS, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -70,7 +71,9 @@ def read_commands(path: Path) -> Motion:
         wanted = ("t", *COMMANDS)
         missing = [name for name in wanted if name not in table.columns]
         if missing:
-            raise InputError(f"{path}: column '{missing[0]}' is missing")
+            found = ", ".join(map(str, table.columns[:10]))
+            hint = "; separated by ';'? expected ','" if ";" in found else ""
+            raise InputError(f"{path}: column '{missing[0]}' is missing{hint}; found: {found}")
         columns = table[list(wanted)].to_numpy(np.float64)
     except (OSError, UnicodeDecodeError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
@@ -80,8 +83,11 @@ def read_commands(path: Path) -> Motion:
     if len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
         raise InputError(f"{path}: column 't': expected two rows or more, finite and increasing")
     if (beyond := np.abs(np.nan_to_num(setpoints)) > _LARGEST).any() or np.isinf(setpoints).any():
-        row, joint = np.argwhere(beyond | np.isinf(setpoints))[0]
-        raise InputError(f"{path}: row {row}, column 'cmd_{JOINTS[joint]}': {setpoints[row, joint]:g}: expected rad and rad/s")
+        row, joint = map(int, np.argwhere(beyond | np.isinf(setpoints))[0])
+        unit, other = ("rad", "degrees") if joint < len(LEGS) else ("rad/s", "degrees/s or rpm")
+        place = f"{row_words(path, row)}, column 'cmd_{JOINTS[joint]}': {setpoints[row, joint]:g}"
+        most = _LARGEST[joint]
+        raise InputError(f"{path}: {place}: expected {-most:.3g} to {most:.3g} {unit}; in {other}?")
     return Motion(path.stem, setpoints[_held_rows(t - t[0])], CONTROL_PERIOD, read_meta(path.parent).profile)
 
 

@@ -24,7 +24,7 @@ _TYPES: dict[str, tuple[tuple[type, ...], str]] = {
     "robot": ((str, Path, Mapping, Robot, type(None)), "a name, a path, a mapping or a Robot"),
     "randomization": ((str, Path, Mapping, RandomizationConfig, type(None)), "a name, a path or a mapping"),
     "task": ((str, Path, Mapping, type(None)), "a name, a path or a mapping"),
-    "effects": ((str, Path, Mapping, list, tuple, Patch, type(None)), "a path or a list of effects"),
+    "effects": ((str, Path, Mapping, list, tuple, Patch, type(None)), "a name, a path, a mapping or a list of these"),
     "episode_length": ((Real, type(None)), "a time above 0 s"),
     "observation": ((str,), "a name"),
     "free_wheels": ((Iterable,), "a list of wheels, such as ['wheel_lf']"),
@@ -161,6 +161,14 @@ class Settings:
         return read_view(self.view)
 
 
+#: What is no keyword of an environment -> where it belongs.
+_ELSEWHERE = {
+    "num_envs": "; several at once: gymnasium.make_vec(ID, num_envs=4)",
+    "seed": "; it goes to env.reset(seed=3)",
+    "sensors": '; it is of the task: task={"sensors": {"camera": 1.0}}',
+}
+
+
 class UnknownOptionError(InputError, TypeError):
     """An option that does not exist. Also a TypeError, worded as Python words it: that is what other libraries probe for."""
 
@@ -174,8 +182,9 @@ def read_settings(options: Mapping[str, Any]) -> Settings:
     valid = [*EnvironmentOptions.__annotations__, "render_mode"]
     for option in options:
         if option not in valid:
+            hint = _ELSEWHERE.get(option) or nearest(option, valid)
             raise UnknownOptionError(
-                f"environment: got an unexpected keyword argument '{option}'{nearest(option, valid)}; valid: {', '.join(valid)}"
+                f"environment: got an unexpected keyword argument '{option}'{hint}; valid: {', '.join(valid)}"
             )
     given = dict(options)
     if "plant" in given:

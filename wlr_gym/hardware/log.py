@@ -126,6 +126,12 @@ class RunLog:
         """Where the run will be once it is finished."""
         return self.folder / f"{self.name('run')}.csv"
 
+    @property
+    def files(self) -> list[Path]:
+        """What is there of the tables and events, once they are finished."""
+        tables = [table.path for table in self._tables.values()]
+        return [path for path in (*tables, self.run.with_suffix(".events.jsonl")) if path.is_file()]
+
     def begin(self, kind: str) -> None:
         """Write rows to ``ramp`` or ``run`` from here on."""
         self._current = kind
@@ -219,6 +225,11 @@ class RunRecorder:
     def run(self) -> Path | None:
         """The last run, once it is finished; None where nothing was logged."""
         return self.log.run if self.log is not None and self.log.run.is_file() else None
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of the last start, once they are finished; of one that ended before its run, the way to its start pose."""
+        return [] if self.log is None else self.log.files
 
     def new_run(self, checks: list[str] | None = None) -> None:
         """Begin a log with what the preflight found; None = it was not made again."""

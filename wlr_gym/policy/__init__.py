@@ -2,7 +2,7 @@
 
 from wlr_gym.policy.agents import Agent, Policy, Training, TrainingProgress, agent_names, load_agent, load_agent_config
 from wlr_gym.policy.export import Parity, export_policy, exportable
-from wlr_gym.policy.file import check_contract, needs_camera, read_contract, write_contract
+from wlr_gym.policy.file import camera_share, check_contract, needs_camera, read_contract, write_contract
 from wlr_gym.policy.model_card import write_model_card
 from wlr_gym.policy.reseal import reseal
 from wlr_gym.policy.sources import (
@@ -16,6 +16,7 @@ from wlr_gym.policy.sources import (
     policy_environment,
     shipped_names,
     trained_environment,
+    untrained,
 )
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "Training",
     "TrainingProgress",
     "agent_names",
+    "camera_share",
     "check_contract",
     "contract_of",
     "environment_for",
@@ -43,6 +45,7 @@ __all__ = [
     "reseal",
     "shipped_names",
     "trained_environment",
+    "untrained",
     "write_contract",
     "write_model_card",
 ]

@@ -173,7 +173,13 @@ def differences(name: str, mine: Any, theirs: Any) -> Iterator[tuple[str, Any, A
         yield name, mine, theirs
 
 
+def camera_share(environment: Contract) -> float:
+    """Return in which share of its training what a policy is fed rested on camera poses, through the slip observer."""
+    if not (environment.get("observer") or {}).get("camera"):
+        return 0.0
+    return (environment.get("sensors") or {}).get("camera", 1.0)
+
+
 def needs_camera(environment: Contract) -> bool:
-    """Whether what a policy is fed rests on camera poses, through the slip observer, and it never did without."""
-    always = (environment.get("sensors") or {}).get("camera", 1.0) >= 1.0
-    return always and bool((environment.get("observer") or {}).get("camera"))
+    """Whether what a policy is fed rests on camera poses, and it never did without."""
+    return camera_share(environment) >= 1.0

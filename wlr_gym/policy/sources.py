@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.settings import merge_changes
-from wlr_gym.policy.agents import Contract, Policy, agent_function, agent_names, load_agent_config
+from wlr_gym.policy.agents import Contract, Policy, agent_function, agent_names, load_agent, load_agent_config
 from wlr_gym.policy.file import CONTRACT_FILE, check_contract, read_contract
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy
 
@@ -61,8 +61,19 @@ def is_policy(source: str | Path) -> bool:
     return str(source) in agent_names() or _policy_place(source) is not None
 
 
-def find_policy(source: str | Path) -> Path:
+def untrained(source: str | Path) -> str:
+    """Return what to say of the name of an agent whose training begins with a random policy; empty = it is none."""
+    if str(source) not in agent_names() or not hasattr(load_agent(str(source)), "settings_to_start_from"):
+        return ""
+    return f"'{source}' is the agent before any training; trained ones: {', '.join(shipped_names())}"
+
+
+def find_policy(source: str | Path, or_agent: bool = False) -> Path:
     """Return the policy folder or file of a trained policy.
+
+    Args:
+        source: as of :func:`load_policy`.
+        or_agent: an agent's name would have done, too; the message lists them.
 
     Raises:
         InputError: there is none; the message lists the names there are.
@@ -76,10 +87,11 @@ def find_policy(source: str | Path) -> Path:
         raise InputError(f"'{source}': not a policy: expected a folder, or a file {SUFFIX}")
     if str(source) in agent_names():
         raise InputError(f"'{source}' is an agent: expected a trained policy (folder, file {SUFFIX} or shipped policy)")
-    hint = nearest(str(source), [*agent_names(), *shipped_names()])
+    agents = agent_names() if or_agent else []
+    kinds, listed = (", an agent", f"agents: {', '.join(agents)}; ") if agents else ("", "")
     raise InputError(
-        f"'{source}' is no policy: neither a folder, a file {SUFFIX}, an agent nor a shipped policy{hint}; "
-        f"agents: {', '.join(agent_names())}; shipped: {', '.join(shipped_names()) or 'none'}"
+        f"'{source}' is no policy: neither a folder, a file {SUFFIX}{kinds} nor a shipped policy"
+        f"{nearest(str(source), [*agents, *shipped_names()])}; {listed}shipped: {', '.join(shipped_names()) or 'none'}"
     )
 
 
@@ -130,6 +142,7 @@ def make_policy(source: str | Path, environment: Contract) -> Policy:
     """
     if str(source) in agent_names():
         return agent_function(str(source), "make_policy")(environment, load_agent_config(source))
+    find_policy(source, or_agent=True)
     return load_policy(source, environment)
 
 
@@ -153,7 +166,7 @@ def policy_environment(source: str | Path) -> dict[str, Any]:
         if _policy_place(source) is not None:
             raise InputError(f"'{source}' is an agent, and a policy in this folder: give ./{source}, or rename the policy")
         return fed_environment(load_agent_config(source).get("environment") or {})
-    contract = contract_of(source)
+    contract = contract_of(find_policy(source, or_agent=True))
     robot = robot_of_contract(contract)
     own = fed_environment(contract["config"].get("environment") or {})
     if FED_AS in own.get("task", {}):
@@ -214,4 +227,4 @@ def trained_environment(source: str | Path) -> str | None:
     """
     if str(source) in agent_names():
         return None
-    return contract_of(source).get("training", {}).get("environment")
+    return contract_of(find_policy(source, or_agent=True)).get("training", {}).get("environment")

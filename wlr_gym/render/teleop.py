@@ -169,9 +169,13 @@ def stick_commands(ranges: Ranges, sticks: Sequence[float]) -> dict[str, float]:
 
 
 def _glfw() -> Any:
+    import warnings
+
     import glfw
 
-    if not glfw.init():
+    with warnings.catch_warnings(action="ignore", category=glfw.GLFWError):  # said below
+        has_started = glfw.init()
+    if not has_started:
         raise InputError("GLFW does not start, so there is no gamepad: use the keyboard, or a display")
     return glfw
 

@@ -75,7 +75,7 @@ def test_times_to_one_nanosecond(t):
 def test_rows_less_than_a_nanosecond_apart_are_refused(tmp_path):
     table = {name: np.zeros(3) for name in REQUIRED} | {"t": np.array([1.0, 1.0 + 3e-10, 2.0])}
     run = Run(pandas.DataFrame(table), RunMeta(), tmp_path / "run_01.csv")
-    with pytest.raises(InputError, match=r"run_01.csv: row 1, column 't': less than 1 ns"):
+    with pytest.raises(InputError, match=r"run_01.csv: row 1 \(line 3\), column 't': less than 1 ns"):
         export_run(run, tmp_path / "a.mcap")
     assert not list(tmp_path.iterdir())
 

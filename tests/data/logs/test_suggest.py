@@ -1,6 +1,7 @@
 """A log with other names, units, axes and clocks comes in right by a proposed map."""
 
 import numpy as np
+import pandas
 import pytest
 from foreign_logs import (
     NAMES,
@@ -192,3 +193,10 @@ def test_unknown_names_need_a_line_each(tmp_path):
     assert found.channels["pos"].unit == "deg"
     assert found.joints["leg_rf"].name == "partb"
     assert set(NAMES) == set(found.joints)
+
+
+def test_a_name_unlike_those_beside_it_is_a_guess(table, tmp_path):
+    frame = pandas.DataFrame(rows_of(table)).rename(columns={"pos_leg_lf": "pos_leg_fl"})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    guessed = {one.what: one.sure for one in suggest_map(tmp_path / "log.csv").reasons if "is taken for it" in one.why}
+    assert guessed == {"pos_leg_lf": "guess"}

@@ -87,6 +87,7 @@ def test_rows_show_nothing_where_there_is_nothing():
 def test_next_to_nothing_has_no_sign():
     assert cell(Estimate(-0.2, -0.4, 0.3), 0) == "0 [0, 0]"
     assert cell(Estimate(5000.0, 1.0, 9000.0), 0) == "-"
+    assert cell(Estimate(2.0, np.nan, np.nan), 1, short=True) == cell(Estimate(2.0, np.nan, np.nan), 1) == "2.0"
 
 
 @pytest.fixture(scope="module")

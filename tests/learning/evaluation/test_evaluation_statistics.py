@@ -81,3 +81,8 @@ def test_quantiles_of_resampled_episodes():
     assert resampling.mean(pairs(values), 0.5).mean == pytest.approx(
         np.mean([np.quantile(values[seed], 0.5, method="inverted_cdf") for seed in range(2)])
     )
+
+
+def test_one_episode_has_no_interval():
+    assert np.isnan(Bootstrap(1, 1).mean(np.ones((1, 1, 1, 2))).low)
+    assert Bootstrap(1, 2).mean(np.ones((1, 1, 2, 2))).low == 1.0

@@ -186,7 +186,7 @@ def test_options_are_laid_over_a_file(tmp_path):
         ([], "environment id"),
         ([ENVIRONMENT, "--set", "learning_rte=1e-3,2e-3"], "did you mean 'learning_rate'"),
         ([ENVIRONMENT, "--set", "gamma"], "--set gamma"),
-        ([ENVIRONMENT, "--workers", "0"], "workers = 0"),
+        ([ENVIRONMENT, "--workers", "0"], "--workers 0: expected 1 or more"),
         ([ENVIRONMENT, "--search", "none.yaml"], "none.yaml"),
         (["--resume", "nothing_there"], "sweep.yaml is missing"),
         (["--resume", "somewhere", "--seeds", "3"], "as it was planned"),

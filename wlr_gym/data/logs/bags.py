@@ -14,6 +14,8 @@ from wlr_gym.data.logs.definitions import Definitions, UnknownTypeError, full_na
 from wlr_gym.data.logs.topics import Message, Share, cannot_read
 
 METADATA = "metadata.yaml"
+#: How every file of rosbag1 begins.
+ROSBAG1 = b"#ROSBAG V"
 
 
 def messages(path: Path, wants: Callable[[str], bool], notes: list[str], tell: Share) -> Iterator[Message]:
@@ -89,9 +91,16 @@ def _open(path: Path) -> Any:
         if len(files) != 1:
             raise ValueError(f"no {METADATA}, and {len(files)} .db3 files: name one of them")
         path = files[0]
+    if _is_rosbag1(path) and not _begins_with(path, ROSBAG1):
+        raise ValueError(f"it does not begin with {ROSBAG1.decode()}")
     reader = Reader1(path) if _is_rosbag1(path) else Reader2(path)
     reader.open()
     return reader
+
+
+def _begins_with(path: Path, magic: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic
 
 
 def _is_rosbag1(path: Path) -> bool:

@@ -56,6 +56,7 @@ def propose(log: Log, robot: Robot, given: Mapping[str, Any] | None = None) -> P
     look = _look(log, robot, known)
     _unnamed(look)
     _no_pose(look)
+    _other_names(look)
     body = find_pose(look)
     joints = find_joints(look, body)
     if body is None:
@@ -106,6 +107,14 @@ def _no_pose(look: LogSignals) -> None:
     if others and not look.has("cam_x") and not any(key.startswith("cam") for key in look.given.channels):
         text = f"not proposed: the poses of {', '.join(others)} are not known to be the body's; name one in the map if it is"
         look.note("cam", GUESS, text)
+
+
+def _other_names(look: LogSignals) -> None:
+    """Say which fields are taken for a channel of another name, where most have the very names of our channels."""
+    others = [one for column, one in look.chosen.items() if one.field != column]
+    for one in others if 2 * len(others) < len(look.chosen) else ():
+        text = f"'{one.field}' of topic '{one.topic}' is taken for it; most others have the very names of our channels"
+        look.note(one.column, GUESS, text)
 
 
 def _leave_out_short(log: Log, chosen: dict[str, FieldCandidate]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import replace_file
+from wlr_gym.base.text import row_words
 from wlr_gym.data.logs.display import display_messages
 from wlr_gym.data.logs.messages import Sent, clock_offset, definition, nanoseconds, row_messages, run_message, typestore
 from wlr_gym.data.read import Run
@@ -87,7 +88,7 @@ def messages_of(run: Run) -> Iterator[Sent]:
     times = [nanoseconds(t, offset) for t in run["t"].tolist()]
     close = np.flatnonzero(np.diff(np.array(times, np.int64)) <= 0)
     if len(close):
-        raise InputError(f"{run.path}: row {close[0] + 1}, column 't': less than 1 ns after the row before")
+        raise InputError(f"{run.path}: {row_words(run.path, close[0] + 1)}, column 't': less than 1 ns after the row before")
     columns = [str(name) for name in run.table.columns]
     robot = own_robot(run.meta, run.path.parent)
     yield run_message(columns, times[0], offset, run.meta, run.simulation, run.name, robot)

@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.text import row_words
 from wlr_gym.gap.rig.own import CLOCK, Rig
 
 Array = NDArray[np.float64]
@@ -66,16 +67,20 @@ def _run(path: Path, rig: Rig) -> RigRun:
     for name, values in ((CLOCK, t), *zip(rig.inputs, inputs.T, strict=True)):
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values.ravel())))
-            raise InputError(f"{path}: column '{name}', row {row}: expected a finite number, as it drives the simulation")
+            raise InputError(
+                f"{path}: column '{name}', {row_words(path, row)}: expected a finite number, as it drives the simulation"
+            )
     if (np.diff(t[:, 0]) <= 0.0).any():
         row = int(np.argmax(np.diff(t[:, 0]) <= 0.0)) + 1
         raise InputError(
-            f"{path}: column '{CLOCK}', row {row}: expected times that rise, got {t[row, 0]:g} after {t[row - 1, 0]:g}"
+            f"{path}: column '{CLOCK}', {row_words(path, row)}: expected times that rise, "
+            f"got {t[row, 0]:g} after {t[row - 1, 0]:g}"
         )
     for name, values in zip(columns, measured.T, strict=True):
         if np.isinf(values).any():
             raise InputError(
-                f"{path}: column '{name}', row {int(np.argmax(np.isinf(values)))}: infinite; expected a finite number"
+                f"{path}: column '{name}', {row_words(path, int(np.argmax(np.isinf(values))))}: infinite; "
+                "expected a finite number"
             )
         if not np.isfinite(values).any():
             raise InputError(f"{path}: column '{name}' holds no number")

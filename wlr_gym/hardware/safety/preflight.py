@@ -79,6 +79,15 @@ def open_ports(servos: Servos, imu: Imu, hardware: Hardware, flow: Flow | None =
     return checks
 
 
+def require_ports(hardware: Hardware) -> None:
+    """Raise :class:`InputError` where a port is not there: nobody needs to stand ready then."""
+    for name, path in ({name: bus.port for name, bus in hardware.buses.items()} | {"imu": hardware.imu.port}).items():
+        if not Path(path).exists():
+            raise InputError(
+                f"{name} port {path}: not there; plug it in, or name its port with --port {name}=PATH; {_ports_here()}"
+            )
+
+
 def _ports_here(devices: Path = Path("/dev")) -> str:
     """Serial ports of this computer, those with stable names first."""
     named = sorted((devices / "serial" / "by-id").glob("*")) if (devices / "serial" / "by-id").is_dir() else []

@@ -39,9 +39,14 @@ def _value(metric: Metric, scores: Scores, short: bool) -> str:
 
 
 def cell(estimate: Estimate, digits: int, short: bool = False, largest: float = LARGEST) -> str:
-    """Return ``mean [low, high]``, or ``mean ± half``; ``-`` where there is nothing or nothing to compare with."""
+    """Return ``mean [low, high]``, or ``mean ± half``; ``-`` where there is nothing or nothing to compare with.
+
+    The mean alone where it has no interval.
+    """
     if not abs(estimate.mean) <= largest:
         return "-"
+    if not math.isfinite(estimate.high - estimate.low):
+        return _text(estimate.mean, digits)
     if short:
         return f"{_text(estimate.mean, digits)} ± {_text((estimate.high - estimate.low) / 2, digits)}"
     return f"{_text(estimate.mean, digits)} [{_text(estimate.low, digits)}, {_text(estimate.high, digits)}]"

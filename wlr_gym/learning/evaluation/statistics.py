@@ -19,7 +19,7 @@ TRIM = 0.25
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its confidence interval; NaN where the quantity does not exist."""
+    """A number with its confidence interval; NaN where the quantity, or its interval, does not exist."""
 
     mean: float
     low: float
@@ -131,6 +131,8 @@ class Bootstrap:
             values = values + factor * (function(*by_both) - values)
         if not np.isfinite(values[0]):
             return Estimate(np.nan, np.nan, np.nan)
+        if not factor and self._weights.shape[1] == 1:  # one episode of one training says nothing of others
+            return Estimate(float(values[0]), np.nan, np.nan)
         tail = 50.0 * (1.0 - CONFIDENCE)
         low, high = np.nanpercentile(np.where(np.isfinite(values), values, np.nan)[1:], (tail, 100.0 - tail))
         return Estimate(float(values[0]), float(low), float(high))

@@ -98,6 +98,8 @@ def _named(text: str) -> tuple[str, tuple[str, ...]]:
     """Return the name that a text gives, or none, and the policies."""
     found = expand(text)
     if found or "=" not in text or Path(text).exists():
+        if not found and "," in text and not Path(text).exists():
+            raise InputError(f"policy '{text}': several need a name: a={text}")
         return "", found or (text,)
     name, _, sources = text.partition("=")
     parts = [part for part in sources.split(",") if part]

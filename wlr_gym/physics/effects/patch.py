@@ -164,6 +164,8 @@ def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
 
 
 def _parse(data: Any, source: str) -> Patch:
+    if data is None:
+        raise InputError(f"{source}: is empty; expected a mapping with 'effects'")
     if not isinstance(data, Mapping):
         raise InputError(f"{source}: expected a mapping with 'effects', got {type(data).__name__}")
     _require_keys(data, ("effects", "provenance"), source)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -96,12 +96,18 @@ def _stated(robot: Robot, key: str) -> list[float]:
 
 
 def _unusual(robot: Robot) -> Iterator[RobotFinding]:
-    for key, usual in USUAL.items():
-        for value in _stated(robot, key):
-            if not usual.low <= value <= usual.high:
-                unit = "" if usual.unit == "-" else f" {usual.unit}"
-                text = f"is unusual, expected {usual.low:.3g} to {usual.high:.3g}{unit}{_mistaken(key, value)}"
-                yield warning(key, value, usual.unit, text)
+    for key in USUAL:
+        yield from unusual(key, _stated(robot, key))
+
+
+def unusual(key: str, values: Sequence[float]) -> Iterator[RobotFinding]:
+    """Yield which of the numbers at a key of the robot file are outside the usual."""
+    usual = USUAL[key]
+    unit = "" if usual.unit == "-" else f" {usual.unit}"
+    for value in values:
+        if not usual.low <= value <= usual.high:
+            text = f"is unusual, expected {usual.low:.3g} to {usual.high:.3g}{unit}{_mistaken(key, value)}"
+            yield warning(key, value, usual.unit, text)
 
 
 def _mistaken(key: str, value: float) -> str:

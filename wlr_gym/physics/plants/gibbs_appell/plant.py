@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.snapshot import RowStore, Snapshot
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground
@@ -115,10 +115,7 @@ class GibbsAppellPlant(Simulator):
         super().__init__(robot, count, options)
         self.sweeps = sweeps
         if self.options.precision not in kernel.WIDTH:
-            raise InputError(
-                f"precision '{self.options.precision}'{nearest(self.options.precision, kernel.WIDTH)}; "
-                f"valid: {', '.join(kernel.WIDTH)}"
-            )
+            raise unknown_name("precision", self.options.precision, kernel.WIDTH)
         self._float = np.dtype(self.options.precision).type
         self._step = self._float(self.options.physics_step)
         self._width = 1 if count == 1 else kernel.WIDTH[self.options.precision]
