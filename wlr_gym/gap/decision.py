@@ -296,8 +296,9 @@ def _choice(
 
 def _some_runs_alone_show_one(result: Result | None) -> bool:
     """Whether nothing was selected, and some runs show an effect that runs left out of the fit do not."""
-    unnamed = result is not None and not result.effects
-    return unnamed and any(one.outcome == FAILS_CROSS_VALIDATION for one in result.evidence)
+    if result is None or result.effects:
+        return False
+    return any(one.outcome == FAILS_CROSS_VALIDATION for one in result.evidence)
 
 
 def _doubt(now: DecisionRound, result: Result | None, left: Sequence[Explanation]) -> str:
