@@ -184,7 +184,7 @@ def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) ->
     counts = f"{counted(faults, 'fault')}, {counted(len(wrong) - faults, 'warning')} in {len(checks)} checks."
     console.print(Text(counts, "bold red" if faults else "bold yellow"))
     first = wrong[0]
-    console.print(Text(f"Look first at the {first.what} of {first.where}; its line above says what to do.", "bold"))
+    console.print(Text(f"Look first at {first.where}, {first.what}: its line above says what to do.", "bold"))
     if registers := mendable(checks):
         repair = f"{counted(len(registers), 'register')} can be written, after a question: {_mend_command(options)}"
         console.print(Text(repair, "bold"))

@@ -35,7 +35,7 @@ def test_kernel_writes_its_columns_in_the_layouts_order():
 
 
 def test_unknown_precision_is_refused_with_the_nearest():
-    with pytest.raises(InputError, match=r"'float46'.*float64.*valid: float64, float32"):
+    with pytest.raises(InputError, match=r"unknown precision 'float46'.*'float64'.*valid: float32, float64"):
         GibbsAppellPlant(ROBOT, 1, PlantOptions(precision="float46"))
 
 
