@@ -51,13 +51,17 @@ def test_refusals(changes, words):
     ("option", "words"),
     [
         ({"control": "mine"}, "--control .*mine: is there and no socket"),
-        ({"links": "links"}, "--links .*links: 'legs' in it is no link"),
+        ({"links": "links"}, "--links .*links: 'legs' in it is no emulator's link"),
+        ({"links": "adapters"}, "--links .*adapters: 'legs' in it is no emulator's link"),
         ({"links": "mine"}, "--links .*mine: cannot be a folder: it is a file"),
         ({"poses": "mine"}, "--poses .*mine: is there and no file of poses"),
     ],
 )
 def test_what_is_there_is_left_alone(tmp_path, option, words):
-    (tmp_path / "links").mkdir()
+    for folder in ("links", "adapters"):
+        (tmp_path / folder).mkdir()
+    adapter = tmp_path / "adapters" / "legs"
+    adapter.symlink_to("/dev/null")
     mine = [tmp_path / "mine", tmp_path / "links" / "legs"]
     for path in mine:
         path.write_text("precious")
@@ -65,6 +69,7 @@ def test_what_is_there_is_left_alone(tmp_path, option, words):
         emulate.run(options(stepped=True, **{name: tmp_path / value for name, value in option.items()}))
     assert [path.read_text() for path in mine] == ["precious"] * 2
     assert not any(path.is_symlink() for path in (tmp_path / "links").iterdir())
+    assert str(adapter.readlink()) == "/dev/null"
 
 
 def test_what_an_emulator_left_is_replaced(tmp_path):

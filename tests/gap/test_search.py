@@ -581,7 +581,7 @@ def test_what_one_run_alone_shows_is_reported_and_not_selected():
     assert sentence(analysis).startswith("run_1 shows decoy 2 (body) most clearly, but runs left out of the fit do not")
 
 
-def test_what_some_runs_show_weakly_is_told_of_where_the_error_is_hardly_more_than_noise():
+def test_what_some_runs_show_weakly_is_told_of_where_the_error_is_hardly_more_than_noise(monkeypatch):
     problem = Toy({}, [sized("drag", 0.15, "right")], rows=400, runs=6)
     problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
     analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
@@ -589,9 +589,12 @@ def test_what_some_runs_show_weakly_is_told_of_where_the_error_is_hardly_more_th
     assert LEAST_GAIN < alone.gain < INSISTENT
     assert (analysis.verdict, analysis.effects) == (NOTHING_MISSING, ())
     assert title(analysis) == NOTHING_CLEAR
-    assert "shows drag (right) most clearly, but runs left out of the fit do not; more such runs would tell." in sentence(
-        analysis
+    assert sentence(analysis).endswith(
+        "drag (right) most clearly, but runs left out of the fit do not; more such runs would tell."
     )
+    monkeypatch.setattr("wlr_gym.gap.workflow.noise_floor", lambda *_: np.nan)
+    unknown = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
+    assert (unknown.verdict, unknown.effects) == (NOT_EXCITED, ())
 
 
 @pytest.mark.parametrize("everywhere", [True, False])
@@ -822,3 +825,13 @@ def test_what_was_selected_and_removed_again_is_reported_as_removed():
     for kept, outcome in (({look.selected.candidate.label}, "selected"), (set(), "removed")):
         entries = evidence_of(problem, 1, look, RUNS, kept)
         assert [entry.outcome for entry in entries if entry.name == "decoy_2"] == [outcome]
+
+
+@pytest.mark.parametrize(("gain", "outcome"), [(LEAST_GAIN + 1.0, "fails cross-validation"), (LEAST_GAIN - 1.0, "too little")])
+def test_only_what_gains_enough_fails_cross_validation(gain, outcome):
+    problem = Toy({}, [sized("decoy_2", 1.0)], white=1.5)
+    look = named(problem).rounds[0]
+    assert look.selected is not None
+    alone = replace(look.selected, gain=gain, cross_validated=False)
+    entries = evidence_of(problem, 1, replace(look, hypotheses=[alone], selected=None, threshold=LEAST_GAIN), RUNS, ())
+    assert entries[0].outcome == outcome

@@ -271,7 +271,7 @@ def test_a_real_robot_is_asked_for_first(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     with pytest.raises(InputError, match="nobody there to start the robot"):
         recorded(tmp_path, excitation=("straight",), emulated=False, port=THERE)
-    with pytest.raises(InputError, match="legs port /dev/ttyUSB0: not there; plug it in"):
+    with pytest.raises(InputError, match=r"legs port /dev/ttyUSB0: not there\. Plug the adapter in"):
         recorded(tmp_path, excitation=("straight",), emulated=False)
     assert list(tmp_path.iterdir()) == []
 

@@ -96,9 +96,9 @@ def require_ending(path: Path, endings: Iterable[str], option: str = "--out") ->
     """Refuse a file of another kind.
 
     Raises:
-        InputError: its name ends in none of the ``endings``.
+        InputError: its name ends in none of the ``endings``, which are in lower case.
     """
-    if path.suffix.lower() not in endings:
+    if path.suffix not in endings:
         raise InputError(f"{option} {path}: expected a file that ends in {', '.join(endings)}")
 
 

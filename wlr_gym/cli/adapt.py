@@ -137,16 +137,21 @@ def _check(options: AdaptOptions) -> None:
 
 
 def _real(options: AdaptOptions, console: Console) -> RealRobot:
+    from wlr_gym.hardware.config import load_hardware, with_ports
+    from wlr_gym.hardware.safety.preflight import require_ports
     from wlr_gym.learning.adaptation import RealRobot
     from wlr_gym.policy import policy_environment
     from wlr_gym.robot import load_robot
 
+    hardware, ports = options.hardware or "nominal", port_pairs(options.port)
+
     def ask(text: str) -> None:
         if not options.yes:
+            require_ports(with_ports(load_hardware(hardware), ports))
             wait_for_enter(console, f"{text} Free floor? Hand on the switch?")
 
     own = load_robot(options.robot or policy_environment(options.policy).get("robot") or "nominal")
-    return RealRobot(own, options.hardware or "nominal", port_pairs(options.port), ask)
+    return RealRobot(own, hardware, ports, ask)
 
 
 def _print(found: Adapted, content: dict[str, Any], console: Console) -> None:

@@ -154,8 +154,8 @@ def run(options: EvaluateOptions) -> int:
     }  # fmt: skip
     if options.out is not None:
         driven = {} if robot is None else {"robot": robot_content(robot)}
-        record_provenance(options.out, settings_of(options) | driven | {"effects": patch.content()["effects"]}, options.seed)
         _write(options.out, card, samples, options.seed)
+        record_provenance(options.out, settings_of(options) | driven | {"effects": patch.content()["effects"]}, options.seed)
         if options.record:
             _record(options, _shown(card, subjects[0]), options.out / "runs", keywords)
     if options.video is not None:

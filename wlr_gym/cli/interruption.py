@@ -29,7 +29,7 @@ def interruptible() -> Iterator[None]:
     before, since = sys.unraisablehook, 0.0
 
     def come_again() -> None:
-        waiting[:] = [threading.Timer(_AGAIN, _thread.interrupt_main)]
+        waiting[:] = [threading.Timer(_AGAIN, _interrupt_main)]
         waiting[0].daemon = True
         waiting[0].start()
 
@@ -55,6 +55,14 @@ def interruptible() -> Iterator[None]:
         sys.unraisablehook = before
         for timer in waiting:
             timer.cancel()
+
+
+def _interrupt_main() -> None:
+    """Interrupt the main thread, also where it waits in a system call."""
+    if hasattr(signal, "pthread_kill") and (main := threading.main_thread().ident) is not None:
+        signal.pthread_kill(main, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
 
 
 def _imports(frame: FrameType | None) -> bool:

@@ -147,7 +147,7 @@ def _drive_robot(options: PaperOptions, console: Console) -> dict[str, Record]:
     meta, records = RunMeta(robot=robot.name, profile=PROFILE, notes="the paper's tests"), {}
     for name, test in TESTS.items():
         if not (options.emulated or options.yes):
-            confirm(test.motion(), robot, console)
+            confirm(test.motion(), robot, options.load_hardware(), console)
         plant = options.plant_of(robot, options.out / "runs", meta, load_patch(None))
         refuse_deadman(plant)
         with stop_on_request(plant.loop.operator), contextlib.closing(plant):

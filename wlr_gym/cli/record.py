@@ -129,15 +129,13 @@ def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
 def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
     """Limited and logged; between the motions the operator carries the robot back."""
     from wlr_gym.hardware.driving import drive_robot
-    from wlr_gym.hardware.safety.preflight import require_ports
 
     assert options.out is not None
     found: list[dict[str, object]] = []
     code = OK
     for motion in motions:
         if not (options.emulated or options.yes):
-            require_ports(options.load_hardware())
-            confirm(motion, robot, console)
+            confirm(motion, robot, options.load_hardware(), console)
         seed = noise_seed(options.out, options.seed) if options.noise_seed is None else options.noise_seed
         with closing(options.plant_of(options.load()[0], options.out, meta, options.patch(), seed)) as plant:
             drive = drive_robot(plant, motion)

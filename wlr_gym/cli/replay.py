@@ -160,7 +160,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     for measured, motion in zip(runs, motions, strict=True):
         robot = robot_of(measured, chosen)
         if not (options.emulated or options.yes):
-            confirm(motion, robot, console)
+            confirm(motion, robot, options.load_hardware(), console)
         folder = options.out / "robot" / measured.name
         with closing(options.plant_of(robot, folder, meta_of(motion, robot, RunMeta()), patch)) as plant:
             drive = drive_robot(plant, motion)

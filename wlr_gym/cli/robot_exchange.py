@@ -119,8 +119,8 @@ def export_robot(options: RobotExportOptions) -> int:
     kind = options.format or by_name
     if kind is None:
         raise InputError(f"--out {options.out}: expected a file that ends in {', '.join(SUFFIXES)}, or --format")
-    if by_name not in (None, kind):
-        raise InputError(f"--out {options.out}: a name of {by_name}, and --format {kind}; leave one of them out")
+    if by_name not in (None, kind) and options.out.suffix.lower() != ".xml":  # which is used for both
+        raise InputError(f"--out {options.out}: a name of {by_name}, and --format {kind}; leave --format out")
     new_file(options.out, force=options.force)
     robot = load_robot(options.robot)
     text, lost = (mjcf_text(robot), NOT_IN_MJCF) if kind == "mjcf" else (urdf_text(robot), NOT_IN_URDF)

@@ -74,7 +74,7 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     try:
         robot = robot_over(options.base, name, numbers, options.out, check=False)
     except InputError as error:
-        why = "; ".join(_unusual(answers)) or str(error)
+        why = "; ".join([*_unusual(answers), str(error)])
         kept = "" if options.yes else f"; your answers: {_as_options(answers)}"
         raise InputError(f"{why}{kept}") from None
     title = (

@@ -206,13 +206,16 @@ def camera_note(environment: Mapping[str, Any]) -> str:
     return f"{had} a camera, and none is named (--camera): expect worse tracking"
 
 
-def confirm(motion: Motion, robot: Robot, console: Console) -> None:
+def confirm(motion: Motion, robot: Robot, hardware: Hardware, console: Console) -> None:
     """Say what the robot is about to do, and wait for Enter; before every motion: after one it lies elsewhere, torque off.
 
     Raises:
-        InputError: nobody there.
+        InputError: a port is not there, or nobody is.
     """
     from wlr_gym.hardware.operator import KEYS_SAID
+    from wlr_gym.hardware.safety.preflight import require_ports
+
+    require_ports(hardware)
 
     travel = motion.travel(robot.wheel.radius)
     rolled = f"{travel[-1]:+.1f} m in all, from {travel.min():+.1f} to {travel.max():+.1f} m on the way (+ is forward)"

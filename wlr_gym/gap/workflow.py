@@ -18,12 +18,14 @@ from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
     EFFECT_FOUND,
+    FAILS_CROSS_VALIDATION,
     NOT_EXCITED,
     NOTHING_MISSING,
     UNKNOWN,
     Analysis,
     Calibrated,
     Equivalent,
+    Evidence,
     FoundEffect,
     IntakeFinding,
     ParameterEstimate,
@@ -38,7 +40,6 @@ from wlr_gym.gap.opened import named_robot, open_problem
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, separating_run
 from wlr_gym.gap.report.relations import relations
-from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.detectability import detectable
 from wlr_gym.gap.selection.equivalence import equivalents, selection_frequency
 from wlr_gym.gap.selection.hypothesis import INSISTENT
@@ -205,8 +206,10 @@ def analyse_problem(
     somewhere = _somewhere(problem, most_in(channel_gaps) if worst else places[0].name) if nameless else ()
     effects = _effects(problem, search, fitted) or _turned(turned) or somewhere
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
-    verdict = _verdict(search, effects, error / gap.noise_floor)
     groups = _equivalent(problem, search)
+    evidence = [one for number, look in enumerate(search.rounds, 1) for one in evidence_of(problem, number, look, fitted, kept)]
+    evidence += [refuted_evidence(problem, one, fitted) for one in search.refuted]
+    verdict = _verdict(search, effects, evidence, error / gap.noise_floor)
     clock.stop()
     return Analysis(
         data=data,
@@ -218,10 +221,7 @@ def analyse_problem(
         effects=effects,
         equivalent=groups,
         calibration=_calibration(problem, search.fit),
-        evidence=tuple(
-            entry for number, look in enumerate(search.rounds, 1) for entry in evidence_of(problem, number, look, fitted, kept)
-        )
-        + tuple(refuted_evidence(problem, one, fitted) for one in search.refuted),
+        evidence=tuple(evidence),
         thresholds=tuple(
             Threshold(k, look.threshold, chance(look.by_chance), look.probabilities[1])
             for k, look in enumerate(search.rounds, 1)
@@ -283,15 +283,14 @@ class _Clock:
             self.seconds[self._stage] = time.perf_counter() - self._since
 
 
-def _verdict(search: SearchResult, effects: Sequence[FoundEffect], floors: float) -> str:
-    """The verdict; ``floors``: largest error, in noise floors."""
+def _verdict(search: SearchResult, effects: Sequence[FoundEffect], evidence: Sequence[Evidence], floors: float) -> str:
+    """The verdict; ``floors``: largest error, in noise floors, NaN where the model cannot tell its own."""
     if effects:
         return UNKNOWN if all(effect.name == UNKNOWN for effect in effects) else EFFECT_FOUND
-    last = search.rounds[-1]
-    alone = [*search.refuted, *(h for h in last.hypotheses if shown_by_some_runs_only(h, last.threshold))]
-    if alone and (floors > HARDLY_MORE_THAN_NOISE or any(hypothesis.gain > INSISTENT for hypothesis in alone)):
+    alone = [one.gain for one in evidence if one.outcome == FAILS_CROSS_VALIDATION]
+    if alone and not (floors <= HARDLY_MORE_THAN_NOISE and max(alone) <= INSISTENT):
         return NOT_EXCITED
-    scores = last.scores
+    scores = search.rounds[-1].scores
     visible = {score.candidate.name: False for score in scores}
     for score in scores:
         visible[score.candidate.name] |= score.visible

@@ -104,7 +104,10 @@ class Agent(Protocol):
         ...
 
     def settings_to_start_from(self, source: str | Path) -> dict[str, Any]:
-        """Return the settings of a training that starts from a trained policy (``init``)."""
+        """Return the settings of a training that starts from a trained policy (``init``).
+
+        An agent that has this is taken to be random before any training: it moves no real robot then.
+        """
         ...
 
     def export_network(self, folder: Path, contract: Contract) -> bytes:

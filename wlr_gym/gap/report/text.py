@@ -22,7 +22,6 @@ from wlr_gym.gap.analysis import (
     Statistic,
     Turning,
 )
-from wlr_gym.gap.selection.screening import LEAST_GAIN
 from wlr_gym.gap.validation.misfit import most_in, most_left
 from wlr_gym.physics.effects import UNKNOWN_EFFECT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
@@ -275,7 +274,7 @@ def _not_excited(analysis: Analysis) -> str:
 
 def _shown_by_some_runs_only(analysis: Analysis) -> str:
     """Return which run shows what that others do not, as a clause; "" = none does."""
-    alone = [e for e in analysis.evidence if e.outcome == FAILS_CROSS_VALIDATION and e.gain > LEAST_GAIN and e.by_run]
+    alone = [evidence for evidence in analysis.evidence if evidence.outcome == FAILS_CROSS_VALIDATION and evidence.by_run]
     if not alone:
         return ""
     shown = max(alone, key=lambda evidence: evidence.gain)

@@ -15,6 +15,7 @@ from wlr_gym.gap.analysis import (
     Evidence,
 )
 from wlr_gym.gap.problem import Problem
+from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.screening import asked_of
 from wlr_gym.gap.selection.search import Round
@@ -82,7 +83,7 @@ def _outcome(hypothesis: Hypothesis, look: Round, equal: set[str], kept: Contain
         return "implausible", "needs a value outside its plausible range"
     if hypothesis.tolerable:
         return "within tolerance", "the tolerances of calibrated parameters allow as much"
-    if not hypothesis.cross_validated:
+    if shown_by_some_runs_only(hypothesis, look.threshold):
         return FAILS_CROSS_VALIDATION, "left out of the fit, runs are not replayed better with it"
     if not hypothesis.consistent:
         return "inconsistent", "helps some runs and harms others"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import os
+import re
 import select
 import socket
 import struct
@@ -28,6 +29,7 @@ from wlr_gym.hardware.emulator.machine import Machine
 LARGEST_LAG = 0.05
 #: s by which it may be behind when bytes have come in, and servos say what time it is.
 ANSWER_LAG = 0.005
+_TERMINAL = re.compile(r"/dev/(pts/|ttys)\d+")  # what our links point to, now or until an emulator was killed
 _TCGETS2 = 0x802C542A  # Linux ioctl: terminal settings with the speed as a number
 
 
@@ -142,6 +144,8 @@ class Server:
         try:
             return {name: Port(name, None if links is None else links / name) for name in self._names}
         except OSError as error:
+            if self._control is not None:
+                Path(self._control.getsockname()).unlink()
             raise InputError(f"ports cannot be made: {error}") from None
 
     @property
@@ -350,8 +354,8 @@ class Server:
 def _make_folder(links: Path, names: Sequence[str]) -> None:
     make_output_folder(links, "--links")
     for path in (links / name for name in names):
-        if path.exists() and not path.is_symlink():
-            raise InputError(f"--links {links}: '{path.name}' in it is no link; expected another folder")
+        if path.exists() and not (path.is_symlink() and _TERMINAL.fullmatch(os.readlink(path))):
+            raise InputError(f"--links {links}: '{path.name}' in it is no emulator's link; expected another folder")
 
 
 def _listen(path: Path) -> socket.socket:

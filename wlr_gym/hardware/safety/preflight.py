@@ -74,7 +74,7 @@ def open_ports(servos: Servos, imu: Imu, hardware: Hardware, flow: Flow | None =
             if Path(path).exists():
                 found, remedy = str(error), "Join the group it belongs to (ls -l), often dialout, and log in again."
             else:
-                found, remedy = "not there", f"Plug the adapter in, or name its port with --port {name}=PATH; {_ports_here()}."
+                found, remedy = "not there", _plug_in(name)
             checks.append(Check(name, "port", False, found, path, remedy))
     return checks
 
@@ -83,9 +83,11 @@ def require_ports(hardware: Hardware) -> None:
     """Raise :class:`InputError` where a port is not there: nobody needs to stand ready then."""
     for name, path in ({name: bus.port for name, bus in hardware.buses.items()} | {"imu": hardware.imu.port}).items():
         if not Path(path).exists():
-            raise InputError(
-                f"{name} port {path}: not there; plug it in, or name its port with --port {name}=PATH; {_ports_here()}"
-            )
+            raise InputError(f"{name} port {path}: not there. {_plug_in(name)}")
+
+
+def _plug_in(name: str) -> str:
+    return f"Plug the adapter in, or name its port with --port {name}=PATH; {_ports_here()}."
 
 
 def _ports_here(devices: Path = Path("/dev")) -> str:
