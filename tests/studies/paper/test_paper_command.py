@@ -38,8 +38,11 @@ def test_a_robot_is_asked_for_and_guarded(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr("wlr_gym.cli.paper.PaperOptions.plant_of", lambda *given: made.append(given))
     monkeypatch.setattr("builtins.input", lambda *_: (_ for _ in ()).throw(EOFError))
+    words = ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--draws", "0"]
+    with pytest.raises(InputError, match="legs port /dev/ttyUSB0: not there"):
+        run_command("paper", words)
     with pytest.raises(InputError, match="nobody there to start the robot"):
-        run_command("paper", ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--draws", "0"])
+        run_command("paper", [*words, "--port", *(f"{name}=/dev/null" for name in ("legs", "wheels", "imu"))])
     assert not made
 
 
