@@ -4,6 +4,7 @@ import importlib.util
 import sys
 
 import pytest
+from numba.core import config
 
 MODULE = """
 from typing import NamedTuple
@@ -21,7 +22,9 @@ def total(pair):
 
 @pytest.fixture
 def load(tmp_path, monkeypatch):
-    """Load the module anew, as another process would; returns it."""
+    """Load the module anew, as another process would; returns it. What is compiled is kept beside it."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    config.reload_config()
     path = tmp_path / "kept_pair.py"
     path.write_text(MODULE)
 

@@ -79,6 +79,15 @@ LOSES_IT = {
 }
 
 
+@pytest.fixture
+def foreground():
+    """Ctrl-C as on a terminal: a background shell has switched it off."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize("how", LOSES_IT)
 def test_an_interruption_that_a_package_or_a_callback_loses_comes_again(how, command, tmp_path, monkeypatch, capsys):
     (tmp_path / f"loses_it_{how}.py").write_text(f"import signal\n{LOSES_IT[how]}")
