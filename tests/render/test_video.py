@@ -101,6 +101,10 @@ def test_bad_films(tmp_path, name, pictures, keywords, expected):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_ending_in_capitals_is_a_film_too(tmp_path):
+    check_video(tmp_path / "FILM.WEBP")
+
+
 def test_mp4_without_its_package(monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingPackageError, match=r"imageio_ffmpeg.*wlr-gym\[video\]"):

@@ -92,13 +92,18 @@ def require_empty(folder: Path, resume: str) -> None:
         raise InputError(f"{folder}: not empty; give another folder{hint}")
 
 
-def require_ending(path: Path, endings: Iterable[str], option: str = "--out") -> None:
+def require_ending(path: Path, endings: Iterable[str], option: str = "--out", *, any_case: bool = False) -> None:
     """Refuse a file of another kind.
 
+    Args:
+        path: of the file. endings: lower case.
+        option: what gave it.
+        any_case: capitals will do, too: nothing reads it by its ending.
+
     Raises:
-        InputError: its name ends in none of the ``endings``, which are in lower case.
+        InputError: its name ends in none of the endings.
     """
-    if path.suffix not in endings:
+    if (path.suffix.lower() if any_case else path.suffix) not in endings:
         raise InputError(f"{option} {path}: expected a file that ends in {', '.join(endings)}")
 
 

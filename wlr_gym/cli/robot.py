@@ -99,7 +99,7 @@ def _show(options: ShowOptions) -> int:
     from wlr_gym.robot import load_robot, robot_hash
 
     if options.picture is not None:
-        require_ending(options.picture, PICTURES, "--picture")
+        require_ending(options.picture, PICTURES, "--picture", any_case=True)
         if not options.picture.parent.is_dir():
             raise InputError(f"--picture {options.picture}: folder {options.picture.parent} does not exist")
         refuse_existing(options.picture, options.force, "--picture")

@@ -27,7 +27,7 @@ def check_video(path: Path, option: str = "--video") -> None:
         InputError: no such folder, or a suffix that is no film.
         MissingPackageError: MP4 without ``imageio-ffmpeg``.
     """
-    require_ending(path, _WRITERS, option)
+    require_ending(path, _WRITERS, option, any_case=True)
     if not path.parent.is_dir():
         raise InputError(f"{option} {path}: folder {path.parent} does not exist")
     if path.is_dir():
