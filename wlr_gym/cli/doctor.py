@@ -127,7 +127,7 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
     """Return whether a policy was made for this robot, its observations and its control period, and for its sensors."""
     from wlr_gym.hardware.safety.check import Check
     from wlr_gym.learning.evaluation.rollout import make_core
-    from wlr_gym.policy import camera_share, check_contract, contract_of, environment_for
+    from wlr_gym.policy import camera_share, check_contract, contract_of, environment_for, misses_camera
 
     remedy = "Choose another policy, train it for this robot, or name the robot file it was trained with (--robot)."
     try:
@@ -141,13 +141,13 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
     share = camera_share(policy["environment"])
     if has_camera or not share:
         return checks
-    if share <= 0.5:
-        found = f"none; the policy had one in {share:.0%} of its training (docs/policies.md: what each task loses without)"
-        checks.append(Check("policy", "camera", True, found, "", ""))
-    else:
+    if misses_camera(policy["environment"]):
         expected = f"one, as in {share:.0%} of its training"
         remedy = "Its slip observer goes by wheels and IMU alone: expect worse tracking. Name the camera (--camera FILE)."
         checks.append(Check("policy", "camera", False, "none on this robot", expected, remedy, False))
+    else:
+        found = f"none; the policy had one in {share:.0%} of its training (docs/policies.md: what each task loses without)"
+        checks.append(Check("policy", "camera", True, found, "", ""))
     return checks
 
 

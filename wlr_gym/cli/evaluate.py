@@ -136,7 +136,7 @@ def run(options: EvaluateOptions) -> int:
         return _accept(options)
     options = _complete(options)
     _check(options)
-    _note_untrained(options)
+    subjects = _subjects(options)
     patch = options.patch()
     if options.out is not None:
         options.refuse_results(options.out, "card.json")
@@ -146,7 +146,6 @@ def run(options: EvaluateOptions) -> int:
         print_json(content(card))
     else:
         print_card(card)
-    subjects = read_subjects([options.policy, *(options.baselines or ())])
     robot = options.robot or common_robot(subjects)
     keywords = {
         "randomization": options.randomization, "robot": robot, "effects": patch, "threads": options.threads,
@@ -174,7 +173,7 @@ def _accept(options: EvaluateOptions) -> int:
     given = [name for name, value in card_only.items() if value]
     if given:
         raise InputError(f"--accept: {given[0]} is of the card; leave it out")
-    _note_untrained(options)
+    _subjects(options)
     if options.out is not None:
         refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
     with output_folder(options.out), _progress(options.progress) as tell:
@@ -201,9 +200,11 @@ def _accept(options: EvaluateOptions) -> int:
     return OK if result.accepted else FAILED
 
 
-def _note_untrained(options: EvaluateOptions) -> None:
+def _subjects(options: EvaluateOptions) -> tuple[Subject, ...]:
+    """Return who plays; of one before any training that is said."""
     subjects = read_subjects([options.policy, *(options.baselines or ())])
     note_untrained(source for subject in subjects for source in subject.sources)
+    return subjects
 
 
 def _shown(card: Card, subject: Subject) -> Subject:

@@ -55,8 +55,10 @@ class ForceOption:
         Raises:
             InputError: they are there.
         """
+        from wlr_gym.data.format import META_FILE
+
         refuse_existing(folder / own, self.force)
-        for name in (CONFIG_FILE, PROVENANCE_FILE, "meta.yaml"):
+        for name in (CONFIG_FILE, PROVENANCE_FILE, META_FILE):
             if (folder / name).exists() and not self.force:
                 what = f"'{name}' of another command is in it"
                 raise InputError(f"--out {folder}: {what}; choose another folder, or write into it with --force")

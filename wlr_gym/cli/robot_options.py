@@ -197,11 +197,11 @@ def camera_note(environment: Mapping[str, Any]) -> str:
     Args:
         environment: its contract's.
     """
-    from wlr_gym.policy import camera_share
+    from wlr_gym.policy import camera_share, misses_camera
 
-    share = camera_share(environment)
-    if share <= 0.5:
+    if not misses_camera(environment):
         return ""
+    share = camera_share(environment)
     had = "the slip observer is meant to have" if share >= 1.0 else f"in {share:.0%} of its training the policy had"
     return f"{had} a camera, and none is named (--camera): expect worse tracking"
 
@@ -216,7 +216,6 @@ def confirm(motion: Motion, robot: Robot, hardware: Hardware, console: Console) 
     from wlr_gym.hardware.safety.preflight import require_ports
 
     require_ports(hardware)
-
     travel = motion.travel(robot.wheel.radius)
     rolled = f"{travel[-1]:+.1f} m in all, from {travel.min():+.1f} to {travel.max():+.1f} m on the way (+ is forward)"
     console.print(f"The robot will stand up and drive {motion.name}: {motion.duration:.0f} s; it rolls {rolled}.")

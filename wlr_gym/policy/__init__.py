@@ -2,7 +2,7 @@
 
 from wlr_gym.policy.agents import Agent, Policy, Training, TrainingProgress, agent_names, load_agent, load_agent_config
 from wlr_gym.policy.export import Parity, export_policy, exportable
-from wlr_gym.policy.file import camera_share, check_contract, needs_camera, read_contract, write_contract
+from wlr_gym.policy.file import camera_share, check_contract, misses_camera, needs_camera, read_contract, write_contract
 from wlr_gym.policy.model_card import write_model_card
 from wlr_gym.policy.reseal import reseal
 from wlr_gym.policy.sources import (
@@ -39,6 +39,7 @@ __all__ = [
     "load_agent_config",
     "load_policy",
     "make_policy",
+    "misses_camera",
     "needs_camera",
     "policy_environment",
     "read_contract",

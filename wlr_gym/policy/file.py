@@ -180,6 +180,11 @@ def camera_share(environment: Contract) -> float:
     return (environment.get("sensors") or {}).get("camera", 1.0)
 
 
+def misses_camera(environment: Contract) -> bool:
+    """Whether a policy that drives without camera had one in most of its training."""
+    return camera_share(environment) > 0.5
+
+
 def needs_camera(environment: Contract) -> bool:
     """Whether what a policy is fed rests on camera poses, and it never did without."""
     return camera_share(environment) >= 1.0
