@@ -1,4 +1,4 @@
-"""The package as drawn: class names exist once, no import circles, sizes, what strings name exists, agents are thin."""
+"""The package as drawn: class names exist once, no import circles, what strings name exists, agents are thin."""
 
 from __future__ import annotations
 
@@ -17,10 +17,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULE_LINES, CLASS_LINES = 400, 300
-#: Module or class above its size -> why it is worth it.
-REASONS: dict[str, str] = {}
-GENERATED = {"wlr_gym.physics.model.equations"}
 #: What ``agents/*/agent.py`` may import: an agent is only a registration, so that import-linter sees all code behind it.
 AGENTS_IMPORT = ("wlr_gym.policy", "wlr_gym.learning", "wlr_gym.robot", "wlr_gym.base", "numpy")
 #: Dotted names that are no Python names: keys in the metadata of a policy file, modules that a test makes, a misspelling.
@@ -33,13 +29,14 @@ def module_name(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-PATHS = {module_name(path): path for path in sorted((ROOT / "wlr_gym").rglob("*.py"))}
+PATHS = {module_name(path): path for top in ("wlr_gym", "studies") for path in sorted((ROOT / top).rglob("*.py"))}
 SOURCES = {name: path.read_text(encoding="utf-8") for name, path in PATHS.items()}
 #: Every text that may name a module: code, configs and documents.
 TEXTS = {
     str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
     for pattern in (
         "wlr_gym/**/*.py",
+        "studies/**/*.py",
         "agents/*/*.py",
         "tests/**/*.py",
         "configs/**/*.yaml",
@@ -51,9 +48,9 @@ TEXTS = {
     for path in sorted(ROOT.glob(pattern))
     if path.name != "CHANGELOG.md"
 }
-IMPORT_FROM = re.compile(r"\bfrom (wlr_gym[\w.]*) import (?:\(([^)]+)\)|([\w, ]+))")
-DOTTED = re.compile(r"(?<![\w./])wlr_gym(?:\.[A-Za-z_]\w*)+(?::\w+)?(?![\w/])")
-PATH = re.compile(r"(?<![\w./])(?:wlr_gym|tests)/[\w./*]+")
+IMPORT_FROM = re.compile(r"\bfrom ((?:wlr_gym|studies)[\w.]*) import (?:\(([^)]+)\)|([\w, ]+))")
+DOTTED = re.compile(r"(?<![\w./])(?:wlr_gym|studies)(?:\.[A-Za-z_]\w*)+(?::\w+)?(?![\w/])")
+PATH = re.compile(r"(?<![\w./])(?:wlr_gym|studies|tests)/[\w./*]+")
 ROLE = re.compile(r":(?:mod|class|func|data|meth|attr):`([^`]+)`")
 
 
@@ -209,16 +206,6 @@ def test_no_public_class_name_twice():
 def test_no_import_circles():
     """The acyclic contract of import-linter covers sibling packages, this test covers modules."""
     failing(circles(import_graph()), "import circles")
-
-
-def test_sizes_have_reasons():
-    sizes = {name: (source.count("\n"), MODULE_LINES) for name, source in SOURCES.items() if name not in GENERATED}
-    for name, tree in trees().items():
-        for node in classes(tree):
-            sizes[f"{name}.{node.name}"] = ((node.end_lineno or 0) - node.lineno + 1, CLASS_LINES)
-    large = {name: f"{name}: {lines} lines, more than {most}" for name, (lines, most) in sizes.items() if lines > most}
-    failing([text for name, text in large.items() if name not in REASONS], "too large, without a reason")
-    failing([name for name in REASONS if name not in large], "reasons that nothing needs")
 
 
 def test_dotted_names_exist():

@@ -1,4 +1,4 @@
-"""The numbers of docs/performance.md and README's of the engine: kept in docs/data/bench.json, from ``wlr bench --save``.
+"""The numbers of docs/performance.md and README's of the engine: docs/data/bench.json, from ``python -m studies.bench``.
 
 ``python .ci/docs/performance.py bench.json ...`` takes the rows of the reports over, each with its machine, versions and date,
 and writes README's row and the picture anew. What is measured again replaces all of its older rows. tables.py has the tables.
@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.studies.bench.engine_report import AT_DEFAULTS, LEVELS, level_name, reference_text, save_picture, settings_table
+from studies.bench.engine_report import AT_DEFAULTS, LEVELS, level_name, reference_text, save_picture, settings_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "bench.json"
@@ -32,7 +32,7 @@ Row = dict[str, Any]
 def merged(kept: list[Row], report: dict[str, Any]) -> list[Row]:
     """Return the rows with those of a report taken over, each with what it was measured on; refuse a quick report."""
     if report["quick"]:
-        raise SystemExit("a report of wlr bench --quick: its numbers mean nothing")
+        raise SystemExit("a report of python -m studies.bench --quick: its numbers mean nothing")
     conditions = {**report["machine"], "rounds": report["rounds"]}
     new = {(row["name"], row["what"]): {**row, "measured": conditions} for row in report["measurements"]}
     old = [row for row in kept if row["name"] not in {name for name, _ in new}]
@@ -48,7 +48,9 @@ def speed_table(rows: Iterable[Row]) -> list[str]:
     lines = ["| what | ours | peer | ratio [min..max] | bar | command | measured |", "|---|---|---|---|---|---|---|"]
     for row in rows:
         cells = (row["what"], _value(row["ours"], row["unit"]), _peer(row), _ratio(row), _bar(row))
-        lines.append(f"| {' | '.join(cells)} | `wlr bench --only {row['name']}` | {_condition(row['measured'])} |")
+        lines.append(
+            f"| {' | '.join(cells)} | `python -m studies.bench --only {row['name']}` | {_condition(row['measured'])} |"
+        )
     return lines
 
 
@@ -144,7 +146,7 @@ def write_readme(text: str, rows: list[Row]) -> str:
             return text
         wide, narrow = (f"{ratios[f'{precision}, {what}']:.0f}{TIMES}" for precision in ("float64", "float32"))
         cells.append(f"{what}: {wide} as fast (float64), {narrow} (float32)")
-    command = "`wlr bench --only engine` ([performance](docs/performance.md))"
+    command = "`python -m studies.bench --only engine` ([performance](docs/performance.md))"
     error = "rms distance from the engine's contact model"
     what = "engine against MuJoCo (float64), a batch of 320 robots against one"
     head = f"{what}, core of an {engine[0]['measured']['processor']}; error: {error}"

@@ -20,6 +20,12 @@ import learning
 import measured
 import performance
 
+from studies.bench.adapt_study import read_lines
+from studies.bench.adapt_table import markdown as markdown_of_cases
+from studies.bench.decide_table import markdown as markdown_of_decisions
+from studies.bench.gap import score_answers
+from studies.bench.gap_score_table import markdown
+from studies.paper.verdicts import verdict_table
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.data.format import COLUMNS, Column
 from wlr_gym.envs.registry import ENVIRONMENTS
@@ -41,12 +47,6 @@ from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.physics.effects.document import coordinates, parameter_text, places
 from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import JOINTS, load_robot
-from wlr_gym.studies.bench.adapt_study import read_lines
-from wlr_gym.studies.bench.adapt_table import markdown as markdown_of_cases
-from wlr_gym.studies.bench.decide_table import markdown as markdown_of_decisions
-from wlr_gym.studies.bench.gap import score_answers
-from wlr_gym.studies.bench.gap_score_table import markdown
-from wlr_gym.studies.paper.verdicts import verdict_table
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "tables"
@@ -158,12 +158,12 @@ def ablation_table() -> list[str]:
 
 
 def adapt_table() -> list[str]:
-    """Return the cases of ``wlr bench adapt`` that were run."""
+    """Return the cases of ``python -m studies.bench adapt`` that were run."""
     return markdown_of_cases(read_lines(DATA / "adapt.jsonl")).strip().splitlines()
 
 
 def decide_table() -> list[str]:
-    """Return the robots of ``wlr bench decide`` that were run."""
+    """Return the robots of ``python -m studies.bench decide`` that were run."""
     return markdown_of_decisions(json.loads((DATA / "decide.json").read_text(encoding="utf-8"))).strip().splitlines()
 
 

@@ -16,14 +16,14 @@ from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import INTERRUPTED, main
 from wlr_gym.data import read_dataset
+from wlr_gym.demo import hidden_fault, ice_comparison, learn, retraining, workers
+from wlr_gym.demo.page import TERMS
+from wlr_gym.demo.page import page as page_of
+from wlr_gym.demo.settings import Demo
+from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
 from wlr_gym.learning.evaluation import Estimate
 from wlr_gym.physics.effects import load_patch, save_patch
-from wlr_gym.studies.demo import hidden_fault, ice_comparison, learn, retraining, workers
-from wlr_gym.studies.demo.page import TERMS
-from wlr_gym.studies.demo.page import page as page_of
-from wlr_gym.studies.demo.settings import Demo
-from wlr_gym.studies.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section
 
 COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]
 NO_NUMBERS = {

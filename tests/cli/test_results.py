@@ -132,7 +132,6 @@ def test_a_comparison_is_not_replaced(tmp_path, capsys):
         ("replay RUNS --no-plots", "provenance.yaml"),
         ("compare --excitation straight --seconds 0.2", "meta.yaml"),
         ("commission --emulated", "meta.yaml"),
-        ("paper", "config.yaml"),
     ],
 )
 def test_nothing_is_written_among_results_of_another_command(tmp_path, runs, capsys, command, there):
@@ -162,8 +161,6 @@ def test_an_analysis_a_policy_and_a_picture_are_not_replaced(tmp_path, runs, cap
         ["envs", "WLR-Velocity-v0", "--picture", str(tmp_path / "page.png")],
         ["robot", "show", "--picture", str(tmp_path / "page.png")],
         ["demo", "--quick", "--out", str(tmp_path / "demo")],
-        ["paper", "--out", str(tmp_path / "paper")],
-        ["bench", "import", "--save", str(tmp_path / "bench.json")],
     ):
         assert main(words) == 2, words
         assert "exists; choose another name, or replace it with --force" in capsys.readouterr().err, words

@@ -101,8 +101,6 @@ COMMANDS = {
         "--out r.txt: expected a file that ends in .yaml, .yml",
     ),
     "a stream's name": (["deploy", "pid", "--emulated", "--mcap", "x.txt"], "--mcap x.txt: expected a file that ends in .mcap"),
-    "a report's name": (["bench", "import", "--save", "y.txt"], "--save y.txt: expected a file that ends in .json"),
-    "another measurement's option": (["bench", "import", "--sets", "4"], "--sets: for gap or vision with --out; got import"),
     "one plant twice": (
         ["compare", "--plants", "mujoco", "mujoco", "--out", "c"],
         "--plants mujoco mujoco: the same plant twice",

@@ -22,6 +22,8 @@ from typing import Any
 
 import pytest
 
+from studies.bench.__main__ import main as bench
+from studies.paper.__main__ import main as paper
 from wlr_gym.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,6 +31,8 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 _BLOCK = re.compile(r"^(?:<!-- (?P<mark>[^\n]*?) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.S | re.M)
 _MARK = re.compile(r"(file|slow|checked by|not run|demo-command|test-command)(?:: | |$)(.*)")
 
+#: Programs that pages run -> function.
+PROGRAMS = {"wlr": main, "python -m studies.bench": bench, "python -m studies.paper": paper}
 #: Words of a command -> options that make it small enough for a test, added to its own.
 SMALLER = {
     "train": "--max-minutes 0.02 --no-progress",
@@ -38,9 +42,9 @@ SMALLER = {
     "play": "--seconds 0.2 --size 96 64",
     "deploy": "--seconds 0.5 --yes --no-status",
     "compare": "--seconds 1 --no-plots",
-    "bench": "--quick --rounds 1",
+    "python -m studies.bench": "--quick --rounds 1",
     "record": "--seconds 4",
-    "paper": "--plant gibbs_appell --draws 0",
+    "python -m studies.paper": "--plant gibbs_appell --draws 0",
 }
 
 
@@ -118,11 +122,19 @@ def run_block(block: Block, names: dict[str, Any], *, smaller: bool = True) -> N
 
 
 def run_command(command: str, *, smaller: bool = True) -> int:
-    """Run ``wlr ...`` in this process; return its exit code."""
+    """Run ``wlr ...``, or a study, in this process; return its exit code."""
+    program, words = program_of(command)
+    assert program in PROGRAMS, f"{command}: only {', '.join(PROGRAMS)} are run here"
+    fitting = [options for key, options in SMALLER.items() if key == program or set(key.split()) <= set(words)]
+    return PROGRAMS[program](laid_over(words, " ".join(fitting).split() if smaller else []))
+
+
+def program_of(command: str) -> tuple[str, list[str]]:
+    """Return what a command runs, and the words behind it; ``python -m MODULE`` is a program."""
     program, *words = shlex.split(command)
-    assert program == "wlr", f"{command}: only wlr is run here"
-    fitting = [options for key, options in SMALLER.items() if set(key.split()) <= set(words)]
-    return main(laid_over(words, " ".join(fitting).split() if smaller else []))
+    if words[:1] == ["-m"]:
+        program, words = f"{program} -m {words[1]}", words[2:]
+    return program, words
 
 
 def laid_over(words: Sequence[str], more: Sequence[str]) -> list[str]:

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import re
-import shlex
 
 import pytest
-from blocks import PAGES, ROOT, Block, blocks
+from blocks import PAGES, ROOT, Block, blocks, program_of
 
-from wlr_gym.cli import COMMANDS, NESTED, parse
+from studies.bench.__main__ import BenchOptions
+from studies.paper.__main__ import PaperOptions
+from wlr_gym.cli import COMMANDS, NESTED, parse, parsing
 
+STUDIES = {"python -m studies.bench": BenchOptions, "python -m studies.paper": PaperOptions}
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]+)?\)")
 #: Pages that exist on the documentation site only (.ci/docs/pages.py).
 MADE = ("commands.md", "api.md")
 
 
 def commands(block: Block) -> list[str]:
-    """``wlr`` commands of a block."""
+    """Commands of a block that run ``wlr`` or a study."""
     parts = [part.strip() for line in block.commands for part in line.split("&&")]
-    return [part for part in parts if part.startswith("wlr ")]
+    return [part for part in parts if part.startswith(("wlr ", "python -m studies."))]
 
 
 CASES = [
@@ -36,7 +38,10 @@ def test_there_are_commands_to_check() -> None:
 
 @pytest.mark.parametrize("command", CASES)
 def test_command_parses(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    _, name, *arguments = shlex.split(command)
+    program, (name, *arguments) = program_of(command)
+    if program in STUDIES:
+        parsing.parse(STUDIES[program], program, [name, *arguments], "")
+        return
     if name == "--import":
         _, name, *arguments = arguments
     assert name in COMMANDS, f"no command '{name}'"
@@ -54,7 +59,7 @@ def test_what_the_readme_says_reproduces_a_number_exists(capsys: pytest.CaptureF
     commands = [re.search(r"`([^`]+)`", cell) for cell in last_cells]
     assert all(commands)
     for command in (match[1] for match in commands if match):
-        if command.startswith("wlr "):
+        if command.startswith(("wlr ", "python -m studies.")):
             test_command_parses(command, capsys)
         else:
             program, *paths = command.split()

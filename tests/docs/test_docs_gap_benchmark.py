@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from blocks import ROOT
 
-from wlr_gym.studies.bench.blind.cases import case
-from wlr_gym.studies.bench.gap import make_data, read_answers
+from studies.bench.blind.cases import case
+from studies.bench.gap import make_data, read_answers
 
 ANSWERS = ROOT / "docs" / "data" / "gap_answers.json"
 

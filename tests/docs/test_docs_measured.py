@@ -8,9 +8,9 @@ from typing import Any
 
 from blocks import ROOT, site_script
 
-from wlr_gym.studies.bench.adapt_study import CONTENDERS, read_lines
-from wlr_gym.studies.bench.adapt_table import by_case, summary
-from wlr_gym.studies.bench.gap import score_answers
+from studies.bench.adapt_study import CONTENDERS, read_lines
+from studies.bench.adapt_table import by_case, summary
+from studies.bench.gap import score_answers
 
 learning = site_script("learning")
 UNITS = {"1/A": " /A", "-": ""}

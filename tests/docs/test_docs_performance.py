@@ -1,4 +1,4 @@
-"""docs/performance.md has the numbers of docs/data/bench.json, and those come from reports of ``wlr bench``."""
+"""docs/performance.md has the numbers of docs/data/bench.json, and those come from reports of ``python -m studies.bench``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import gymnasium
 import pytest
 from blocks import ROOT, site_script
 
-from wlr_gym.cli.bench import MEASUREMENTS
-from wlr_gym.studies.bench.measure import Measurement, machine
+from studies.bench.__main__ import MEASUREMENTS
+from studies.bench.measure import Measurement, machine
 
 performance = site_script("performance")
 DATA = json.loads((ROOT / "docs" / "data" / "bench.json").read_text(encoding="utf-8"))
@@ -78,7 +78,9 @@ def test_a_report_replaces_its_own_measurement_only():
 def test_a_pair_is_shown_with_its_peer_and_ratio():
     row = Measurement("engine", "substeps", "1/s", (2e6, 4e6, 3e6), (1e5, 1e5, 1e5), "mujoco.batch", 25.0)
     (line,) = performance.speed_table(performance.merged([], report(row)))[2:]
-    assert line.startswith("| substeps | 3 M/s | 100 k/s (mujoco.batch) | 30 [20..40] | >= 25 | `wlr bench --only engine` |")
+    assert line.startswith(
+        "| substeps | 3 M/s | 100 k/s (mujoco.batch) | 30 [20..40] | >= 25 | `python -m studies.bench --only engine` |"
+    )
 
 
 def test_quick_numbers_are_refused():

@@ -13,6 +13,7 @@ pytest.importorskip("onnxruntime")
 from camera_rig import small_camera
 from policy_log import act_again
 
+from studies.bench.camera_chain import ChainSetting, chain_errors, drive_chain, simulated_errors
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK, run_command
 from wlr_gym.cli.doctor import check_policy
@@ -20,7 +21,6 @@ from wlr_gym.data.read import read_run
 from wlr_gym.hardware.log import read_events
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import environment_for, make_policy
-from wlr_gym.studies.bench.camera_chain import ChainSetting, chain_errors, drive_chain, simulated_errors
 
 POLICY = "velocity_slip_aware"
 

@@ -14,6 +14,7 @@ pytest.importorskip("serial")
 
 from robot_rig import ROBOT, Phase, Rig, StoppedError, machine_of
 
+from studies.paper.experiments import PROFILE
 from wlr_gym.cli import FAILED, INTERRUPTED, OK, record, replay, run_command
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import RunMeta
@@ -27,7 +28,6 @@ from wlr_gym.learning.evaluation import make_core
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.policy import make_policy
-from wlr_gym.studies.paper.experiments import PROFILE
 
 ADVICE = "CUT THE POWER: torque is not confirmed off at wheel_lf, wheel_rf, wheel_lr, wheel_rr"
 

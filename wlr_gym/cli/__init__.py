@@ -10,7 +10,7 @@ import importlib
 import keyword
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +51,6 @@ COMMANDS = {
     "commission": "test a robot on a stand, compare each result with the emulator",
     "deploy": "drive the robot with a policy, through the command limiter",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults",
-    "paper": "repeat the paper's experiments in several models and check its claims",
-    "bench": "measure speed and accuracy; score gap and adapt on many hidden faults",
 }
 
 #: Words behind a command that name a module of their own (``vision_check``).
@@ -61,12 +59,17 @@ NESTED = {("vision", "check")}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``wlr`` and return its exit code: 0 done, 1 failed, 2 bad input, 130 interrupted."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    return guarded(_dispatch, sys.argv[1:] if arguments is None else arguments)
+
+
+def guarded(dispatch: Callable[[list[str]], int], arguments: Sequence[str]) -> int:
+    """Do what the words of a command line say and return the exit code; mistakes and interruption are told in one line."""
+    words = list(arguments)
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # numba colours messages that nobody reads
     gc.set_threshold(max(50_000, gc.get_threshold()[0]))  # and leaves much to the garbage collector while it compiles
     try:
         try:
-            return _answered(words)
+            return _answered(dispatch, words)
         finally:
             print(end="", flush=True)  # here, where it can be caught; at its end Python could only complain
     except BrokenPipeError:
@@ -76,11 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
 
 
-def _answered(words: list[str]) -> int:
-    """Do what the words say, and tell mistakes and interruption in one line."""
+def _answered(dispatch: Callable[[list[str]], int], words: list[str]) -> int:
     try:
         with interruptible():
-            return _dispatch(words)
+            return dispatch(words)
     except (InputError, MissingPackageError) as error:
         _say(str(error), "red")
         return BAD_INPUT
@@ -145,11 +147,31 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     if (name, *arguments[:1]) in NESTED:
         name, arguments = f"{name}_{arguments[0]}", arguments[1:]
     _check_word(name, arguments)
+    return run_options(parse(name, arguments), _module(name).run)
+
+
+def run_options(options: Any, run: Callable[[Any], int]) -> int:
+    """Run a command with its options; with ``--json`` only results are printed on the standard output."""
     from wlr_gym.cli.results import only_results
 
-    options = parse(name, arguments)
     with only_results(getattr(options, "json", False)):
-        return _module(name).run(options)
+        return run(options)
+
+
+def run_program(program: str, kind: type, run: Callable[[Any], int], description: str, arguments: Sequence[str] | None) -> int:
+    """Be a program of one command, ``python -m PROGRAM``, as ``wlr`` runs its commands; return the exit code."""
+
+    def dispatch(words: list[str]) -> int:
+        return run_words(program, kind, run, description, words)
+
+    return guarded(dispatch, sys.argv[1:] if arguments is None else arguments)
+
+
+def run_words(program: str, kind: type, run: Callable[[Any], int], description: str, words: Sequence[str]) -> int:
+    """Parse the words of a program of one command and run it."""
+    from wlr_gym.cli import parsing
+
+    return run_options(parsing.parse(kind, program, words, description), run)
 
 
 def _check_word(name: str, arguments: Sequence[str]) -> None:

@@ -26,7 +26,7 @@ from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
-    from wlr_gym.studies.demo.settings import Demo
+    from wlr_gym.demo.settings import Demo
 
 STEPS, QUICK_STEPS = 3_000_000, 16_384
 #: Sizes with --quick.
@@ -59,9 +59,9 @@ def run(options: DemoOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.base.text import duration
-    from wlr_gym.studies.demo import stage
-    from wlr_gym.studies.demo.page import write_page
-    from wlr_gym.studies.demo.workers import WORKERS, run_workers
+    from wlr_gym.demo import stage
+    from wlr_gym.demo.page import write_page
+    from wlr_gym.demo.workers import WORKERS, run_workers
 
     demo = _demo(options)
     refuse_existing(demo.page, options.force)
@@ -88,7 +88,7 @@ def run(options: DemoOptions) -> int:
 
 
 def _demo(options: DemoOptions) -> Demo:
-    from wlr_gym.studies.demo.settings import Demo
+    from wlr_gym.demo.settings import Demo
 
     if options.steps is not None and options.steps < 1:
         raise InputError(f"--steps {options.steps}: expected 1 or more")

@@ -6,7 +6,7 @@ What a steady skid turn needs is allowed on top: yaw rate * reach^2 / side along
 
 Load shift: all four legs lean alike, which moves the wheels under the body. With leg angle phi, hips l_x apart and legs of
 length l the front wheels carry the share 1/2 - l cos(phi) / l_x of the body: equations (16) and (17) of the paper, corrected
-(``wlr_gym/studies/paper/corrected.py``), for parallel legs on a level floor, their own mass neglected. Load goes to the axle
+(``studies/paper/corrected.py``), for parallel legs on a level floor, their own mass neglected. Load goes to the axle
 that slips less.
 """
 

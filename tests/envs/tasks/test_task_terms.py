@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from studies.paper.experiments import LEG_SPEED, TESTS
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.compiled_terms import compile_computed, compile_scores
@@ -20,7 +21,6 @@ from wlr_gym.envs.tasks.terms.geometry import PlanarPose, true_pose
 from wlr_gym.learning.evaluation.metrics import errors_of
 from wlr_gym.learning.evaluation.rollout import Measure
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.paper.experiments import LEG_SPEED, TESTS
 
 POSTURE_COMMANDS = ("front_leg_first", "front_leg_second", "rear_leg_first", "rear_leg_second")
 LINE, CURVE, CIRCLE = 0.5, 1.5, 2.5

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
+from studies.paper import corrected
+from studies.paper.quantities import PaperConstants, State
 from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation import make_core, roll_out, score, tuning
 from wlr_gym.learning.evaluation.tuning import tracking_score
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 from wlr_gym.policy.control import PidConfig, task_settings
 from wlr_gym.robot import load_robot
-from wlr_gym.studies.paper import corrected
-from wlr_gym.studies.paper.quantities import PaperConstants, State
 
 ENVIRONMENT = "WLR-Velocity-v0"
 LEFT, RIGHT = [4, 6], [5, 7]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from vision_studio import pose_of
 
+from studies.bench.vision import _centre_error
+from studies.bench.vision_clutter import clutter
 from wlr_gym.perception.markers.camera import Camera, distort, undistort
 from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.pose import circle_centres, find_target
 from wlr_gym.perception.markers.targets import CODE_NAMES, load_target
 from wlr_gym.perception.scene import Look, ScenePose, project
-from wlr_gym.studies.bench.vision import _centre_error
-from wlr_gym.studies.bench.vision_clutter import clutter
 
 CAMERA = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))
 

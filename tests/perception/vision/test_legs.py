@@ -8,6 +8,7 @@ import pytest
 from test_frame_noise import tilted
 from test_measure import OFFSET, samples_of
 
+from studies.bench.vision_drives import paper_test, pose_at, skid_turn, true_slip
 from wlr_gym.data import Run
 from wlr_gym.perception.vision import slip
 from wlr_gym.perception.vision.legs import STANDING, leg_readings
@@ -16,7 +17,6 @@ from wlr_gym.perception.vision.tracking import angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.tolerance import read_tolerances
-from wlr_gym.studies.bench.vision_drives import paper_test, pose_at, skid_turn, true_slip
 
 
 @pytest.fixture(scope="module")

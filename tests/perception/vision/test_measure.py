@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from studies.bench.vision_drives import paper_test, pose_at, skid_turn, true_slip
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Run, read_run
 from wlr_gym.perception.vision.alignment import align
@@ -15,7 +16,6 @@ from wlr_gym.perception.vision.smoothing import smooth
 from wlr_gym.perception.vision.tracking import LOST, OK, Sample, angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.studies.bench.vision_drives import paper_test, pose_at, skid_turn, true_slip
 
 STD = np.array([5e-5, 5e-5, 1.4e-4, 5e-5, 7e-4, 7e-4])  # of a pose from 2 m above
 OFFSET = 0.137

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, samples_of
 
+from studies.bench.vision_drives import pose_at, skid_turn, true_slip
 from wlr_gym.data import Run
 from wlr_gym.perception.vision import slip
 from wlr_gym.perception.vision.imu_check import imu_findings, wrong_axes
@@ -16,7 +17,6 @@ from wlr_gym.perception.vision.slip import measure_slip
 from wlr_gym.perception.vision.tracking import OK, Sample, angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.studies.bench.vision_drives import pose_at, skid_turn, true_slip
 
 GRAVITY, SECONDS = 9.80665, 5.0
 SIZE = np.array([0.2, 0.1, 0.01, 0.9, 0.03, 0.02])

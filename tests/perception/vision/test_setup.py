@@ -12,6 +12,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
+from studies.bench.__main__ import main as bench
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.perception.markers.calibration import calibrate
@@ -366,7 +367,7 @@ def test_bad_input_is_named(arguments, message, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_bench_reports_every_bar(tmp_path):
     file = tmp_path / "bench.json"
-    assert main(["bench", "vision", "--quick", "--rounds", "1", "--save", str(file)]) == 0
+    assert bench(["vision", "--quick", "--rounds", "1", "--save", str(file)]) == 0
     rows = json.loads(file.read_text())["vision"]
     assert {row["method"].split()[0] for row in rows} == {"ours", "paper's", "tags"}
     assert all(row["met"] for row in rows if row["bar"] is not None and "frames per second" not in row["what"])
@@ -376,6 +377,6 @@ def test_bench_reports_every_bar(tmp_path):
 def test_process_ends_well_after_apriltag_3():
     """The package's destructor frees memory and then uses it: a crash at the end of the process, or later."""
     pytest.importorskip("pupil_apriltags")
-    code = "from wlr_gym.studies.bench.vision_tags import tag_kinds, tag_poses; print(tag_poses(0.0, 4, tag_kinds()[-1])[1])"
+    code = "from studies.bench.vision_tags import tag_kinds, tag_poses; print(tag_poses(0.0, 4, tag_kinds()[-1])[1])"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (0, "all four in 4 of 4 frames\n")

@@ -1,0 +1,356 @@
+"""The paper's two tests, and how to drive them: on the reduced model, on any simulator, on a robot.
+
+Commands as the servos take them: 80 velocity counts for the front wheels at 1 acceleration count, 15 velocity counts for the
+legs; the rear wheels have no torque. Time 0 is when the commands are written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from studies.paper import reduced
+from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.data.body_pose import euler_angles
+from wlr_gym.data.excitations import Motion
+from wlr_gym.data.format import Profile
+from wlr_gym.data.replay import profile_parameters
+from wlr_gym.data.run_states import standing_at
+from wlr_gym.hardware.dynamixel.tables import load_table
+from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
+from wlr_gym.physics.plants.base import Plant, PlantOptions, Sensors
+from wlr_gym.physics.plants.forces import Force
+from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
+from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.slip import no_slip_error
+
+Array = NDArray[np.float64]
+
+TURNS = 4
+#: rad/s, rad/s2, rad/s: 80, 1 and 15 register counts, the paper's commands: 18.32 rpm, 214.577 rev/min2, 3.435 rpm.
+WHEEL_SPEED = load_table("XL430-W250-T").per_count("profile_velocity") * 80
+WHEEL_ACCELERATION = load_table("XL430-W250-T").per_count("profile_acceleration")
+LEG_SPEED = load_table("XM540-W150-R").per_count("profile_velocity") * 15
+PROFILE = Profile(wheel_acceleration=WHEEL_ACCELERATION, leg_velocity=LEG_SPEED, leg_acceleration=0.0)
+#: s per tick; s of rest before the commands, in which the robot settles on its gears, and after the wheels stopped.
+PERIOD = 0.02
+SETTLE = 1.0
+AFTER = 1.0
+#: The nine-velocity model of :mod:`studies.paper.reduced`, beside the plants of
+#: :data:`wlr_gym.physics.plants.BACKENDS`.
+REDUCED = "reduced"
+MODELS = (REDUCED, *SIMULATORS, *REAL)
+
+
+@dataclass(frozen=True)
+class PaperTest:
+    """One test of the paper.
+
+    Attributes:
+        name, title: for files and headings.
+        start, end: angles of front and rear legs, rad.
+        figures: numbers of the paper's figures: rotation, speed, torque, body, path.
+        error, lateral: what the paper reports: relative error of ignoring slip, lateral displacement in m.
+        rear_driven: not as in the paper: the rear wheels are driven like the front ones.
+    """
+
+    name: str
+    title: str
+    start: tuple[float, float]
+    end: tuple[float, float]
+    figures: tuple[int, ...] = ()
+    error: float = 0.0
+    lateral: float = 0.0
+    rear_driven: bool = False
+
+    def motion(self) -> Motion:
+        """Return the setpoints as they are written, NaN = no torque; the servos' profiles make the ramps."""
+        times = PERIOD * np.arange(round((SETTLE + duration() + AFTER) / PERIOD)) - SETTLE
+        commanded = (times > -0.5 * PERIOD)[:, None]
+        setpoints = np.full((len(times), 8), np.nan)
+        setpoints[:, LEG_SLICE] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
+        driven = slice(4, 8) if self.rear_driven else slice(4, 6)
+        setpoints[:, driven] = np.where(commanded[:, 0] & (times < stop_time() - 0.5 * PERIOD), WHEEL_SPEED, 0.0)[:, None]
+        return Motion(self.name, setpoints, PERIOD, PROFILE)
+
+
+#: Leg angles.
+_LOW = math.radians(30)
+_HIGH = math.radians(150)
+TESTS: Mapping[str, PaperTest] = {
+    "test_1": PaperTest("test_1", "first test: rear legs turn", (_LOW, _LOW), (_LOW, _HIGH), (7, 8, 9, 10, 11), 0.115, 0.011),
+    "test_2": PaperTest(
+        "test_2", "second test: all legs turn", (_LOW, _HIGH), (_HIGH, _LOW), (13, 14, 15, 16, 17), 0.05, 0.052
+    ),
+}
+
+
+def paper_test(name: str) -> PaperTest:
+    """Return one of :data:`TESTS`.
+
+    Raises:
+        InputError: no such test.
+    """
+    if name not in TESTS:
+        raise unknown_name("test of the paper", name, TESTS)
+    return TESTS[name]
+
+
+def write_tests(folder: Path) -> list[Path]:
+    """Write the setpoints of both tests as command files, for ``wlr record --commands``; its runs can be replayed and compared.
+
+    Raises:
+        InputError: the folder cannot be written to.
+    """
+    from wlr_gym.data.record import write_commands
+
+    return [write_commands(folder, test.motion()) for test in TESTS.values()]
+
+
+def stop_time() -> float:
+    """When the wheels must be told to stop so that they end after :data:`TURNS` turns: s (up and down ramps are alike)."""
+    return 2 * math.pi * TURNS / WHEEL_SPEED
+
+
+def duration() -> float:
+    """Until the wheels stand: s."""
+    return stop_time() + WHEEL_SPEED / WHEEL_ACCELERATION
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What N robots did: one row per recorded tick, time 0 = the commands. SI; NaN where a robot does not know.
+
+    Attributes:
+        model: which. test: which. time: (T,).
+        joint_position, joint_velocity: (T, N, 8), wheels relative to their leg, zero at time 0.
+        torque: (T, N, 8) motor torque at the output shaft before gear friction; of a robot its effort reading.
+        position: (T, N, 3) body origin: x and y from where it was at time 0, height above the floor.
+        attitude: (T, N, 3) yaw, pitch (nose down +), roll. velocity: (T, N, 3) of the origin in the yaw frame.
+        yaw_rate: (T, N). slip: (T, N, 4, 2) slip velocity along and across; slip_path: its integral.
+        force: (T, N, 4, 3) of the floor on each wheel: along, across, normal.
+    """
+
+    model: str
+    test: PaperTest
+    time: Array
+    joint_position: Array
+    joint_velocity: Array
+    torque: Array
+    position: Array
+    attitude: Array
+    velocity: Array
+    yaw_rate: Array
+    slip: Array
+    slip_path: Array
+    force: Array
+
+    @property
+    def end(self) -> Array:
+        """Last x, y (N, 2), m."""
+        return self.position[-1, :, :2]
+
+
+def no_slip_travel(robot: Robot, record: Record, encoder_on_leg: bool) -> Array:
+    """Return how far the front wheels would have moved the body without slip, (T, N), m, from encoders and legs: (3).
+
+    Args:
+        robot: whose lengths.
+        record: the motion.
+        encoder_on_leg: True: the wheel angle is relative to the leg, as the servo reads it. False: as (3) is printed, which
+            takes it for the absolute one.
+    """
+    c = reduced.constants_of(Parameters.nominal(robot))
+    joints = record.joint_position
+    front, rear = joints[:, :, :2].mean(axis=2), joints[:, :, 2:4].mean(axis=2)
+    p = reduced.posture(c, front, rear)
+    reach = c.l_x / 2 * np.cos(p.pitch) + c.l * np.cos(p.f)
+    turned = joints[:, :, 4:6].mean(axis=2) + (p.f if encoder_on_leg else 0.0)
+    start = int(np.argmin(np.abs(record.time)))
+    return c.a * (turned - turned[start]) - (reach - reach[start])
+
+
+def error_of_ignoring_slip(robot: Robot, record: Record) -> Array:
+    """Return the paper's measure (N,): 1 - travel/no-slip travel at the end; positive = falls short."""
+    return no_slip_error(record.end[:, 0], no_slip_travel(robot, record, True)[-1])
+
+
+# ---- driving ---------------------------------------------------------------------------------------------------------
+
+
+def drive(
+    model: str,
+    test: PaperTest,
+    robot: Robot,
+    parameters: Parameters | None = None,
+    forces: tuple[Force, ...] = (),
+    physics_step: float | None = None,
+    every: int = 1,
+    threads: int = 1,
+    precision: str = "float64",
+) -> Record:
+    """Drive one test, N robots at once.
+
+    Args:
+        model: the reduced one, or a simulator.
+        test: of :data:`TESTS`. robot: the robot.
+        parameters: (N); None = one nominal robot. The test's servo profile is written into them.
+        forces: formula forces (simulators).
+        physics_step: s; None = 1 ms, for the reduced model 2 ms.
+        every: record every so many control ticks.
+        threads, precision: of a simulator.
+
+    Raises:
+        InputError: unknown model, formula forces for the reduced model.
+    """
+    parameters = profile_parameters(Parameters.nominal(robot) if parameters is None else parameters, PROFILE)
+    if model == REDUCED:
+        if forces:
+            raise InputError("the reduced model takes no formula forces; expected a simulator")
+        return _drive_reduced([test], robot, parameters, physics_step or 0.002, every)[0]
+    if model not in SIMULATORS:
+        raise unknown_name("backend", model, (REDUCED, *SIMULATORS))
+    options = PlantOptions(PERIOD, physics_step or 0.001, precision, threads, sensor_noise=False)
+    with closing(make_plant(model, robot, len(parameters), options, forces)) as plant:
+        return drive_plant(plant, test, parameters, every)
+
+
+def drive_plant(plant: Plant, test: PaperTest, parameters: Parameters, every: int = 1) -> Record:
+    """Drive one test on a plant that is there, from the test's posture (a robot moves its legs there in its reset).
+
+    A robot shows what it can measure: effort for torque, the camera for the pose; its slip and floor forces are NaN.
+    """
+    setpoints = test.motion().setpoints
+    torque_on = np.isfinite(setpoints)
+    count = plant.count
+    state = standing_at(np.tile(setpoints[0], (count, 1)), plant.robot, parameters)
+    seeds = np.arange(count, dtype=np.uint64)
+    readings = plant.reset(seeds=seeds, parameters=parameters if plant.capabilities.can_set_state else None, state=state)
+    look = _look_at_truth if plant.capabilities.has_truth else _look_at_sensors
+    slip_path = np.zeros((count, 8))
+    rows, seen = [look(plant, readings, slip_path)], readings.camera_is_new > 0.0
+    for tick, (goal, on) in enumerate(zip(setpoints, torque_on, strict=True)):
+        asked = np.where(on, goal, np.where(np.arange(8) < 4, np.pi / 2, 0.0))
+        readings = plant.step(np.tile(asked, (count, 1)), np.tile(on, (count, 1)))
+        seen = seen | (readings.camera_is_new > 0.0)
+        if plant.capabilities.has_truth:
+            slip_path = slip_path + plant.truth().slip_displacement
+        if (tick + 1) % every == 0:
+            rows.append(look(plant, readings, slip_path))
+    record = _record(plant.capabilities.name, test, rows, every)
+    if not plant.capabilities.has_truth:  # a robot without a camera does not know where it is
+        record.position[:, ~seen], record.attitude[:, ~seen] = np.nan, np.nan
+    return record
+
+
+Row = dict[str, Array]
+
+
+def _look_at_truth(plant: Plant, readings: Sensors, slip_path: Array) -> Row:
+    truth = plant.truth()
+    yaw, pitch, roll = euler_angles(truth.quaternion)
+    v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
+    level = np.einsum("nij,nj->ni", rotation(np.zeros_like(yaw), pitch, roll), v)
+    return {
+        "joint_position": truth.joint_position + np.pad(plant.parameters["joint.zero_offset"], ((0, 0), (0, 4))),
+        "joint_velocity": truth.joint_velocity.copy(),
+        "torque": truth.motor_torque.copy(),
+        "position": truth.position.copy(),
+        "attitude": np.stack([yaw, pitch, roll], axis=1),
+        "velocity": level,
+        "yaw_rate": (np.sin(roll) * w[:, 1] + np.cos(roll) * w[:, 2]) / np.cos(pitch),
+        "slip": truth.slip_velocity.reshape(-1, 4, 2).copy(),
+        "slip_path": slip_path.reshape(-1, 4, 2).copy(),
+        "force": truth.contact_force.reshape(-1, 4, 3).copy(),
+    }
+
+
+def _look_at_sensors(plant: Plant, readings: Sensors, slip_path: Array) -> Row:
+    count = plant.count
+    unknown = np.full((count, 4, 3), np.nan)
+    x, y, yaw = readings.camera_pose.T
+    return {
+        "joint_position": readings.joint_position.copy(),
+        "joint_velocity": readings.joint_velocity.copy(),
+        "torque": readings.joint_effort.copy(),
+        "position": np.stack([x, y, np.full(count, np.nan)], axis=1),
+        "attitude": np.stack([yaw, np.full(count, np.nan), np.full(count, np.nan)], axis=1),
+        "velocity": unknown[:, 0].copy(),
+        "yaw_rate": readings.gyro[:, 2].copy(),
+        "slip": unknown[:, :, :2].copy(),
+        "slip_path": unknown[:, :, :2].copy(),
+        "force": unknown.copy(),
+    }
+
+
+def _record(model: str, test: PaperTest, rows: list[Row], every: int) -> Record:
+    found = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    time = np.asarray(PERIOD * every * np.arange(len(rows)) - SETTLE, dtype=np.float64)
+    start = int(np.argmin(np.abs(time)))
+    found["joint_position"][:, :, WHEEL_SLICE] -= found["joint_position"][start, :, WHEEL_SLICE]
+    found["position"][:, :, :2] -= found["position"][start, :, :2]
+    found["slip_path"] = found["slip_path"] - found["slip_path"][start]
+    found["attitude"][:, :, 0] = np.unwrap(found["attitude"][:, :, 0], axis=0)
+    return Record(model, test, time, **found)
+
+
+def _drive_reduced(tests: list[PaperTest], robot: Robot, parameters: Parameters, step: float, every: int) -> list[Record]:
+    """All tests side by side, one block of robots each: a batch costs hardly more than one robot."""
+    count, blocks = len(parameters), len(tests)
+    model = reduced.ReducedModel(robot, Parameters(np.tile(parameters.values, (blocks, 1))), step)
+    setpoints = np.concatenate(
+        [np.repeat(test.motion().setpoints[:, None, reduced.PAIRS], count, axis=1) for test in tests], axis=1
+    )
+    starts = np.repeat([test.start for test in tests], count, axis=0)
+    rows, path, last = [], np.zeros((count * blocks, 4, 2)), np.zeros((count * blocks, 4, 2))
+    state = model.standing(*starts.T)
+    for tick, now in enumerate(reduced.run(model, state, np.nan_to_num(setpoints), np.isfinite(setpoints), PERIOD)):
+        slip = model.slip(now)
+        path, last = path + 0.5 * PERIOD * (slip + last), slip
+        if tick % every == 0:
+            rows.append(_look_at_reduced(model, now, slip, path))
+    whole = _record(REDUCED, tests[0], rows, every)
+    robots = np.arange(count)
+    return [replace(select(whole, robots + k * count), test=test) for k, test in enumerate(tests)]
+
+
+def _look_at_reduced(model: reduced.ReducedModel, state: reduced.ReducedState, slip: Array, path: Array) -> Row:
+    p = reduced.posture(model.constants, *state.legs.T)
+    b, _ = reduced.reduction(model.constants, p, state.u)
+    u = np.einsum("nij,nj->ni", b, state.u)
+    zero = np.zeros(len(u))
+    return {
+        "joint_position": np.concatenate([np.repeat(state.legs, 2, axis=1), state.wheels], axis=1),
+        "joint_velocity": np.concatenate([np.repeat(state.u[:, 3:5], 2, axis=1), state.u[:, 5:]], axis=1),
+        "torque": np.concatenate([np.repeat(state.motor[:, :2] / 2, 2, axis=1), state.motor[:, 2:]], axis=1),
+        "position": np.column_stack([state.pose[:, :2], p.height]),
+        "attitude": np.stack([state.pose[:, 2], p.pitch, zero], axis=1),
+        "velocity": np.stack([u[:, reduced.VX], u[:, reduced.VY], u[:, reduced.VZ]], axis=1),
+        "yaw_rate": state.u[:, 2].copy(),
+        "slip": slip,
+        "slip_path": path.copy(),
+        "force": np.stack([state.along, state.lateral, state.normal], axis=2),
+    }
+
+
+def drive_both(model: str, robot: Robot, parameters: Parameters | None = None) -> dict[str, Record]:
+    """Drive both tests on one model; see :func:`drive`."""
+    if model == REDUCED:
+        nominal = profile_parameters(Parameters.nominal(robot) if parameters is None else parameters, PROFILE)
+        return dict(zip(TESTS, _drive_reduced(list(TESTS.values()), robot, nominal, 0.002, 1), strict=True))
+    return {name: drive(model, test, robot, parameters) for name, test in TESTS.items()}
+
+
+def select(record: Record, robots: NDArray[np.intp]) -> Record:
+    """Return a record of some of its robots only."""
+    arrays = {
+        name: value[:, robots] for name, value in vars(record).items() if isinstance(value, np.ndarray) and value.ndim > 1
+    }
+    return replace(record, **arrays)

@@ -1,0 +1,293 @@
+"""What could make the robot slip as the paper reports? A search with the effect library on the Gibbs-Appell engine.
+
+A rigid robot on Coulomb friction makes both tests with no slip and no drift. The paper reports 11.5 % and 1.1 cm in the first
+test, 5 % and 5.2 cm in the second. Candidates are tried alone and in pairs, by random draws that close in on the paper's four
+numbers. What is reported are the ranges of all draws that give all four at once: not the best one, and not a cause.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from studies.paper.experiments import PaperTest
+from studies.paper.slip_candidates import (
+    CANDIDATES,
+    FLOOR_DIAL,
+    READINGS,
+    Dial,
+    PaperReading,
+    SlipCandidate,
+    make_parameters,
+    scaled,
+)
+from studies.paper.slip_outcomes import Outcomes, measure, outcomes
+from wlr_gym.base.random import generator
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+#: Share of draws that are made anew in every round; the rest are made near the best so far, closer each round.
+_FRESH = 0.15
+#: Best draws of each reading that new ones are made near.
+_ELITE = 8
+#: Combinations that are drawn again for each reading, and rounds of it.
+BEAM = 4
+ROUNDS = 3
+#: In tolerances: what comes near a match.
+_NEAR = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class SearchFinding:
+    """One candidate, or a pair of them.
+
+    Attributes:
+        names: of the candidates. dials: their numbers, the floor's mu last. values: (N, dials) all draws.
+        outcomes: of all draws.
+    """
+
+    names: tuple[str, ...]
+    dials: tuple[Dial, ...]
+    values: Array
+    outcomes: Outcomes
+
+    @property
+    def label(self) -> str:
+        """``rear drag + radius``."""
+        return " + ".join(self.names)
+
+    def matches(self, reading: PaperReading) -> NDArray[np.intp]:
+        """Return the draws that give all four numbers."""
+        return np.flatnonzero(self.outcomes.miss(reading) <= 1.0)
+
+    def closest(self, reading: PaperReading) -> float:
+        """Return the smallest miss, in tolerances."""
+        return float(self.outcomes.miss(reading).min())
+
+    def parameters(self, robot: Robot, rows: NDArray[np.intp]) -> Parameters:
+        """Return the robots of some draws."""
+        return make_parameters(robot, self.dials, self.values[rows])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types: per reading how close, how many matches, and the range of every dial among them."""
+        found: dict[str, Any] = {"candidates": list(self.names), "draws": len(self.values), "readings": {}}
+        for reading in READINGS:
+            rows = self.matches(reading)
+            entry: dict[str, Any] = {"closest": self.closest(reading), "matches": len(rows)}
+            if len(rows):
+                low, high = self.values[rows].min(axis=0), self.values[rows].max(axis=0)
+                entry["ranges"] = {
+                    dial.label: {"low": float(a), "high": float(b), "unit": dial.unit}
+                    for dial, a, b in zip(self.dials, low, high, strict=True)
+                }
+            found["readings"][reading.name] = entry
+        return found
+
+
+def search(
+    robot: Robot,
+    draws: int = 16,
+    levels: int = 3,
+    seed: int = 0,
+    candidates: Sequence[SlipCandidate] = CANDIDATES,
+    threads: int = 2,
+    tell: Callable[[float], None] = lambda share: None,
+) -> list[SearchFinding]:
+    """Try every candidate alone, every pair, then the pairs that came closest together with every third.
+
+    Each level starts with ``draws`` draws for each of its combinations; the :data:`BEAM` that come closest to each reading are
+    drawn again in :data:`ROUNDS` rounds of four times as many, near the best so far and nearer each round. At last all that
+    have a match are drawn again, sixteen times as many near their best: how far do the matches reach?
+
+    Args:
+        robot: the nominal one.
+        draws: per combination at first.
+        levels: most candidates at once, 1 to 3.
+        seed: another seed, other draws.
+        candidates: what to try.
+        threads: of the engine.
+        tell: told the share of the batches that are driven.
+
+    Returns:
+        One finding per combination; no choice is made among them.
+    """
+    findings: list[SearchFinding] = []
+    matched: list[_Trial] = []
+    driven, batches = itertools.count(1), levels * (ROUNDS + 2) + 1
+    for level in range(1, levels + 1):
+        if level < 3:
+            combos = list(itertools.combinations(candidates, level))
+        else:
+            combos = _extended(_survivors([found for found in findings if len(found.names) == 2]), candidates)
+        trials = [_Trial(combo, generator(seed, "paper", *(c.name for c in combo)), draws) for combo in combos]
+        _drive_all(robot, trials, threads)
+        tell(next(driven) / batches)
+        for turn in range(ROUNDS):
+            near = {found.names for found in _survivors([trial.finding() for trial in trials])}
+            chosen = [trial for trial in trials if trial.names in near]
+            for trial in chosen:
+                trial.close_in(4 * draws, 0.2 / 2.0**turn)
+            _drive_all(robot, chosen, threads)
+            tell(next(driven) / batches)
+        _drive_again(robot, trials, threads)
+        tell(next(driven) / batches)
+        matched += [trial for trial in trials if trial.matches]
+        findings += [trial.finding() for trial in trials]
+    _spread(robot, matched, 16 * draws, threads)
+    spread = {trial.names: trial.finding() for trial in matched}
+    return [spread.get(found.names, found) for found in findings]
+
+
+def _survivors(findings: Sequence[SearchFinding]) -> list[SearchFinding]:
+    """The findings that come closest to each reading, each once."""
+    near = {}
+    for reading in READINGS:
+        for found in sorted(findings, key=lambda found: found.closest(reading))[:BEAM]:
+            near[found.names] = found
+    return list(near.values())
+
+
+def _extended(findings: Sequence[SearchFinding], candidates: Sequence[SlipCandidate]) -> list[tuple[SlipCandidate, ...]]:
+    """Every finding with each candidate that it lacks, in the candidates' own order."""
+    names = {
+        frozenset({*found.names, other.name}) for found in findings for other in candidates if other.name not in found.names
+    }
+    combos = [tuple(candidate for candidate in candidates if candidate.name in chosen) for chosen in names]
+    return sorted(combos, key=lambda combo: [candidate.name for candidate in combo])
+
+
+class _Trial:
+    """A combination while it is searched: its draws in the unit cube, and what came of them."""
+
+    def __init__(self, combo: Sequence[SlipCandidate], stream: np.random.Generator, draws: int) -> None:
+        self.names = tuple(candidate.name for candidate in combo)
+        self.dials = (*(dial for candidate in combo for dial in candidate.dials), FLOOR_DIAL)
+        self.stream = stream
+        self.seen, self.parts = np.zeros((0, len(self.dials))), list[Outcomes]()
+        self.waiting: Array = stream.uniform(size=(draws, len(self.dials)))
+
+    def close_in(self, draws: int, width: float) -> None:
+        """Draw near the best of every reading so far, ``width`` away in the unit cube; a few anywhere."""
+        known, size = _joined(self.parts), (draws, len(self.dials))
+        best = np.concatenate([np.argsort(known.miss(reading), kind="stable")[:_ELITE] for reading in READINGS])
+        near = np.abs(self.seen[self.stream.choice(best, draws)] + width * self.stream.normal(size=size))
+        near = 1.0 - np.abs(1.0 - near)  # reflected at both ends
+        anew = self.stream.uniform(size=draws) < _FRESH
+        self.waiting = np.clip(np.where(anew[:, None], self.stream.uniform(size=size), near), 0.0, 1.0)
+
+    def take(self, outcomes: Outcomes) -> None:
+        """Take the outcomes of the waiting draws."""
+        self.seen, self.parts = np.concatenate([self.seen, self.waiting]), [*self.parts, outcomes]
+
+    @property
+    def matches(self) -> bool:
+        """Whether a draw matches, in any reading."""
+        return any(len(self.finding().matches(reading)) for reading in READINGS)
+
+    def finding(self) -> SearchFinding:
+        """Return all there is so far."""
+        return SearchFinding(self.names, self.dials, scaled(self.dials, self.seen), _joined(self.parts))
+
+
+def _drive_all(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
+    """Drive the waiting draws of all trials in one batch."""
+    rows = [make_parameters(robot, trial.dials, scaled(trial.dials, trial.waiting)).values for trial in trials]
+    every = outcomes(robot, Parameters(np.concatenate(rows)), threads, exact=False)
+    ends = np.cumsum([len(trial.waiting) for trial in trials])
+    for trial, end in zip(trials, ends, strict=True):
+        trial.take(every.take(np.arange(end - len(trial.waiting), end)))
+
+
+def _spread(robot: Robot, trials: Sequence[_Trial], draws: int, threads: int) -> None:
+    """Draw near the best of trials that match, wide and narrow."""
+    for width in (0.15, 0.05) if trials else ():
+        for trial in trials:
+            trial.close_in(draws // 2, width)
+        _drive_all(robot, trials, threads)
+        _drive_again(robot, trials, threads)
+
+
+def _drive_again(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
+    """Put the exact outcomes in the place of the fast ones where these come near a match."""
+    known = [_joined(trial.parts) for trial in trials]
+    near = [np.flatnonzero(np.min([found.miss(reading) for reading in READINGS], axis=0) < _NEAR) for found in known]
+    if not any(map(len, near)):
+        return
+    rows = [
+        make_parameters(robot, trial.dials, scaled(trial.dials, trial.seen[rows])).values
+        for trial, rows in zip(trials, near, strict=True)
+        if len(rows)
+    ]
+    exact, start = outcomes(robot, Parameters(np.concatenate(rows)), threads), 0
+    for trial, found, rows in zip(trials, known, near, strict=True):
+        for name, values in vars(found).items():
+            values[rows] = getattr(exact, name)[start : start + len(rows)]
+        trial.parts, start = [found], start + len(rows)
+
+
+def _joined(parts: Sequence[Outcomes]) -> Outcomes:
+    return Outcomes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+
+
+# ---- what would decide -----------------------------------------------------------------------------------------------
+
+_DOWN = (np.pi / 2, np.pi / 2)
+#: Legs straight down, same wheels: a third drive that any of the candidates could be told by.
+CONTROL = PaperTest("control", "control: legs straight down", _DOWN, _DOWN)
+
+#: What else could have been measured: name -> meaning and unit.
+OBSERVABLES: Mapping[str, tuple[str, str]] = {
+    "control_error": ("error of ignoring slip with all legs straight down, same wheels", "%"),
+    "control_lateral": ("lateral displacement in that drive, absolute", "cm"),
+    "rear_turns_1": ("encoder turns of the rear wheels in the first test", "turns"),
+    "rear_turns_2": ("encoder turns of the rear wheels in the second test", "turns"),
+    "front_effort_1": ("mean effort of a front wheel in the first test", "N m"),
+    "front_effort_2": ("mean effort of a front wheel in the second test", "N m"),
+    "yaw_2": ("heading at the end of the second test, absolute", "deg"),
+}
+
+
+def observables(
+    robot: Robot, findings: Sequence[SearchFinding], reading: PaperReading, most: int = 32, threads: int = 2
+) -> list[dict[str, Array]]:
+    """Return what the matching robots of each finding would have shown elsewhere: :data:`OBSERVABLES`, each (matches,).
+
+    Args:
+        robot: nominal. findings: with matches. reading: whose matches.
+        most: of the matches of one finding are driven again for the control drive, the first ones.
+        threads: of the engine.
+    """
+    chosen = [finding.matches(reading)[:most] for finding in findings]
+    if not chosen:
+        return []
+    batch = [finding.parameters(robot, rows).values for finding, rows in zip(findings, chosen, strict=True)]
+    control = measure(robot, Parameters(np.concatenate(batch)), CONTROL, threads)
+    shown, end = [], 0
+    for finding, rows in zip(findings, chosen, strict=True):
+        start, end = end, end + len(rows)
+        own = finding.outcomes.take(rows)
+        shown.append(
+            {
+                "control_error": 100 * control["error_encoder"][start:end],
+                "control_lateral": 100 * np.abs(control["lateral"][start:end]),
+                "rear_turns_1": own.rear_turns[:, 0],
+                "rear_turns_2": own.rear_turns[:, 1],
+                "front_effort_1": own.front_effort[:, 0],
+                "front_effort_2": own.front_effort[:, 1],
+                "yaw_2": np.degrees(np.abs(own.yaw[:, 1])),
+            }
+        )
+    return shown
+
+
+def matching(findings: Sequence[SearchFinding], reading: PaperReading) -> list[SearchFinding]:
+    """Return the findings with a match, most matches first."""
+    ordered = sorted(findings, key=lambda finding: -len(finding.matches(reading)))
+    return [finding for finding in ordered if len(finding.matches(reading))]

@@ -1,0 +1,168 @@
+"""The verdict on every equation of the paper, with its functions as printed, with misprints undone, and corrected.
+
+Verdicts: ``correct``; ``conditional`` (true under a condition the paper does not state); ``misprint`` (print or OCR: which of
+the two cannot be told from the text); ``incomplete`` (terms are missing); ``wrong`` (physics). tests/studies/paper proves
+each of them.
+Source: Korayem, Nikseresht, Asadi 2024, "Vision-based dynamic modeling of wheeled-legged robot considering slippage using
+Gibbs-Appell formulation", Robotica.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from studies.paper import corrected, printed, repaired
+
+CORRECT = "correct"
+CONDITIONAL = "conditional"
+MISPRINT = "misprint"
+INCOMPLETE = "incomplete"
+WRONG = "wrong"
+
+
+@dataclass(frozen=True)
+class Equation:
+    """One equation of the paper.
+
+    Attributes:
+        number, title, section: in the paper. verdicts: of the words above.
+        remark: what is right or wrong with it, in a sentence.
+        correction: the right form, as text.
+        printed, repaired, corrected: functions; ``repaired`` is None where nothing, or only a last bracket, is misprinted.
+    """
+
+    number: int
+    title: str
+    section: str
+    verdicts: tuple[str, ...]
+    remark: str
+    correction: str
+    printed: Callable[..., Any]
+    corrected: Callable[..., Any]
+    repaired: Callable[..., Any] | None = None
+
+
+def _rows() -> list[tuple[int, str, str, tuple[str, ...], str, str]]:
+    slip = (
+        "called the wheel's velocity, it is (contact point) - (slip): 0 on every true motion; leg and pitch rates are missing"
+    )
+    true_slip = "x_s' = x' - y_i th' + X_i' - a (th_i' + leg' + psi'), y_s' = y' + th' X_i, z_s' = 0"
+    torque = (
+        "= dS/dth_i'' once its bracket is closed; that bracket is 0 on a true motion, and the traction a F_x, most of the "
+        "torque, is missing"
+    )
+    true_torque = "tau_i = I_o (th_i'' + leg'' + psi'') + J_w th_i'' + a F_x,i"
+    force = "lost sgn(x_s'); = left side of (18), which is 0 on a true motion, not a force"
+    true_force = "F_x,i = (tau_i - I_o (th_i'' + leg'' + psi'') - J_w th_i'')/a, at most mu N_i; -mu N_i sgn(x_s') when sliding"
+    denominator = "denominator lost 'l(': adds metres to a pure number"
+    no_inertia = f"{denominator}; lost sgn(y'); lateral inertia dropped; = left side of (18) again, not a force"
+    lateral = "the rows of y and th give it: F_f + F_r = inertia of y, X_f F_f + X_r F_r = inertia of th - moment of the F_x,i"
+    return [
+        (1, "velocity of a wheel centre", "3.1", (CORRECT,), "relative velocity taken in the yaw frame", "as printed"),
+        (
+            2, "velocity of the body", "3.1", (CONDITIONAL,),
+            "true for components of the yaw frame only, which is not said",
+            "x' = X' cos th + Y' sin th, y' = Y' cos th - X' sin th",
+        ),
+        (3, "right front wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
+        (4, "left front wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
+        (5, "right rear wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
+        (6, "left rear wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
+        (
+            7, "Gibbs function of the wheels", "3.2", (CONDITIONAL, INCOMPLETE),
+            "right for absolute wheel angles; wheel mass and diametral inertia are missing",
+            "I_o/2 (th_i'' + leg'' + psi'')^2 + J_w/2 th_i''^2 + I_t/2 th''^2 + m_w/2 a_i^2",
+        ),
+        (
+            8, "Gibbs function of the legs", "3.2", (WRONG,),
+            "leg spin and angle are relative, velocity terms missing, a_i is the residual of (3)-(6), not a leg's acceleration",
+            "absolute alpha'' + psi'', cos^2(alpha + psi), I_along sin^2, coupling terms, acceleration of the mid-leg point",
+        ),
+        (
+            9, "Gibbs function of the body", "3.2", (MISPRINT, INCOMPLETE),
+            "Psi'^2 for Psi''^2; inertia about x and velocity terms of a pitched body are missing",
+            "I_yaw = I_Gx sin^2 psi + I_Gz cos^2 psi; + I_yaw' psi' th' th'' - I_yaw'/2 th'^2 psi''",
+        ),
+        (10, "Gibbs function", "3.2", (INCOMPLETE, WRONG), "sum of (7)-(9), Psi''^2 right; has their faults", "sum of them"),
+        (
+            11, "acceleration of the body", "3.2", (WRONG,),
+            "drops -th' y': true without lateral velocity only", "(x'' - th' y') i + (y'' + th' x') j + z'' k",
+        ),
+        (
+            12, "potential", "3.2", (MISPRINT,),
+            "legs' term without psi; and psi must be eliminated before differentiating",
+            "V = g l (m_l + M_G/2)(sin(alpha + psi) + sin(beta + psi)) + constants",
+        ),
+        (
+            13, "Dahl friction", "3.2", (INCOMPLETE,), "state equation missing; sigma_0 is a stiffness, not a roughness",
+            "F = -sigma_0 z, z' = v - sigma_0 |v| z/(mu F_n)",
+        ),
+        (
+            14, "Coulomb friction", "3.2", (CONDITIONAL,),
+            "steady sliding limit of (13), with v the slip velocity, not the wheel's; says nothing of sticking",
+            "F = -mu F_n s/|s| for slip s; |F| <= mu F_n at rest",
+        ),
+        (
+            15, "dissipation", "3.2", (MISPRINT, CONDITIONAL),
+            "bracket after mu_dx is not closed; adds x and y to a square: up to sqrt(2) mu F_n",
+            "sum F_n sqrt((mu_x x_s')^2 + (mu_y y_s')^2), F_n not differentiated",
+        ),
+        (16, "normal force in front", "3.2", (CORRECT,), "at rest, mass of the leg at mid-leg, massless wheels", "+ m_w g"),
+        (17, "normal force behind", "3.2", (CORRECT,), "likewise", "+ m_w g"),
+        (18, "Gibbs-Appell with slip", "3.2", (CORRECT,), "for slip coordinates the right side is 0", "as printed"),
+        (
+            19, "torque of the front legs", "3.2", (MISPRINT, INCOMPLETE, WRONG),
+            "z-part lost a factor 2 and has the leg inside its 1/2; gravity, normal forces and traction are missing",
+            "tau_alpha = 2 (J_l + I_o + J_h) alpha'' + ... + 2 l cos f (N_f - m_l g/2) + (l sin f + a)(F_rf + F_lf)",
+        ),
+        (20, "torque of the rear legs", "3.2", (MISPRINT, INCOMPLETE, WRONG), "as (19)", "as (19) with beta"),
+        (21, "torque of the right front wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
+        (22, "torque of the left front wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
+        (23, "torque of the right rear wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
+        (24, "torque of the left rear wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
+        (25, "force on the right front wheel", "3.2", (MISPRINT, WRONG), force, true_force),
+        (26, "force on the left front wheel", "3.2", (MISPRINT, WRONG), force, true_force),
+        (27, "force on the right rear wheel", "3.2", (MISPRINT, WRONG), f"sign of th'' l_y; {force}", true_force),
+        (28, "force on the left rear wheel", "3.2", (MISPRINT, WRONG), f"{denominator}; {force}", true_force),
+        (29, "lateral force in front", "3.2", (MISPRINT, INCOMPLETE, WRONG), no_inertia, lateral),
+        (30, "lateral force behind", "3.2", (MISPRINT, INCOMPLETE, WRONG), no_inertia, lateral),
+    ]  # fmt: skip
+
+
+def _function(module: Any, number: int) -> Callable[..., Any] | None:
+    """The function of an equation in a module; None = there is none."""
+    return next((value for name, value in vars(module).items() if name.startswith(f"eq{number}_")), None)
+
+
+def _equation(number: int, title: str, section: str, verdicts: tuple[str, ...], remark: str, correction: str) -> Equation:
+    as_printed, right = (_function(module, number) for module in (printed, corrected))
+    assert as_printed is not None
+    assert right is not None
+    return Equation(number, title, section, verdicts, remark, correction, as_printed, right, _function(repaired, number))
+
+
+#: Every equation by its number.
+EQUATIONS: dict[int, Equation] = {row[0]: _equation(*row) for row in _rows()}
+
+
+def verdict_table() -> list[str]:
+    """Return the verdicts as lines of a Markdown table; equations of one verdict, remark and correction share a line."""
+    groups: dict[tuple[tuple[str, ...], str, str], list[Equation]] = {}
+    for equation in EQUATIONS.values():
+        groups.setdefault((equation.verdicts, equation.remark, equation.correction), []).append(equation)
+    head = ["| | equation | verdict | why | correct |", "|---|---|---|---|---|"]
+    return head + [
+        f"| {', '.join(f'({e.number})' for e in same)} | {'; '.join(e.title for e in same)} | {', '.join(verdicts)} "
+        f"| {_cell(remark)} | {_code(right)} |"
+        for (verdicts, remark, right), same in groups.items()
+    ]
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("*", "\\*")
+
+
+def _code(text: str) -> str:
+    return f"`{text}`".replace("|", "\\|")

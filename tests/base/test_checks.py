@@ -1,0 +1,43 @@
+"""Every refusal names place, value and what was expected."""
+
+import pytest
+
+from wlr_gym.base.checks import check_file, check_folder, check_name, check_number
+from wlr_gym.base.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "unit", "bounds", "message"),
+    [
+        ("--segment", 0.0, "s", {"above": 0.0}, "--segment 0: expected more than 0 s"),
+        ("--deadman", 7.0, "s", {"above": 0.0, "most": 5.0}, "--deadman 7: expected more than 0 and 5 at most s"),
+        ("robot.yaml: body.mass", -1, "kg", {"least": 0.0}, "robot.yaml: body.mass = -1: expected 0 or more kg"),
+        ("episodes", 3.5, "", {"least": 1, "most": 9, "whole": True}, "episodes = 3.5: expected a whole number from 1 to 9"),
+        ("episodes", True, "", {"least": 1, "whole": True}, "episodes = True: expected a whole number, 1 or more"),
+        ("share", float("nan"), "", {}, "share = nan: expected a finite number"),
+        ("share", 1.0, "", {"least": 0.0, "below": 1.0, "what": "a share"}, "expected 0 or more and less than 1; a share"),
+        ("share", "half", "", {"least": 0.0, "most": 1.0}, "share = 'half': expected a number from 0 to 1"),
+    ],
+)
+def test_numbers_outside_are_refused(place, value, unit, bounds, message):
+    with pytest.raises(InputError) as refused:
+        check_number(place, value, unit, **bounds)
+    assert message in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("value", "bounds"), [(0, {"least": 0}), (5.0, {"most": 5.0}), (1, {"whole": True, "above": 0}), (1e-9, {"above": 0.0})]
+)
+def test_numbers_inside_pass(value, bounds):
+    check_number("x", value, **bounds)
+
+
+def test_names_and_places(tmp_path):
+    check_name("plant", "mujoco", ["mujoco", "gibbs_appell"])
+    with pytest.raises(InputError, match=r"--backend: unknown plant 'mujco' \(did you mean 'mujoco'\?\); valid: "):
+        check_name("plant", "mujco", ["mujoco", "gibbs_appell"], "--backend")
+    check_folder(tmp_path)
+    with pytest.raises(InputError, match="is a folder; expected a file"):
+        check_file(tmp_path)
+    with pytest.raises(InputError, match="no such folder; expected a folder"):
+        check_folder(tmp_path / "none")

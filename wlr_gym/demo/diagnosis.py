@@ -1,0 +1,334 @@
+"""Last stages: the gap workflow names the hidden fault, its patch is tried on held-out runs, and the truth is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.html import heading, table
+from wlr_gym.base.plots import new_figure, tidy
+from wlr_gym.base.text import number
+from wlr_gym.demo.settings import Demo
+from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, drawn, link, paragraph, picture
+from wlr_gym.gap.report.text import UNEXPLAINED, channel, error, listed, percent, places, plain, unit_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from wlr_gym.data.replay import ChannelError, ReplayResult
+    from wlr_gym.gap.analysis import Analysis
+    from wlr_gym.gap.report.entries import EffectEntry, GapEntry, Result, RunGapEntry
+    from wlr_gym.physics.effects.effect import PatchEffect
+
+NAME_TITLE = "4. What does the simulator lack?"
+CHECK_TITLE = "5. Does it hold?"
+#: Channels in the picture of a replay.
+_SHOWN = 3
+#: A channel has got worse where its error rises by more than this; 1 = sensor noise.
+_WORSE = 0.1
+#: Channel -> error, of each of several replays.
+Errors = Sequence[Mapping[str, "ChannelError"]]
+
+
+def name(demo: Demo, tell: Tell) -> Section:
+    """Run the gap workflow on the measured runs, and nothing else."""
+    from wlr_gym.gap import analyse
+    from wlr_gym.gap.analysis import EFFECT_FOUND
+    from wlr_gym.gap.report.folder import REPORT_FILE
+    from wlr_gym.gap.report.text import sentence
+
+    if not demo.measured.is_dir():
+        raise InputError("no measured runs: the robot was not driven")
+    found = analyse(demo.measured, demo.gap, tell=lambda text, share: tell(f"gap workflow: {text}", share))
+    html = paragraph(
+        "The gap workflow gets the folder of measured runs. It calibrates the simulator within its tolerances, tests every "
+        "effect of its library at every place, and holds out one run or two that no fit has seen."
+    )
+    if found.gap is not None:
+        html += paragraph(f"Error of replayed runs: {found.gap.metric}.")
+    html += f"<p><b>{escape(sentence(found))}</b></p>"
+    plots = demo.gap / "plots"
+    for kind, caption in (
+        ("evidence", "By how much each candidate improves the fit; the selected one is dark."),
+        ("overlays_1", "Measured channels, and the same runs replayed by the simulator as given, calibrated, and with what was "
+         "found; below each the error that is left. Green: two standard deviations of sensor noise."),
+    ):  # fmt: skip
+        if (plots / f"{kind}.png").is_file():
+            html += picture(plots / f"{kind}.png", caption)
+    files = ((REPORT_FILE, "the whole report"), ("patch.yaml", "the patch"))
+    links = [link(demo, demo.gap / name, text) for name, text in files if (demo.gap / name).is_file()]
+    html += f"<p>Files: {', '.join(links)}.</p>"
+    verdict = SHOWN if found.verdict == EFFECT_FOUND else NOT_SHOWN
+    return Section(NAME_TITLE, sentence(found), html, verdict, left_over(found))
+
+
+def left_over(found: Analysis) -> list[str]:
+    """Return what is not good about an analysis: what is left, what is not sure, what got worse."""
+    from wlr_gym.gap.report.text import made_worse
+
+    gap, said = found.gap, []
+    if gap is None:
+        return ["no run could be held out to validate it"]
+    if gap.heldout_after > gap.noise_floor and error(gap.heldout_after) != error(gap.noise_floor):
+        said.append(
+            f"an error of {error(gap.heldout_after)} is left in the held-out runs, above the noise floor of "
+            f"{error(gap.noise_floor)}"
+        )
+    low, high = gap.reduction_ci95
+    if found.added and not np.isfinite([low, high]).all():
+        said.append("too few runs are held out for an interval of what the effects remove")
+    elif found.added and low <= 0.0 <= high:
+        said.append("the interval of what the effects remove contains 0")
+    if worse := made_worse(found):
+        said.append(f"{worse[0].lower()}{worse[1:].rstrip('.')}")
+    return said
+
+
+# ---- does it hold? ---------------------------------------------------------------------------------------------------
+
+
+def check(demo: Demo, tell: Tell) -> Section:
+    """Show the report's numbers of the held-out runs, replay these with the patch alone, then show the hidden fault."""
+    from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, read_result
+    from wlr_gym.physics.effects import load_patch
+
+    if not (demo.gap / RESULT_FILE).is_file():
+        raise InputError("no result of the gap workflow to check")
+    result = read_result(demo.gap / RESULT_FILE)
+    hidden = load_patch(demo.hidden).effects[0]
+    answer = judge(hidden, result.effects, result.equivalent)
+    heldout = [one for one in result.run_gaps if one.heldout]
+    pairs = _replayed(demo, result, load_patch(demo.gap / PATCH_FILE), tell)
+    before, after = ([pair[k].errors for pair in pairs] for k in range(2))
+    worse = worse_channels(before, after) if pairs else []
+    html = _of_the_report(heldout) + (_patch_alone(demo, pairs) if pairs else "")
+    html += heading("The hidden fault") + _revealed(hidden, result.effects, answer)
+    better = bool(pairs) and not worse and fell(result.gap)
+    not_good = [*answer.outside, *_risen(heldout), *patch_alone_lacks(before, after, worse)]
+    verdict = SHOWN if answer.right and better else NOT_SHOWN
+    return Section(CHECK_TITLE, f"{answer.sentence} {_held_out(result.gap)}".strip(), html, verdict, not_good)
+
+
+def fell(gap: GapEntry | None) -> bool:
+    """Whether the effects make the error of the held-out runs smaller."""
+    return gap is not None and _number(gap.heldout_after) < _number(gap.heldout_calibrated)
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _held_out(gap: GapEntry | None) -> str:
+    if gap is None:
+        return "No run was held out."
+    calibrated, after, floor = (error(_number(value)) for value in (gap.heldout_calibrated, gap.heldout_after, gap.noise_floor))
+    return f"Error of the held-out runs: {calibrated} calibrated, {after} with what was found; noise floor {floor}."
+
+
+def _of_the_report(heldout: Sequence[RunGapEntry]) -> str:
+    rows = []
+    for one in heldout:
+        errors = [error(_number(value)) for value in (one.before, one.calibrated, one.after)]
+        rows.append((one.run, *errors, percent(_number(one.reduction))))
+    said = "The runs that no fit has seen: error of the gap report (1 = sensor noise), and what the effects remove of what is "
+    said += "above the noise floor."
+    return paragraph(said) + table(("held-out run", "as given", "calibrated", "with effects", "removed"), rows, range(1, 5))
+
+
+def _risen(heldout: Sequence[RunGapEntry]) -> list[str]:
+    worse = [one.run for one in heldout if _number(one.after) > _number(one.calibrated)]
+    return [f"the effects make the error of {listed(worse)} larger"] if worse else []
+
+
+# ---- the patch alone -------------------------------------------------------------------------------------------------
+
+
+def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> list[tuple[ReplayResult, ReplayResult]]:
+    """Replay the held-out runs without the patch and with it."""
+    from wlr_gym.data import read_dataset
+    from wlr_gym.data.replay import replay
+
+    runs = [run for run in read_dataset(demo.measured).runs if run.name in result.runs.heldout]
+    pairs = []
+    for index, run in enumerate(runs):
+        tell(f"replaying {run.name}, held out", index / len(runs))
+        pairs.append((replay(run), replay(run, effects=patch)))
+    return pairs
+
+
+def _patch_alone(demo: Demo, pairs: Sequence[tuple[ReplayResult, ReplayResult]]) -> str:
+    """Return what the patch does in the simulator as its file has it; the picture is of the run that it leaves worst."""
+    rows = [(one.run.name, *(error(_over_all([replayed.errors])) for replayed in (one, other))) for one, other in pairs]
+    html = heading("The patch alone") + paragraph(
+        "The simulator as its file has it, not calibrated, replays the same runs in pieces of one second, each begun where the "
+        "robot was: with nothing added, and with patch.yaml, as any command takes it (--effects). This one-second replay error "
+        "is not the error above: the numbers that calibration moved are not in the patch, and no reading is limited, so that "
+        "more is left."
+    )
+    html += table(("held-out run", "one-second replay error, as given", "with the patch"), rows, (1, 2))
+    worst = max(pairs, key=lambda pair: _over_all([pair[1].errors]))
+    caption = f"{worst[0].run.name}, of the held-out runs the one with the largest one-second replay error with the patch: the "
+    return html + drawn(
+        _replay_picture(*worst), demo.out / "replay.png", f"{caption}channels that were furthest off without it."
+    )
+
+
+def _over_all(runs: Errors, channels: Sequence[str] = ()) -> float:
+    """Return the rms over runs and channels (none = all), in units of sensor noise."""
+    from wlr_gym.data.replay import pooled
+
+    chosen = [run[name] for run in runs for name in channels or run]
+    return pooled(chosen, lambda one: one.segment_rms / one.noise)
+
+
+def worse_channels(before: Errors, after: Errors) -> list[str]:
+    """Return the channels whose error the patch makes larger, by more than a tenth of the sensor noise, over all runs.
+
+    Args:
+        before, after: channel -> error of each run, without the patch and with it.
+    """
+    return [one for one in before[0] if _over_all(after, [one]) > _over_all(before, [one]) + _WORSE]
+
+
+def patch_alone_lacks(before: Errors, after: Errors, worse: Sequence[str]) -> list[str]:
+    """Return what is not good about the patch alone: that nothing got better, what got worse, and what is left most.
+
+    Args:
+        before, after: channel -> error of each run, without the patch and with it.
+        worse: channels that got worse.
+    """
+    if not after:
+        return ["no run was held out to try the patch on"]
+    said = [] if _over_all(after) < _over_all(before) else ["the patch alone makes the one-second replay error no smaller"]
+    if worse:
+        said.append(f"with the patch alone, {listed(worse)} got worse")
+    most = max(after[0], key=lambda name: _over_all(after, [name]))
+    left = _over_all(after, [most])
+    if left > UNEXPLAINED:
+        said.append(f"with the patch alone, {most} ({channel(most)}) is still off by {error(left)} times the sensor noise")
+    return said
+
+
+def _replay_picture(before: ReplayResult, after: ReplayResult) -> Figure:
+    from wlr_gym.gap.report.plots import AFTER, CALIBRATED, MEASURED
+
+    run = before.run
+    seen = [name for name in before.errors if not name.startswith("pos_wheel")]  # in turns of a wheel no error is seen
+    worst = sorted(seen, key=lambda name: -before.errors[name].segment_rms / before.errors[name].noise)[:_SHOWN]
+    figure = new_figure(10.0, 2.3 * len(worst) + 0.5)
+    rows = np.atleast_1d(figure.subplots(len(worst), 1, sharex=True))
+    t = run["t"] - run["t"][0]
+    for axes, name in zip(rows, worst, strict=True):
+        axes.plot(t, run[name], color=MEASURED, linewidth=2.4, label="measured")
+        for replayed, colour, label in ((before, CALIBRATED, "simulator as given"), (after, AFTER, "with the patch")):
+            values = replayed.segments[name].copy()
+            values[list(replayed.starts)] = np.nan  # lift the pen between pieces
+            axes.plot(t, values, color=colour, linewidth=1.0, label=label)
+        was, now = (one.errors[name] for one in (before, after))
+        before_text, after_text = (f"{one.segment_rms:.2g}{unit_of(one.unit)}" for one in (was, now))
+        axes.set_title(f"{name}: rms error {before_text}, with the patch {after_text}", fontsize=9, loc="left")
+        axes.set_ylabel(was.unit)
+        tidy(axes)
+        axes.margins(x=0.01)
+    rows[-1].set_xlabel("time (s)")
+    figure.legend(*rows[0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=9, frameon=False)
+    return figure
+
+
+# ---- the hidden fault ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """How good a diagnosis is.
+
+    Attributes:
+        named, placed: the hidden effect is among those found; at its place.
+        near: another name was selected, and the report says that these data do not distinguish it from the hidden one.
+        sizes: parameter -> (hidden, found, low, high); the interval is NaN where there is none.
+        extra: names found that were not hidden.
+    """
+
+    named: bool
+    placed: bool
+    near: bool
+    sizes: Mapping[str, tuple[float, float, float, float]]
+    extra: tuple[str, ...]
+
+    @property
+    def right(self) -> bool:
+        """Named, at its place, and nothing besides."""
+        return self.named and self.placed and not self.extra
+
+    @property
+    def outside(self) -> list[str]:
+        """Return in words which sizes lie outside their interval."""
+        out = [name for name, (hidden, _, low, high) in self.sizes.items() if hidden < low or hidden > high]
+        return [f"the interval does not hold the hidden {listed(out)}"] if out else []
+
+    @property
+    def sentence(self) -> str:
+        """Return the verdict in words."""
+        if not self.named:
+            return (
+                "The name was not found, but the report gave it as an alternative." if self.near else "The name was not found."
+            )
+        place = "the place were right" if self.placed else "but not the place was right"
+        text = f"The name {'and ' if self.placed else ''}{place}"
+        if self.sizes:
+            off = max(abs(found / hidden - 1.0) for hidden, found, _, _ in self.sizes.values())
+            text += f", the size off by {100.0 * off:.0f} %"
+        return text + (
+            f"; {listed([plain(name) for name in self.extra])} was named, too, but is not there." if self.extra else "."
+        )
+
+
+def judge(hidden: PatchEffect, found: Sequence[EffectEntry], equivalent: Sequence[Sequence[str]] = ()) -> Diagnosis:
+    """Compare what was found with what was hidden.
+
+    Args:
+        hidden: the effect.
+        found: entries of the result file.
+        equivalent: groups of names that the data do not distinguish.
+    """
+    same = [one for one in found if one.name == hidden.name]
+    best = next((one for one in same if set(one.where) == set(hidden.where)), same[0] if same else None)
+    sizes = {}
+    if best is not None:
+        for parameter, value in hidden.parameters.items():
+            if value != 0.0:  # the other axes of a bias have no size to be off by
+                entry = best.parameters.get(parameter)  # a component of a vector may be missing
+                found_value, interval = (0.0, None) if entry is None else (entry.value, entry.ci95)
+                sizes[parameter] = (value, found_value, *(interval or (np.nan, np.nan)))
+    return Diagnosis(
+        named=best is not None,
+        placed=best is not None and set(best.where) == set(hidden.where),
+        near=best is None and any(hidden.name in group for group in equivalent),
+        sizes=sizes,
+        extra=tuple(one.name for one in found if one is not best),
+    )
+
+
+def _revealed(hidden: PatchEffect, found: Sequence[EffectEntry], answer: Diagnosis) -> str:
+    from wlr_gym.physics.effects import EFFECTS
+
+    named = [plain(one.name) for one in found] or ["nothing"]
+    at = [places(one.where) for one in found if one.name == hidden.name] or [places(one.where) for one in found] or ["-"]
+    rows = [
+        ("effect", plain(hidden.name), ", ".join(named), "yes" if answer.named else "no"),
+        ("place", places(hidden.where), ", ".join(at), "yes" if answer.placed else "no"),
+    ]
+    for parameter, (truth, value, low, high) in answer.sizes.items():
+        unit = unit_of(EFFECTS[hidden.name].parameters[parameter].unit)
+        interval = f" (95 % interval {number(low)} to {number(high)})" if np.isfinite(low) else ""
+        inside = "the interval holds it" if low <= truth <= high else "outside the interval"
+        off = f"{round(100.0 * (value / truth - 1.0)):+d} %; {inside}"
+        rows.append((parameter, f"{number(truth)}{unit}", f"{number(value)}{unit}{interval}", off))
+    names = ", ".join(plain(name) for name in answer.extra)
+    extra = paragraph(f"Named beside it, but not there: {names}.") if names else ""
+    return table(("", "hidden in the robot", "found by the gap workflow", "right?"), rows) + extra

@@ -1,0 +1,170 @@
+"""Second stage: the shipped policies, a classical controller and the new policy on the same ice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from wlr_gym.base.html import heading, table
+from wlr_gym.demo.settings import ENVIRONMENT, Demo
+from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, filmed, paragraph
+from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.gap.report.text import listed, unit_of
+from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
+
+TITLE = "2. On ice"
+OURS = "velocity_slip_aware"
+BLIND = "velocity_blind"
+NEW = "trained just now"
+#: The robot as it is deployed.
+NO_CAMERA = having(())
+SHIPPED = (OURS, BLIND, "pid")
+_WHO = {
+    OURS: "shipped; sees its slip (observer on wheels, legs and IMU)",
+    BLIND: "shipped; the same training, without the slip observer",
+    "pid": "classical controller, tuned",
+    NEW: "the policy of section 1",
+}
+
+
+@dataclass(frozen=True)
+class ScoreColumn:
+    """A column of the table: a metric of the card, in a unit of which the card's is ``scale``; ``digits`` after the point."""
+
+    key: str
+    name: str
+    unit: str = ""
+    scale: float = 1.0
+    digits: int = 3
+
+    @property
+    def heading(self) -> str:
+        """Return name and unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+    def text(self, value: float) -> str:
+        """Return a value of the metric, without unit."""
+        return f"{self.scale * value:.{self.digits}f}"
+
+    def cell(self, estimate: Estimate) -> str:
+        """Return mean and half of the interval."""
+        return f"{self.text(estimate.mean)} ± {self.text(0.5 * (estimate.high - estimate.low))}"
+
+
+_COLUMNS = (
+    ScoreColumn("tracking_error", "tracking error"),
+    ScoreColumn("velocity_error", "velocity error", "mm/s", 1000.0, 1),
+    ScoreColumn("yaw_rate_error", "yaw rate error", "rad/s"),
+    ScoreColumn("excess_slip", "excess slip", "mm/s", 1000.0, 1),
+    ScoreColumn("success", "success", "%", digits=0),
+)
+#: A policy that fails in more episodes than this, %, is not good.
+_MANY = 10.0
+#: Label of the second kind of floor; what the kinds are, for the page and in short.
+SPLIT = "split"
+FLOORS = {
+    MAIN: "Ice everywhere: friction coefficient 0.05 to 0.2",
+    SPLIT: "Split floor: one friction coefficient left of a line, another one right of it, each 0.05 to 0.9",
+}
+_WHERE = {MAIN: "on ice", SPLIT: "on split floors"}
+#: The film: astride a line between two frictions, then a turn to the right.
+SCHEDULE = "0:0.1,0; 4:0.1,-0.3"
+
+
+def compare(demo: Demo, tell: Tell) -> Section:
+    """Play the same episodes with every policy, and film two of them."""
+    tell("on ice", 0.0)
+    card = _play(demo, tell)
+    html = paragraph(
+        f"{demo.episodes} episodes of 20 s each on each kind of floor: the same floors, robots, commands for all. No robot "
+        "has a camera, as the deployed one. A success keeps velocity and yaw rate within 5 % of the range of commands, rms "
+        "over the episode. Excess slip: mean over wheels and time. Mean ± half of the 95 % confidence interval."
+    )
+    html += "".join(heading(said) + _table(card, label) + paragraph(_against(card, label)) for label, said in FLOORS.items())
+    better = all(card.comparison[label][BLIND]["tracking_error"].low > 0.0 for label in FLOORS)
+    return Section(TITLE, _headline(card), html + _film(demo, tell), SHOWN if better else NOT_SHOWN, falls_short(card))
+
+
+def _play(demo: Demo, tell: Tell) -> Card:
+    subjects = [Subject(name, (name,)) for name in SHIPPED]
+    if (demo.training / "policy").is_dir():
+        subjects.append(Subject(NEW, (str(demo.training / "policy"),)))
+    conditions = [  # precision as in training: the engine is compiled once
+        Condition(label, {"randomization": floor, "precision": "float32", **NO_CAMERA}, episodes=demo.episodes)
+        for label, floor in ((MAIN, "ice"), (SPLIT, "split"))
+    ]
+    total, done = work(conditions, subjects, 1000), 0
+
+    def on_tick(text: str, cost: int) -> None:
+        nonlocal done
+        done += cost
+        tell(f"on ice: {text.partition(':')[0]}", 0.5 * min(1.0, done / total))
+
+    return Card(play(ENVIRONMENT, subjects, conditions, FIRST_SEED + demo.seed, on_tick))
+
+
+def _table(card: Card, label: str) -> str:
+    rows = [(name, _WHO[name], *(one.cell(own[one.key]) for one in _COLUMNS)) for name, own in card.scores[label].items()]
+    return table(("policy", "", *(column.heading for column in _COLUMNS)), rows, range(2, 2 + len(_COLUMNS)))
+
+
+def falls_short(card: Card) -> list[str]:
+    """Return where others beat the slip-aware policy, where it is no better than the blind one, and how often it fails.
+
+    Better: the whole 95 % interval of the paired difference is.
+    """
+    said = []
+    for label, where in _WHERE.items():
+        for other, own in card.comparison[label].items():
+            better = [column for column in _COLUMNS if own[column.key].high < 0.0]
+            said += [f"{where}, {other} has the better {_listed(card, label, (other, OURS), better)}"] if better else []
+        blind = card.comparison[label][BLIND]
+        if equal := [column for column in _COLUMNS if not blind[column.key].excludes_zero]:
+            names = _listed(card, label, (OURS, BLIND), equal)
+            said.append(f"{where}, {OURS} is not measurably better than {BLIND} in {names}")
+        failed = 100.0 - card.scores[label][OURS]["success"].mean
+        said += [f"{where}, {OURS} fails in {failed:.0f} % of the episodes"] if failed > _MANY else []
+    return said
+
+
+def _listed(card: Card, label: str, policies: tuple[str, str], columns: Iterable[ScoreColumn]) -> str:
+    """Return metrics with the values of two policies: ``excess slip (1.9 against 4.3 mm/s)``."""
+    scores = [card.scores[label][name] for name in policies]
+    values = {one: " against ".join(one.text(own[one.key].mean) for own in scores) for one in columns}
+    return listed([f"{one.name} ({text}{unit_of(one.unit)})" for one, text in values.items()])
+
+
+def _against(card: Card, label: str) -> str:
+    errors = {name: own["tracking_error"] for name, own in card.comparison[label].items()}
+    others = [f"{name} by {e.mean:.0f} % (95 % interval {e.low:.0f} to {e.high:.0f})" for name, e in errors.items()]
+    return f"Paired episode by episode, the tracking error of {OURS} is lower (minus: higher) than that of {'; '.join(others)}."
+
+
+def _headline(card: Card) -> str:
+    said = [f"{_lower(card.comparison[label][BLIND]['tracking_error'])} {where}" for label, where in _WHERE.items()]
+    return f"The tracking error of a policy that observes its slip, against the same training without: {'; '.join(said)}."
+
+
+def _lower(better: Estimate) -> str:
+    if not better.excludes_zero:
+        return "not distinguishable"
+    return f"{abs(better.mean):.0f} % {'lower' if better.mean > 0 else 'higher'}"
+
+
+def _film(demo: Demo, tell: Tell) -> str:
+    def watch(pictures: Iterable[Any], count: int) -> Iterator[Any]:
+        for index, one in enumerate(pictures):
+            tell(f"on ice: film, picture {index + 1} of {count}", 0.5 + 0.5 * index / count)
+            yield one
+
+    subjects, floor = [Subject(name, (name,)) for name in (OURS, "pid")], {"randomization": SPLIT, **NO_CAMERA}
+    path = demo.out / "ice.webp"
+    return filmed(path, demo, subjects, demo.film_seconds, floor, _CAPTION, schedule=SCHEDULE, watch=watch)
+
+
+_CAPTION = (
+    "The first split floor of the table, the same commands for both: drive on, after 4 s turn right as well. "
+    "Arrows: where each wheel slips to, 0.1 m for 0.05 m/s; the redder, the faster. Pink: the path of the robot; dashed: the "
+    "path that was commanded. Skid-steering needs slip; what counts is which robot follows. One scene; averages: the table."
+)

@@ -1,0 +1,113 @@
+"""Stages of the demo, and what each contributes to the page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.plots import save
+from wlr_gym.demo.settings import ENVIRONMENT, Demo
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from wlr_gym.learning.evaluation import Subject
+
+#: Told of what is going on and of the share of the stage that is done.
+Tell = Callable[[str, float], None]
+#: Verdicts of a section: what it set out to show was shown, was not, was not tried, or went wrong.
+SHOWN = "shown"
+NOT_SHOWN = "not shown"
+SKIPPED = "skipped"
+FAILED = "failed"
+_MEDIA = {".png": "image/png", ".webp": "image/webp"}
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a stage has found.
+
+    Attributes:
+        title: of the section.
+        headline: one sentence for the top of the page; empty = none.
+        html: what stands below the title.
+        verdict: one of the four above.
+        not_good: what the numbers do not speak for, in clauses.
+    """
+
+    title: str
+    headline: str
+    html: str
+    verdict: str = SHOWN
+    not_good: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class DemoStage:
+    """One stage.
+
+    Attributes:
+        title: of its section.
+        work: does it.
+        share: of the time of its worker.
+        needs: (package, extra) it cannot do without.
+    """
+
+    title: str
+    work: Callable[[Demo, Tell], Section]
+    share: float
+    needs: tuple[tuple[str, str], ...] = ()
+
+
+def paragraph(text: str) -> str:
+    """Return text as a paragraph."""
+    return f"<p>{escape(text)}</p>"
+
+
+def link(demo: Demo, path: Path, text: str) -> str:
+    """Return a link to a file or folder beside the page."""
+    target = path.relative_to(demo.page.parent).as_posix()
+    return f'<a href="{escape(target)}{"/" if path.is_dir() else ""}">{escape(text)}</a>'
+
+
+def picture(path: Path, caption: str) -> str:
+    """Return a picture or film inside the page, with its caption."""
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    source = f"data:{_MEDIA[path.suffix]};base64,{data}"
+    return f'<figure><img alt="{escape(path.stem)}" src="{source}"><figcaption>{escape(caption)}</figcaption></figure>'
+
+
+def filmed(
+    path: Path,
+    demo: Demo,
+    subjects: Sequence[Subject],
+    seconds: float,
+    keywords: Mapping[str, Any],
+    caption: str,
+    **options: Any,
+) -> str:
+    """Film two subjects beside each other and return the film for the page, or why there is none.
+
+    Args:
+        path, subjects, seconds, keywords, options: of :func:`wlr_gym.learning.evaluation.film.film_beside`. caption: below it.
+    """
+    from wlr_gym.learning.evaluation.conditions import FIRST_SEED
+    from wlr_gym.learning.evaluation.film import film_beside
+    from wlr_gym.render.view import View
+
+    view = View(size=(400, 330), path=True)
+    try:
+        film_beside(path, ENVIRONMENT, subjects, FIRST_SEED + demo.seed, seconds, keywords, view=view, fps=10.0, **options)
+    except InputError as error:
+        return paragraph(f"No film: {error}.")
+    return picture(path, caption)
+
+
+def drawn(figure: Figure, path: Path, caption: str) -> str:
+    """Save a figure as PNG, and return it for the page."""
+    return picture(save(figure, path), caption)

@@ -1,0 +1,141 @@
+"""Stages in two workers, each a process of its own on one core: what one worker breaks or leaks does not harm the other.
+
+A worker is a job (:mod:`wlr_gym.base.jobs`): it sends progress and finished sections to its parent.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from wlr_gym.base.errors import InputError, MissingPackageError, require_package
+from wlr_gym.base.jobs import PATIENCE, Job, Send, serve, start
+from wlr_gym.demo import diagnosis, hidden_fault, ice_comparison, learn, retraining
+from wlr_gym.demo.settings import Demo
+from wlr_gym.demo.stage import FAILED, SKIPPED, DemoStage, Section, paragraph
+
+#: The shipped policies are ONNX files.
+_POLICIES = (("onnxruntime", "export"),)
+#: What training on from a policy file takes, to read its weights.
+_FILE_WEIGHTS = (("onnx", "export"),)
+#: What training takes.
+_TRAINING = (("torch", "train"), ("stable_baselines3", "train"), ("tensorboard", "train"))
+#: The emulated robot is driven by the servo library.
+_ROBOT = (("dynamixel_sdk", "robot"), ("serial", "robot"))
+#: Worker -> its stages, one after the other. Shares: measured on a quiet core.
+WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
+    "policies": (
+        DemoStage(learn.TITLE, learn.train, 0.6, _TRAINING),
+        DemoStage(ice_comparison.TITLE, ice_comparison.compare, 0.4, _POLICIES),
+    ),
+    "robot": (
+        DemoStage(hidden_fault.TITLE, hidden_fault.drive, 0.15, (*_POLICIES, *_ROBOT)),
+        DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.45),
+        DemoStage(diagnosis.CHECK_TITLE, diagnosis.check, 0.05),
+        DemoStage(retraining.TITLE, retraining.retrain, 0.35, (*_TRAINING, *_POLICIES, *_FILE_WEIGHTS, *_ROBOT)),
+    ),
+}
+#: Called with the worker, what it is doing, and the share of its work that is done.
+TellWorker = Callable[[str, str, float], None]
+
+
+# ---- the parent ------------------------------------------------------------------------------------------------------
+
+
+def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
+    """Run all workers at once; return sections in the order of the page, and whether somebody stopped the demo.
+
+    Ctrl-C ends the workers in good order.
+    """
+    inbox: queue.Queue[tuple[str, dict[str, Any] | None]] = queue.Queue()
+    found: dict[str, list[Section]] = {worker: [] for worker in WORKERS}
+    interrupted = False
+    running = {worker: _start(worker, demo, inbox) for worker in WORKERS}
+    try:
+        while running:
+            try:
+                worker, message = inbox.get()
+                if message is None:
+                    running.pop(worker).wait()
+                elif "section" in message:
+                    found[worker].append(Section(**message["section"]))
+                elif "text" in message:
+                    tell(worker, message["text"], message["share"])
+            except KeyboardInterrupt:
+                interrupted = True
+                _interrupt(running)
+    finally:
+        for process in running.values():
+            process.kill()
+    return [section for worker in WORKERS for section in _complete(worker, found[worker], interrupted)], interrupted
+
+
+def _start(worker: str, demo: Demo, inbox: queue.Queue[Any]) -> Any:
+    """Start a worker, and a thread that puts all it sends into the inbox; return its process."""
+    task = {"worker": worker, "demo": {**asdict(demo), "out": str(demo.out)}}
+    process = start(Job(worker, "wlr_gym.demo.workers", task, str(demo.out / "log.txt")))
+
+    def read() -> None:
+        for line in process.stdout:
+            inbox.put((worker, json.loads(line)))
+        inbox.put((worker, None))
+
+    threading.Thread(target=read, daemon=True).start()
+    return process
+
+
+def _interrupt(running: Mapping[str, Any]) -> None:
+    """Ask the workers to end, and see to it that they do."""
+    for process in running.values():
+        process.send_signal(signal.SIGINT)
+        killer = threading.Timer(PATIENCE, process.kill)
+        killer.daemon = True
+        killer.start()
+
+
+def _complete(worker: str, sections: list[Section], interrupted: bool) -> list[Section]:
+    """Return a section for each stage of a worker: those that were not reached say so."""
+    text = "Not reached: the demo was stopped." if interrupted else "Not reached: this worker ended early; log.txt says why."
+    verdict = SKIPPED if interrupted else FAILED
+    missing = [Section(stage.title, "", paragraph(text), verdict) for stage in WORKERS[worker][len(sections) :]]
+    return sections + missing
+
+
+# ---- a worker --------------------------------------------------------------------------------------------------------
+
+
+def work(worker: str, demo: Demo, send: Send) -> None:
+    """Do the stages of a worker; one that cannot be done says why and the others continue."""
+    done = 0.0
+    for stage in WORKERS[worker]:
+
+        def tell(text: str, share: float, base: float = done, stage: DemoStage = stage) -> None:
+            send({"text": text, "share": base + stage.share * share})
+
+        send({"section": asdict(_attempt(stage, demo, tell))})
+        done += stage.share
+
+
+def _attempt(stage: DemoStage, demo: Demo, tell: Callable[[str, float], None]) -> Section:
+    try:
+        for package, extra in stage.needs:
+            require_package(package, extra)
+        return stage.work(demo, tell)
+    except MissingPackageError as error:
+        return Section(stage.title, "", paragraph(f"Left out: {error}"), SKIPPED)
+    except InputError as error:
+        return Section(stage.title, "", paragraph(f"Not done: {error}"), FAILED)
+    except Exception as error:  # one stage that fails must not take the page with it
+        traceback.print_exc()
+        return Section(stage.title, "", paragraph(f"Failed: {type(error).__name__}: {error}; log.txt has more."), FAILED)
+
+
+if __name__ == "__main__":
+    serve(lambda task, send: work(task["worker"], Demo(**{**task["demo"], "out": Path(task["demo"]["out"])}), send))
