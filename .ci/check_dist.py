@@ -1,7 +1,7 @@
 """Check what ``python -m build`` made: ``python .ci/check_dist.py SDIST WHEEL_OF_THE_SDIST WHEEL_OF_THE_CLONE``.
 
-The source distribution holds every file of the clone's git index and nothing else. Both wheels hold the same files: the package
-with its configs, agents and type marker.
+The source distribution holds every file of the clone's git index and nothing else: the studies, tests and documents too. Both
+wheels hold the same files: the package with its configs, agents and type marker.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The package as drawn: class names exist once, no import circles, what strings name exists, agents are thin."""
+"""The package and its studies: class names exist once, no import circles, what strings name exists, agents are thin."""
 
 from __future__ import annotations
 
@@ -23,13 +23,15 @@ AGENTS_IMPORT = ("wlr_gym.policy", "wlr_gym.learning", "wlr_gym.robot", "wlr_gym
 NO_PYTHON = {"wlr_gym.contract", "wlr_gym.sha256", "wlr_gym.cli.probe", "wlr_gym.evalute"}
 #: Folders of ``wlr_gym`` that only a wheel has.
 IN_WHEELS = ("wlr_gym/configs", "wlr_gym/agents")
+#: Packages whose code is checked.
+TOPS = ("wlr_gym", "studies")
 
 
 def module_name(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-PATHS = {module_name(path): path for top in ("wlr_gym", "studies") for path in sorted((ROOT / top).rglob("*.py"))}
+PATHS = {module_name(path): path for top in TOPS for path in sorted((ROOT / top).rglob("*.py"))}
 SOURCES = {name: path.read_text(encoding="utf-8") for name, path in PATHS.items()}
 #: Every text that may name a module: code, configs and documents.
 TEXTS = {
@@ -173,7 +175,7 @@ def known(module: str, words: list[str]) -> bool:
 
 def role_exists(module: str, target: str) -> bool:
     """Tell whether what a docstring refers to exists: a full name, one relative to its package, or one of its own module."""
-    if target.startswith("wlr_gym"):
+    if target.startswith(TOPS):
         return exists(target)
     package = module if PATHS[module].name == "__init__.py" else module.rpartition(".")[0]
     if target.startswith("."):

@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from learning import read_data
+from studies.learning import read_data
 
 DATA = Path(__file__).resolve().parents[2] / "docs" / "data"
 OBSERVER_HEADER = ("floor, drive", "v x", "its 99 %", "v y", "slip", "in 2 sigma", "error/sigma")

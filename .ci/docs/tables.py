@@ -15,11 +15,10 @@ from dataclasses import fields
 from functools import partial
 from pathlib import Path
 
-import ablations
-import learning
 import measured
-import performance
 
+from studies import ablations, learning
+from studies.bench import performance
 from studies.bench.adapt_study import read_lines
 from studies.bench.adapt_table import markdown as markdown_of_cases
 from studies.bench.decide_table import markdown as markdown_of_decisions

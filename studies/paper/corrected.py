@@ -1,7 +1,7 @@
 """Equations (1) to (30) with the right physics: the paper's assumptions, everything that follows from them.
 
 Legs pairwise equal, no roll, four wheels on a level floor. (7) to (11) are the whole Gibbs function with its velocity terms;
-(19) to (30) are its Appell equations, solved for what the paper asks for. tests/studies/paper derives them symbolically.
+(19) to (30) are its Appell equations, solved for what the paper asks for. studies/tests/paper derives them symbolically.
 """
 
 from __future__ import annotations

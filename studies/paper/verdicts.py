@@ -1,7 +1,7 @@
 """The verdict on every equation of the paper, with its functions as printed, with misprints undone, and corrected.
 
 Verdicts: ``correct``; ``conditional`` (true under a condition the paper does not state); ``misprint`` (print or OCR: which of
-the two cannot be told from the text); ``incomplete`` (terms are missing); ``wrong`` (physics). tests/studies/paper proves
+the two cannot be told from the text); ``incomplete`` (terms are missing); ``wrong`` (physics). studies/tests/paper proves
 each of them.
 Source: Korayem, Nikseresht, Asadi 2024, "Vision-based dynamic modeling of wheeled-legged robot considering slippage using
 Gibbs-Appell formulation", Robotica.

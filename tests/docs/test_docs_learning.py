@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from blocks import ROOT, site_script
+from blocks import ROOT
 
-learning = site_script("learning")
+from studies import learning
 
 
 def test_every_row_that_is_promised_is_there():

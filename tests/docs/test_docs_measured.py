@@ -6,13 +6,13 @@ import re
 from pathlib import Path
 from typing import Any
 
-from blocks import ROOT, site_script
+from blocks import ROOT
 
+from studies import learning
 from studies.bench.adapt_study import CONTENDERS, read_lines
 from studies.bench.adapt_table import by_case, summary
 from studies.bench.gap import score_answers
 
-learning = site_script("learning")
 UNITS = {"1/A": " /A", "-": ""}
 
 

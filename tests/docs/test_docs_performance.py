@@ -8,12 +8,12 @@ from contextlib import closing
 
 import gymnasium
 import pytest
-from blocks import ROOT, site_script
+from blocks import ROOT
 
+from studies.bench import performance
 from studies.bench.__main__ import MEASUREMENTS
 from studies.bench.measure import Measurement, machine
 
-performance = site_script("performance")
 DATA = json.loads((ROOT / "docs" / "data" / "bench.json").read_text(encoding="utf-8"))
 ROWS = DATA["rows"]
 #: What the page says in words.

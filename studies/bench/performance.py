@@ -1,7 +1,8 @@
 """The numbers of docs/performance.md and README's of the engine: docs/data/bench.json, from ``python -m studies.bench``.
 
-``python .ci/docs/performance.py bench.json ...`` takes the rows of the reports over, each with its machine, versions and date,
-and writes README's row and the picture anew. What is measured again replaces all of its older rows. tables.py has the tables.
+``python -m studies.bench.performance bench.json ...`` takes the rows of the reports over, each with its machine, versions and
+date, and writes README's row and the picture anew. What is measured again replaces all of its older rows. .ci/docs/tables.py
+prints the tables.
 """
 
 from __future__ import annotations

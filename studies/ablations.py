@@ -1,8 +1,8 @@
 """What each part of Velocity's recipe is worth, and what weights of slip buy: docs/data/ablations.json, figure slip_weights.
 
-``python .ci/docs/ablations.py SWEEP BLIND PLAIN`` scores every setting of three sweeps (commands: docs/policies.md) as ``wlr
+``python -m studies.ablations SWEEP BLIND PLAIN`` scores every setting of three sweeps (commands: docs/policies.md) as ``wlr
 evaluate`` does, beside the whole recipe and the controllers; an interrupted scoring goes on where it stopped. Then, or without
-arguments, the picture is drawn. tables.py has the table.
+arguments, the picture is drawn. .ci/docs/tables.py has the table.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from learning import interval, percent, read_data
-
+from studies.learning import interval, percent, read_data
 from wlr_gym.base.files import write_json
 from wlr_gym.base.plots import BLUE, GREEN, ORANGE, WINE, legend_below, new_figure, save, tidy
 from wlr_gym.base.provenance import git_commit
@@ -20,7 +19,7 @@ from wlr_gym.base.settings import read_yaml
 from wlr_gym.learning.evaluation.scoring import evaluate
 from wlr_gym.learning.evaluation.training_seeds import expand
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 SWEEP = ROOT / "examples" / "ablations.yaml"
 #: Commit, episodes, settings -> floors -> numbers, controllers.
 DATA = ROOT / "docs" / "data" / "ablations.json"

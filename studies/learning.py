@@ -1,8 +1,8 @@
 """The result tables of docs/policies.md: kept in docs/data/learning.json, from trained seeds of each recipe.
 
-``python .ci/docs/learning.py TASK POLICIES BLIND`` scores the seeds of a task's slip-aware recipe (a folder or pattern of run
+``python -m studies.learning TASK POLICIES BLIND`` scores the seeds of a task's slip-aware recipe (a folder or pattern of run
 folders) and of its blind one beside the hand-written controllers, as ``wlr evaluate`` does, row by row, and takes the numbers
-over. An interrupted scoring goes on where it stopped. tables.py has the tables.
+over. An interrupted scoring goes on where it stopped. .ci/docs/tables.py has the tables.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from wlr_gym.learning.evaluation.scoring import evaluate
 from wlr_gym.learning.evaluation.statistics import Estimate
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "docs" / "data" / "learning.json"
 EPISODES = 256
 CONTROLLERS = ("slip_compensating", "pid")
