@@ -139,7 +139,7 @@ def _drive_robot(options: PaperOptions, console: Console) -> dict[str, Record]:
     """Guarded and logged; between the tests the operator carries the robot back."""
     from studies.paper.experiments import PROFILE, TESTS, drive_plant
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.driving import refuse_deadman
+    from wlr_gym.hardware.deployment import refuse_deadman
     from wlr_gym.hardware.operator import stop_on_request
     from wlr_gym.physics.effects import load_patch
     from wlr_gym.robot import load_robot

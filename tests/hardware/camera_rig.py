@@ -14,6 +14,7 @@ from wlr_gym.hardware.emulator.camera import true_pose
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.loop import ControlLoop
+from wlr_gym.physics.plants.robot_options import RobotOptions
 
 STAND = np.array([math.pi / 2] * 4 + [0.0] * 4)
 FORWARD = STAND + np.array([0.0] * 4 + [2.0] * 4)
@@ -42,7 +43,7 @@ class CameraRig:
     def __init__(self, file: CameraFile | None = None, log: Any = None, tick: float = 0.002, **parts: Any) -> None:
         self.machine = Machine(ROBOT, HARDWARE, MachineOptions(timing=NO_TIME, tick=tick), **parts)
         self.link = emulated_link(self.machine, file or small_camera())
-        self.loop = ControlLoop(ROBOT, HARDWARE, self.link, PERIOD, log=log)
+        self.loop = ControlLoop(ROBOT, HARDWARE, self.link, PERIOD, RobotOptions(log=log))
         self.truth: list[tuple[float, float, float, float]] = []
         self.machine.watchers.append(self._look)
         self.shown: list[tuple[float, ...]] = []

@@ -19,6 +19,7 @@ from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.loop import ControlLoop, Phase, StoppedError
+from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.robot import JOINTS, load_robot
 
 loop_module.TIMED_READS = 20  # in emulated time they all take the same
@@ -100,7 +101,7 @@ class Rig:
         self.machine = machine or Machine(ROBOT, hardware, options or MachineOptions(timing=NO_TIME))
         self.link = emulated_link(self.machine)
         meta = None if profile is None else RunMeta(robot=ROBOT.name, profile=profile)
-        self.loop = ControlLoop(ROBOT, hardware, self.link, PERIOD, log=log, dry_run=dry_run, meta=meta)
+        self.loop = ControlLoop(ROBOT, hardware, self.link, PERIOD, RobotOptions(log=log, dry_run=dry_run), meta)
 
     def drive(self, seconds, setpoints=DRIVE):
         for _ in range(round(seconds / PERIOD)):

@@ -33,7 +33,7 @@ from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.safety import camera as rules
 from wlr_gym.hardware.safety.camera import CameraWatch, camera_statistics
-from wlr_gym.hardware.safety.camera_check import check_camera
+from wlr_gym.hardware.safety.preflight import check_camera
 
 PERIOD = 0.02
 HEIGHT = ROBOT.leg.length + ROBOT.wheel.radius - ROBOT.hip_position.z

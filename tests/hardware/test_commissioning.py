@@ -29,13 +29,9 @@ pytest.importorskip("serial")
 from robot_rig import hardware_file
 
 from wlr_gym.hardware.commissioning import runner
-from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandTest
-from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
-from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TroubleError
-from wlr_gym.hardware.commissioning.person import TerminalPerson
-from wlr_gym.hardware.commissioning.registry import TESTS, choose
-from wlr_gym.hardware.commissioning.runner import Commissioning, run_test
-from wlr_gym.hardware.commissioning.stand import Stand
+from wlr_gym.hardware.commissioning.runner import Commissioning, EmulatedPerson, run_test
+from wlr_gym.hardware.commissioning.stand import PowerError, QuitError, SkippedError, Stand, TerminalPerson, TroubleError
+from wlr_gym.hardware.commissioning.stand_tests import TESTS, PartlyError, Reading, StandTest, choose
 from wlr_gym.hardware.dynamixel import tables
 from wlr_gym.hardware.emulator import MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME

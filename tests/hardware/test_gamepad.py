@@ -16,9 +16,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import run_command
 from wlr_gym.hardware.config import PadButtons
 from wlr_gym.hardware.deployment import deploy, loop_of
-from wlr_gym.hardware.gamepad import DrivingPad
 from wlr_gym.hardware.log import read_events
-from wlr_gym.hardware.operator import Operator
+from wlr_gym.hardware.operator import DrivingPad, Operator
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import make_policy
 

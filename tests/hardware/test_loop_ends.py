@@ -18,8 +18,7 @@ from studies.paper.experiments import PROFILE
 from wlr_gym.cli import FAILED, INTERRUPTED, OK, record, replay, run_command
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import RunMeta
-from wlr_gym.hardware.deployment import deploy, loop_of
-from wlr_gym.hardware.driving import drive_robot
+from wlr_gym.hardware.deployment import deploy, drive_robot, loop_of
 from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
@@ -151,7 +150,7 @@ def unplugged_at_the_end(monkeypatch):
         before_off(plant.loop, lambda: unplug(plant.loop))
         return drive_robot(plant, motion)
 
-    monkeypatch.setattr("wlr_gym.hardware.driving.drive_robot", drive)
+    monkeypatch.setattr("wlr_gym.hardware.deployment.drive_robot", drive)
     return driven
 
 
@@ -221,7 +220,7 @@ def test_a_stop_in_the_last_motion_tick_starts_no_other(tmp_path, monkeypatch):
         in_phase(plant.loop, Phase.STOPPING, interrupt)
         return drive_robot(plant, motion)
 
-    monkeypatch.setattr("wlr_gym.hardware.driving.drive_robot", drive)
+    monkeypatch.setattr("wlr_gym.hardware.deployment.drive_robot", drive)
     options = record.RecordOptions(excitation=("straight", "turns"), out=tmp_path, emulated=True, seconds=0.2)
     assert record.run(options) == INTERRUPTED
     assert driven == ["straight"]

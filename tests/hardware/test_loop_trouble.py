@@ -17,7 +17,7 @@ from wlr_gym.data.read import read_run
 from wlr_gym.hardware.log import CsvTable, read_events
 from wlr_gym.hardware.operator import STOP_SIGNALS, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.hardware.safety import preflight, registers
+from wlr_gym.hardware.safety import preflight
 from wlr_gym.hardware.safety.limiter import CALM_SPEED
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.plants.robot_options import RobotOptions
@@ -273,7 +273,7 @@ def test_mending_leaves_servos_alone_that_are_on(rig):
         rig.machine.servos[joint].set("bus_watchdog", -1)
     rig.machine.servos["wheel_rr"].set("torque_enable", 1)
     servos = rig.link.servos
-    left = registers.mend(servos, preflight.check_servos(servos, ROBOT, HARDWARE))
+    left = preflight.mend(servos, preflight.check_servos(servos, ROBOT, HARDWARE))
     assert {(check.where, check.what) for check in left} == {("wheel_rr", "watchdog"), ("wheel_rr", "torque")}
     assert [servos.get(joint, "bus_watchdog") for joint in ("leg_lf", "wheel_rr")] == [0, -1]
     rig.link.close()

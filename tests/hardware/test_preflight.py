@@ -18,7 +18,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware.safety import preflight, registers
+from wlr_gym.hardware.safety import preflight
 from wlr_gym.hardware.servos import Servos
 
 ROBOT = load_robot("emanual")
@@ -72,7 +72,7 @@ def test_each_fault_is_found_alone_and_not_mended(server, servos, item, count):
     assert (check.where, check.is_fatal) == ("wheel_lr", True)
     assert check.remedy.endswith(".")
     assert "FAULT" in str(check)
-    assert registers.mend(servos, [check]) == [check]
+    assert preflight.mend(servos, [check]) == [check]
     assert failed(servos) == [check]
 
 
@@ -128,7 +128,7 @@ def test_each_altered_register_is_named_alone_and_mended(rig, joint, item, count
     assert (check.where, check.what, check.found, check.expected) == (joint, named[0], found, named[2])
     assert check.is_fatal == (item != "return_delay_time")
     assert "wlr doctor --mend" in check.remedy
-    assert registers.mend(servos, [check]) == []
+    assert preflight.mend(servos, [check]) == []
     assert machine.servos[joint][item] == before
     assert failed(servos) == []
 
@@ -137,8 +137,8 @@ def test_no_register_of_either_model_is_forgotten():
     for bus, joint in (("legs", "leg_rf"), ("wheels", "wheel_lr")):
         items = load_table(HARDWARE.buses[bus].model).items.values()
         writable = {item.name for item in items if item.in_eeprom and item.writable}
-        assert writable - set(registers.IGNORED) == {name for name in registers.MEANING if name in writable}
-        assert {item for where, item, _ in ALTERED if where == joint} >= writable - set(registers.IGNORED)
+        assert writable - set(preflight.IGNORED) == {name for name in preflight.MEANING if name in writable}
+        assert {item for where, item, _ in ALTERED if where == joint} >= writable - set(preflight.IGNORED)
     assert len(ALTERED) >= 30
 
 
@@ -149,7 +149,7 @@ def test_what_the_hardware_file_asks_for_is_expected(rig):
     hardware = HARDWARE.model_copy(update={"buses": {**HARDWARE.buses, "legs": bus}})
     found = [check for check in preflight.check_servos(servos, ROBOT, hardware) if not check.ok]
     assert [(check.where, check.found, check.expected) for check in found] == [(leg, "885", "600") for leg in JOINTS[:4]]
-    assert registers.mend(servos, found) == []
+    assert preflight.mend(servos, found) == []
     assert machine.servos["leg_rr"]["pwm_limit"] == 600
 
 
@@ -159,7 +159,7 @@ def test_a_servo_that_answers_no_reads_is_not_called_a_bad_line(rig):
     machine.servos["wheel_rf"].set("pwm_limit", 100)
     (check,) = failed(servos)  # the other one is seen once this one is mended
     assert (check.what, check.found) == ("status_return_level", "no answer to reads")
-    assert registers.mend(servos, [check]) == []
+    assert preflight.mend(servos, [check]) == []
     assert [check.what for check in failed(servos)] == ["pwm_limit"]
 
 
@@ -167,7 +167,7 @@ def test_eeprom_stays_locked_under_torque(server, servos):
     servo = server.machine.servos["leg_lf"]
     servo.set("return_delay_time", 100)
     servo.set("torque_enable", 1)
-    left = registers.mend(servos, failed(servos))
+    left = preflight.mend(servos, failed(servos))
     assert {check.what for check in left} == {"torque", "return_delay_time"}
 
 

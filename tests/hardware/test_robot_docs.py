@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from wlr_gym.cli import commission, emulate
-from wlr_gym.hardware.commissioning.registry import TESTS
+from wlr_gym.hardware.commissioning.stand_tests import TESTS
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.emulator import FAULTS, health
 from wlr_gym.hardware.emulator.servo import BOOT_TIME, FIRMWARE

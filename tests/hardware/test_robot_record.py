@@ -25,7 +25,7 @@ from wlr_gym.robot import JOINTS, load_robot
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
-from wlr_gym.hardware.driving import DriveResult
+from wlr_gym.hardware.deployment import DriveResult
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link

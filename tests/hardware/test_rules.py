@@ -15,8 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.safety import limiter, rules
-from wlr_gym.hardware.safety.rules import Memory
-from wlr_gym.hardware.safety.state import Level, RobotStatus
+from wlr_gym.hardware.safety.rules import Level, Memory, RobotStatus
 from wlr_gym.robot import JOINTS, load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -393,7 +392,7 @@ def test_only_command_limiter_and_watchdog_process_write_setpoints_and_torque():
 #: Modules that write single items of servos. Preflight's registers are mended with torque off; commissioning has own limits.
 SINGLE_WRITERS = {
     "hardware/safety/limiter.py",
-    "hardware/safety/registers.py",
+    "hardware/safety/preflight.py",
     "hardware/commissioning/stand.py",
 }
 

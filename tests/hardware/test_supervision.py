@@ -9,9 +9,7 @@ from test_rules import HOME, LIMITS, RATINGS, ROBOT, at, decide, noisy, status
 from wlr_gym.data.format import Profile
 from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.safety import rules
-from wlr_gym.hardware.safety.rules import Memory
-from wlr_gym.hardware.safety.state import Level
-from wlr_gym.hardware.safety.supervision import reach, unseen
+from wlr_gym.hardware.safety.rules import Level, Memory, reach, unseen
 from wlr_gym.hardware.servos import ServoRegisters
 from wlr_gym.robot import JOINTS
 

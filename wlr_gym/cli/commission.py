@@ -25,10 +25,9 @@ from wlr_gym.cli.tables import print_table
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.hardware.commissioning.comparison import StandFinding
-    from wlr_gym.hardware.commissioning.contract import StandTest
-    from wlr_gym.hardware.commissioning.person import Person
-    from wlr_gym.hardware.commissioning.runner import StandResult
+    from wlr_gym.hardware.commissioning.runner import StandFinding, StandResult
+    from wlr_gym.hardware.commissioning.stand import Person
+    from wlr_gym.hardware.commissioning.stand_tests import StandTest
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.measured import Measured
@@ -71,7 +70,7 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     """
     from rich.console import Console
 
-    from wlr_gym.hardware.commissioning.registry import choose
+    from wlr_gym.hardware.commissioning.stand_tests import choose
 
     console = Console(soft_wrap=True, highlight=False, stderr=options.json)
     tests = choose(options.tests)
@@ -170,8 +169,8 @@ def _commission(
 
 def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Callable[[str], str]) -> tuple[Link, Person]:
     """Return a link to the robot, and who stands beside it."""
-    from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
-    from wlr_gym.hardware.commissioning.person import TerminalPerson
+    from wlr_gym.hardware.commissioning.runner import EmulatedPerson
+    from wlr_gym.hardware.commissioning.stand import TerminalPerson
     from wlr_gym.hardware.emulator.link import emulated_link
     from wlr_gym.hardware.emulator.stand import EmulatedStand
 
@@ -196,7 +195,7 @@ def _save(
 def _write(target: Path, source: Path, findings: Iterable[StandFinding], earlier: Measured | None) -> None:
     """Write the hardware file with what was measured, now or in an ``earlier`` session that this one continues."""
     from wlr_gym.hardware.calibration import save_hardware
-    from wlr_gym.hardware.commissioning.comparison import with_measurements
+    from wlr_gym.hardware.commissioning.runner import with_measurements
     from wlr_gym.hardware.config import load_hardware
 
     content = with_measurements(load_hardware(source), findings, earlier)  # what the file says, not ports of the command line

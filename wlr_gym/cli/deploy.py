@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.hardware.deployment import Deployment
     from wlr_gym.hardware.emulator.machine import Machine
-    from wlr_gym.hardware.gamepad import DrivingPad
     from wlr_gym.hardware.loop import ControlLoop
-    from wlr_gym.hardware.operator import Keys
+    from wlr_gym.hardware.operator import DrivingPad, Keys
     from wlr_gym.policy import Policy
 
 #: How a stop begins that an emulated robot in real time owes to a busy computer.
@@ -185,7 +184,7 @@ def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> 
 
 def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Console) -> list[DrivingPad]:
     """Return the gamepad that steers, or none; refuse one whose sticks steer none of the task's commands."""
-    from wlr_gym.hardware.gamepad import DrivingPad
+    from wlr_gym.hardware.operator import DrivingPad
 
     if options.gamepad is None:
         return []

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
-    from wlr_gym.hardware.safety.check import Check
+    from wlr_gym.hardware.safety.preflight import Check
     from wlr_gym.robot import Robot
 
 
@@ -78,7 +78,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
     from wlr_gym.hardware.dynamixel.errors import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight
-    from wlr_gym.hardware.safety.camera_check import check_camera
+    from wlr_gym.hardware.safety.preflight import check_camera
 
     ports = preflight.open_ports(link.servos, link.imu, hardware, link.flow)
     found = ports if options.emulated else ports + preflight.check_latency_timers(hardware)
@@ -110,7 +110,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
 
 def _mend(link: Link, checks: Sequence[Check], console: Console) -> bool:
     """Say which registers will be written, ask, write; return whether there were any."""
-    from wlr_gym.hardware.safety.registers import mend, mendable
+    from wlr_gym.hardware.safety.preflight import mend, mendable
 
     registers = [(check.where, check.found, *check.fix) for check in mendable(checks) if check.fix]
     if not registers:
@@ -125,7 +125,7 @@ def _mend(link: Link, checks: Sequence[Check], console: Console) -> bool:
 
 def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Check]:
     """Return whether a policy was made for this robot, its observations and its control period, and for its sensors."""
-    from wlr_gym.hardware.safety.check import Check
+    from wlr_gym.hardware.safety.preflight import Check
     from wlr_gym.learning.evaluation.rollout import make_core
     from wlr_gym.policy import camera_share, check_contract, contract_of, environment_for, misses_camera
 
@@ -172,7 +172,7 @@ def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console
 def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) -> None:
     from rich.text import Text
 
-    from wlr_gym.hardware.safety.registers import mendable
+    from wlr_gym.hardware.safety.preflight import mendable
 
     for line, style in _lines(checks, options.verbose):
         console.print(Text(line, style))

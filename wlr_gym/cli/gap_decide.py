@@ -102,7 +102,7 @@ def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backen
     """Drive an emulated robot in emulated time, through the command limiter as a real one; noise as in a simulator."""
     from wlr_gym.data.read import read_meta
     from wlr_gym.gap.decision import Recorded
-    from wlr_gym.hardware.driving import drive_robot
+    from wlr_gym.hardware.deployment import drive_robot
 
     del backend  # it has a simulator of its own
     meta = read_meta(data).model_copy(update={"profile": motion.profile})

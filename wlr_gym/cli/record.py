@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data.excitations import Motion
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.driving import DriveResult
+    from wlr_gym.hardware.deployment import DriveResult
     from wlr_gym.robot import Robot
 
 
@@ -128,7 +128,7 @@ def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
 
 def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
     """Limited and logged; between the motions the operator carries the robot back."""
-    from wlr_gym.hardware.driving import drive_robot
+    from wlr_gym.hardware.deployment import drive_robot
 
     assert options.out is not None
     found: list[dict[str, object]] = []

@@ -153,7 +153,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.data.record import meta_of, motion_of
     from wlr_gym.data.repetition import compare_repeat
     from wlr_gym.data.replay import robot_of
-    from wlr_gym.hardware.driving import drive_robot
+    from wlr_gym.hardware.deployment import drive_robot
 
     motions = [motion_of(measured) for measured in runs]
     chosen = options.robot or options.load_hardware().robot

@@ -11,19 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.config import Hardware, load_hardware
-    from wlr_gym.hardware.deployment import Deployment, deploy
-    from wlr_gym.hardware.driving import DriveResult, drive_robot
+    from wlr_gym.hardware.deployment import Deployment, DriveResult, deploy, drive_robot
     from wlr_gym.hardware.plant import RobotPlant
     from wlr_gym.physics.plants.robot_options import RobotOptions
 
 HOMES = {
     "Deployment": "wlr_gym.hardware.deployment",
-    "DriveResult": "wlr_gym.hardware.driving",
+    "DriveResult": "wlr_gym.hardware.deployment",
     "Hardware": "wlr_gym.hardware.config",
     "RobotOptions": "wlr_gym.physics.plants.robot_options",
     "RobotPlant": "wlr_gym.hardware.plant",
     "deploy": "wlr_gym.hardware.deployment",
-    "drive_robot": "wlr_gym.hardware.driving",
+    "drive_robot": "wlr_gym.hardware.deployment",
     "load_hardware": "wlr_gym.hardware.config",
 }
 

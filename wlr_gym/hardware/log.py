@@ -24,9 +24,8 @@ from wlr_gym.data.logs.stream import McapStream
 from wlr_gym.data.robot_file import note_robot
 from wlr_gym.data.sensor_columns import LIVE_CAMERA, channels, sensed_columns
 from wlr_gym.data.write import write_meta
-from wlr_gym.hardware.safety.state import RobotStatus
-from wlr_gym.hardware.step import StepRecord
-from wlr_gym.hardware.timing import Clock
+from wlr_gym.hardware.link import Link
+from wlr_gym.hardware.safety.rules import Decision, RobotStatus
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 from wlr_gym.robot import JOINTS, WHEEL_SLICE, Robot
 
@@ -187,10 +186,8 @@ class RunRecorder:
     Args:
         folder: of the logs; None = none is written.
         meta: of the runs.
-        clock: of the runs.
         robot: whose runs they are.
-        has_camera: its poses are logged, too.
-        seed: of an emulated robot's noise; None = of none.
+        link: to it: the clock of the runs, whether there is a camera, whose poses are logged then, the seed of an emulated one.
 
     Attributes:
         columns: of a row.
@@ -200,22 +197,14 @@ class RunRecorder:
         stream: where rows of the run go besides; it has these columns.
     """
 
-    def __init__(
-        self,
-        folder: Path | None,
-        meta: RunMeta,
-        clock: Clock,
-        robot: Robot,
-        has_camera: bool = False,
-        seed: int | None = None,
-    ) -> None:
-        self.folder, self.meta, self._robot, self._has_camera = folder, meta, robot, has_camera
-        self.columns = row_columns(robot, has_camera)
+    def __init__(self, folder: Path | None, meta: RunMeta, robot: Robot, link: Link) -> None:
+        self.folder, self.meta, self._robot, self._has_camera = folder, meta, robot, link.camera is not None
+        self.columns = row_columns(robot, self._has_camera)
         self.log: RunLog | None = None
         self.trouble = ""
         self.stream: McapStream | None = None
         self.origin: RobotStatus | None = None
-        self._clock, self._seed = clock, seed
+        self._clock, self._seed = link.clock, link.seed
         self._checks: list[str] = []
         self._rules: frozenset[str] = frozenset()
         self._flow_trouble = ""
@@ -253,42 +242,43 @@ class RunRecorder:
             if name in _TABLES:
                 self.log.begin(_TABLES[name])
 
-    def step(self, record: StepRecord) -> None:
-        """Write the row of a control step, and an event for each rule that begins to act."""
+    def step(self, status: RobotStatus, decision: Decision, setpoints: np.ndarray, count: int) -> None:
+        """Write the row of a control step, and an event for each rule that begins to act.
+
+        Args:
+            status: what was known of the robot.
+            decision: of the command limiter.
+            setpoints: (8,) as the servos' registers hold them, rad and rad/s; NaN = motor off.
+            count: readings of the joints so far.
+        """
         if self.log is None or self.trouble:
             return
         with self._noting_trouble():
-            status, decision = record.status, record.decision
-            row = self.log.row(status.time, sensors_of(status, self.origin), record.setpoints)
+            row = self.log.row(status.time, sensors_of(status, self.origin), setpoints)
             if self.stream is not None and row is not None:
                 self.stream.add(float(row[0]), row[1:].tolist())
             rules = {verdict.rule: {"level": verdict.level.name, "text": verdict.text} for verdict in decision.verdicts}
             rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}
             for rule in rules.keys() - self._rules:
-                self.log.event(status.time, "intervention", rule=rule, row=record.count, **rules[rule])
+                self.log.event(status.time, "intervention", rule=rule, row=count, **rules[rule])
             self._rules = frozenset(rules)
-            self._note_camera(record)
-            self._note_flow(record)
+            self._note_camera(self.log, status, count)
+            self._note_flow(self.log, status, count)
 
-    def _note_camera(self, record: StepRecord) -> None:
+    def _note_camera(self, log: RunLog, status: RobotStatus, count: int) -> None:
         """Write an event where the camera begins to give no pose, for a reason, and where it gives one again."""
-        assert self.log is not None
-        status = record.status
         if status.camera is not None and status.camera.reason != self._camera:
             self._camera = status.camera.reason
-            self.log.event(
-                status.time, "camera", row=record.count, no_pose=self._camera or None, doubt=status.camera.doubt or None
-            )
+            log.event(status.time, "camera", row=count, no_pose=self._camera or None, doubt=status.camera.doubt or None)
 
-    def _note_flow(self, record: StepRecord) -> None:
+    def _note_flow(self, log: RunLog, status: RobotStatus, count: int) -> None:
         """Write an event where optical flow begins to be missing, for a reason, or is odd, and where it is well again."""
-        assert self.log is not None
-        reading = record.status.flow
+        reading = status.flow
         if reading is None or not (reading.trouble or reading.is_new):
             return
         kind = (reading.trouble or reading.note).partition(":")[0]
         if kind != self._flow_trouble:
-            self.log.event(record.status.time, "flow", row=record.count, trouble=reading.trouble, note=reading.note)
+            log.event(status.time, "flow", row=count, trouble=reading.trouble, note=reading.note)
             self._flow_trouble = kind
 
     def policy(self, names: list[str], values: np.ndarray) -> None:

@@ -9,7 +9,7 @@ Making a loop opens nothing and moves nothing. ``start`` makes the preflight che
 setpoints that ask for no motion. Whatever ends a run ends in :meth:`ControlLoop.stop`, which always switches torque off.
 FAULT is for good: look at the robot, then make a new loop.
 
-What happens in a control step is in :mod:`wlr_gym.hardware.step`.
+A control step follows the data: check, decide and limit, write; log; serve the operator, wait for the deadline, read.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,16 +34,15 @@ from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunRecorder, sensors_of
 from wlr_gym.hardware.operator import Operator
-from wlr_gym.hardware.ramp import legs_away, make_ramp, ramp_speed, start_pose
-from wlr_gym.hardware.safety.check import NotReadyError
 from wlr_gym.hardware.safety.limiter import CommandLimiter
-from wlr_gym.hardware.safety.rules import resting
-from wlr_gym.hardware.safety.state import REQUESTS, Level, RobotStatus, Verdict
+from wlr_gym.hardware.safety.preflight import NotReadyError
+from wlr_gym.hardware.safety.rules import REQUESTS, Decision, Level, RobotStatus, Verdict, resting
 from wlr_gym.hardware.safety.watchdog import Guard
-from wlr_gym.hardware.step import ControlStep
+from wlr_gym.hardware.sensing import Sensing
 from wlr_gym.hardware.timing import Clock, Pacer
 from wlr_gym.physics.plants.base import Sensors
-from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
+from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]
 
@@ -53,6 +52,10 @@ TIMED_READS = 200
 LONGEST_HOLD = 30.0
 #: s that arming the servos may take, or the last tries to switch them off, before this process counts as hung.
 ARM_TIME = 10.0
+#: s the shortest way to the start pose takes.
+SHORTEST_RAMP = 0.5
+#: Fastest over mean speed of a minimum-jerk path.
+PEAK_SPEED = 1.875
 #: What a servo, a bus or the IMU can raise while it is talked to.
 HARDWARE_TROUBLE = (NoAnswerError, RefusedError, ConnectionError)
 
@@ -80,9 +83,8 @@ class ControlLoop:
         robot, hardware: what is driven.
         link: its connections; taken over and opened by the first :meth:`start`.
         period: s of a control step.
-        dry_run: everything but writing: torque stays off, nothing moves.
-        log: folder for the logs of runs; None = none.
-        watchdog: start a watchdog process (real ports only).
+        options: ``dry_run``, ``log`` and ``guard`` count here: what is not written, where logs go, whether a watchdog process
+            starts (real ports only).
         meta: of the log; its profile is the servos'. None = robot's name, no profile.
 
     Attributes:
@@ -98,24 +100,26 @@ class ControlLoop:
         hardware: Hardware,
         link: Link,
         period: float = 0.02,
-        *,
-        dry_run: bool = False,
-        log: Path | None = None,
-        watchdog: bool = True,
+        options: RobotOptions | None = None,
         meta: RunMeta | None = None,
     ) -> None:
-        _check_period(period, hardware.safety.watchdog)
-        meta = meta or RunMeta(robot=robot.name, profile=Profile(), notes="dry run" if dry_run else None)
+        options = options or RobotOptions()
+        if period >= (longest := hardware.safety.watchdog):
+            raise InputError(
+                f"control period {period:g} s: expected less than safety.watchdog, {longest:g} s: servos would stop"
+            )
+        meta = meta or RunMeta(robot=robot.name, profile=Profile(), notes="dry run" if options.dry_run else None)
         self.robot, self.hardware, self.limits = robot, hardware, hardware.safety
         self.phase: Phase = Phase.TORQUE_OFF
         self.reason, self.ended_well = "", True
         self.clock: Clock = link.clock
         self.operator, self.pacer = Operator(link.clock), Pacer(link.clock, period)
-        self.recorder: RunRecorder = RunRecorder(log, meta, link.clock, robot, link.camera is not None, link.seed)
+        self.recorder: RunRecorder = RunRecorder(options.log, meta, robot, link)
         self._link, self._is_open = link, False
-        self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, dry_run, meta.profile)
-        self._step = ControlStep(self._limiter, link, self.operator, self.pacer)
-        self._guard = Guard(robot, hardware, watchdog and link.is_serial and not dry_run)
+        self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, options.dry_run, meta.profile)
+        self._sensing = Sensing(self._limiter, link, period)
+        self._guard = Guard(robot, hardware, options.guard and link.is_serial and not options.dry_run)
+        self._idle = self._read_at = 0.0  # s for which nothing was sent before the last reading, and when that was there
 
     def __enter__(self) -> ControlLoop:
         return self
@@ -126,7 +130,7 @@ class ControlLoop:
     @property
     def status(self) -> RobotStatus | None:
         """What was last read; None = nothing yet."""
-        return self._step.status
+        return self._sensing.status
 
     @property
     def setpoints(self) -> Array:
@@ -140,11 +144,11 @@ class ControlLoop:
 
     def sensors(self) -> Sensors:
         """Return what was last read as a plant's sensors; wheels from where they stood at the run's start."""
-        return sensors_of(self._step.known, self.recorder.origin)
+        return sensors_of(self._sensing.known, self.recorder.origin)
 
     def statistics(self) -> dict[str, Any]:
         """Return ticks, missed ones, percentiles of the timing (ms), the limiter's interventions, what camera and flow gave."""
-        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **self._step.sensor_statistics()}
+        return {**self.pacer.statistics(), "interventions": dict(self.interventions), **self._sensing.statistics()}
 
     # ---- start-up ----
 
@@ -158,11 +162,13 @@ class ControlLoop:
 
         Raises:
             StoppedError: a check failed, or the robot had to stop on the way.
-            InputError: a port cannot be opened, or the loop is in FAULT.
+            InputError: a port cannot be opened, the loop is in FAULT, or ``legs`` are not four finite numbers.
         """
         if self.phase is Phase.FAULT:
             raise InputError(f"the robot stopped with a fault ({self.reason}): look at it, then start anew")
-        target = start_pose(self.robot, legs)
+        target = np.full(len(LEGS), self.robot.home.leg_angle) if legs is None else np.asarray(legs, np.float64)
+        if target.shape != (len(LEGS),) or not np.isfinite(target).all():
+            raise InputError(f"start pose {target}: expected four finite leg angles in rad")
         with self._stopping_on_trouble():
             if self.phase is Phase.TORQUE_OFF:
                 self._switch_on()
@@ -170,9 +176,9 @@ class ControlLoop:
                 self.recorder.new_run()
             self._enter(Phase.RAMP)
             self._follow_ramp(target)
-            self.recorder.origin = self._step.begin_run()
+            self.recorder.origin = self._sensing.begin_run()
             self._enter(Phase.RUNNING)
-        return self._step.known
+        return self._sensing.known
 
     def _switch_on(self) -> None:
         """Torque off, and nothing known, to standing with torque on."""
@@ -186,33 +192,41 @@ class ControlLoop:
         if wrong := "\n".join(str(check) for check in found if check.is_fatal and not check.ok):
             self._fail(f"preflight: {wrong}")
         self._guard.start(self.recorder.folder)
-        self._step.first()
+        self._sensing.first()
         self.operator.serve()
         if self.operator.asked:
             self._fail(self.operator.asked, is_fault=False)
         self._limiter.prepare()
-        self._step.first()  # again, after what takes a second: torque comes on under a body that stands now
+        self._sensing.first()  # again, after what takes a second: torque comes on under a body that stands now
         atexit.register(self.close)
         self._guard.expect(ARM_TIME)
         self._limiter.arm()
-        self._step.begin()
+        self._idle = 0.0
+        self.pacer.start()
+        self._sensing.next()
 
     def _follow_ramp(self, target: Array) -> None:
         """Go to a start pose (4,), and see that the legs are there: not blocked, too weak, or held by the command limiter."""
-        speed = ramp_speed(self.limits, self._limiter.profile.leg_velocity)
-        ramp = make_ramp(self.setpoints[LEG_SLICE], target, speed, self.pacer.period)
+        speed, fastest = self.limits.start_speed, self._limiter.profile.leg_velocity
+        speed = min(speed, fastest / PEAK_SPEED) if fastest > 0.0 else speed  # legs with a velocity profile follow no faster
+        way = minimum_jerk(self.setpoints[LEG_SLICE], target, speed, self.pacer.period)
         done = held = 0
-        while done < ramp.steps:
-            worst = self._drive(ramp.setpoints(done + 1))
+        while done < len(way):
+            worst = self._drive(way[done])
             if worst.level < Level.HOLD:
                 done += 1
                 continue
             held += 1  # held legs wait where they are, and so does their way
             if held * self.pacer.period > LONGEST_HOLD:
                 self._fail(f"held for {LONGEST_HOLD:g} s on the way to the start pose: {worst.rule}: {worst.text}")
-        known = self._step.known.position[LEG_SLICE]
-        if (away := legs_away(known, target, self.limits.start_error)) and not self._limiter.dry_run:
-            self._fail(away)
+        position, limit = self._sensing.known.position, self.limits.start_error
+        away = [
+            f"{leg} is at {at:.2f} rad, its setpoint is {to:.2f} rad"
+            for leg, at, to in zip(LEGS, position[LEG_SLICE], target, strict=True)
+            if abs(at - to) > limit
+        ]
+        if away and not self._limiter.dry_run:
+            self._fail(f"start pose: {'; '.join(away)} (limit {limit:g} rad)")
 
     # ---- drive ----
 
@@ -230,7 +244,7 @@ class ControlLoop:
             raise StoppedError(self.reason or "the robot has not been started")
         with self._stopping_on_trouble():
             self._drive(wanted, torque_on)
-        return self._step.known
+        return self._sensing.known
 
     def _drive(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> Verdict:
         """Take a control step; return the worst verdict, if it lets the run go on."""
@@ -242,15 +256,48 @@ class ControlLoop:
     def _take_step(self, wanted: object, torque_on: NDArray[np.bool_] | None = None) -> Verdict:
         """Send, log and receive; return the worst verdict, at once when torque must go off."""
         self._guard.expect(self.limits.heartbeat)
-        trouble = self.recorder.trouble or self._guard.trouble
-        record = self._step.send(wanted, torque_on, trouble, is_answer=self.phase is Phase.RUNNING)
-        worst = record.decision.worst
+        status, decision = self._send(wanted, torque_on)
+        worst = decision.worst
         if worst.level >= (Level.OFF if self.phase is Phase.STOPPING else Level.STOP):
             self._note_reason(f"{worst.rule}: {worst.text}")
-        self.recorder.step(record)
+        is_on = self._limiter.torque_on & (worst.level < Level.OFF)
+        sent = np.where(is_on, self._limiter.written, np.nan)
+        self.recorder.step(status, decision, sent, self._sensing.count)
         if worst.level < Level.OFF:
-            self._step.receive()
+            self._receive()
         return worst
+
+    def _send(self, wanted: object, torque_on: NDArray[np.bool_] | None) -> tuple[RobotStatus, Decision]:
+        """Check what was last read, decide, limit and write; return what was known, and what was decided."""
+        known, pacer, operator = self._sensing.known, self.pacer, self.operator
+        is_answer = self.phase is Phase.RUNNING  # somebody answers what was read (a policy): time thinking and latency
+        if is_answer:
+            pacer.note("think", self.clock.now() - self._read_at)
+        status = replace(
+            known,
+            late_ticks=pacer.late_ticks,
+            late_share=pacer.late_share,
+            operator_silence=operator.silence,
+            idle=max(self._idle, self.clock.now() - known.time),
+            trouble=self.recorder.trouble or self._guard.trouble or operator.trouble,
+            asked_to_stop=operator.asked_to_stop,
+            asked_off=operator.asked_off,
+        )
+        with pacer.timed("write"):
+            decision = self._limiter.write(wanted, status, torque_on)
+        if is_answer:
+            pacer.note("latency", self.clock.now() - self._read_at)
+        return status, decision
+
+    def _receive(self) -> None:
+        """Serve the operator in the time that is left, wait for the deadline, read."""
+        sent = self.clock.now()
+        self.operator.serve()
+        self.pacer.wait()
+        self._idle = self.clock.now() - sent
+        with self.pacer.timed("read"):
+            self._sensing.next()
+        self._read_at = self.clock.now()
 
     # ---- stop ----
 
@@ -373,9 +420,15 @@ class ControlLoop:
         self.recorder.phase(phase.value, self.reason)
 
 
-def _check_period(period: float, longest: float) -> None:
-    if period >= longest:
-        raise InputError(f"control period {period:g} s: expected less than safety.watchdog, {longest:g} s: servos would stop")
+def minimum_jerk(begin: Array, target: Array, speed: float, period: float) -> list[Array]:
+    """Return the setpoints (8,) of every control step from one pose (4,) to another, wheels at rest; rad and rad/s.
+
+    ``speed`` is the mean speed (rad/s) of the leg with the longest way.
+    """
+    steps = int(np.ceil(max(SHORTEST_RAMP, float(np.abs(target - begin).max()) / speed) / period))
+    times = [step / steps for step in range(1, steps + 1)]
+    shares = [s**3 * (10.0 - 15.0 * s + 6.0 * s * s) for s in times]
+    return [np.concatenate([begin + share * (target - begin), np.zeros(len(WHEELS))]) for share in shares]
 
 
 def _demand(left: list[str]) -> str:

@@ -76,16 +76,7 @@ class RobotPlant:
             link = _link(robot, description, chosen, self.options)
         self.parameters["flow.present"] = link.flow is not None
         self.parameters["camera.present"] = link.camera is not None
-        self.loop: ControlLoop = ControlLoop(
-            robot,
-            description,
-            link,
-            self.options.control_period,
-            dry_run=chosen.dry_run,
-            log=chosen.log,
-            watchdog=chosen.guard,
-            meta=meta,
-        )
+        self.loop: ControlLoop = ControlLoop(robot, description, link, self.options.control_period, chosen, meta)
 
     def reset(
         self,

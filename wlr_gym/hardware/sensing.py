@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
-from wlr_gym.hardware.camera.reading import CameraReader
-from wlr_gym.hardware.flow.driver import Flow
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.flow.supervision import FlowSupervision
-from wlr_gym.hardware.imu.driver import Imu, ImuReading
+from wlr_gym.hardware.imu.driver import ImuReading
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
-from wlr_gym.hardware.safety.camera import CameraWatch
-from wlr_gym.hardware.safety.check import NotReadyError
+from wlr_gym.hardware.link import Link
+from wlr_gym.hardware.safety.camera import CameraWatch, camera_statistics
 from wlr_gym.hardware.safety.limiter import CommandLimiter
-from wlr_gym.hardware.safety.rules import VERTICAL_BAND, next_up, tilt_of
-from wlr_gym.hardware.safety.state import Mask, RobotStatus
-from wlr_gym.hardware.safety.supervision import reach, unseen
+from wlr_gym.hardware.safety.preflight import NotReadyError
+from wlr_gym.hardware.safety.rules import VERTICAL_BAND, Mask, RobotStatus, next_up, reach, tilt_of, unseen
 from wlr_gym.hardware.servos import JointReadings, ServoRegisters
-from wlr_gym.hardware.timing import Clock
 from wlr_gym.robot import JOINTS
 
 #: Control steps between readings of voltage and temperature.
@@ -35,35 +33,48 @@ class Sensing:
 
     Args:
         limiter: reads the servos.
-        imu: of the robot; open.
-        clock: of the run.
+        link: its other sensors, open before they are read, and the clock of the run.
         period: s of a control step.
-        camera: above the floor; None = there is none.
-        flow: optical-flow sensor, open; None = there is none.
 
     Attributes:
+        status: what was last read; None = nothing yet.
         count: readings of the joints since :meth:`first`.
         watch: judges the camera's readings; None = there is none.
     """
 
-    def __init__(
-        self,
-        limiter: CommandLimiter,
-        imu: Imu,
-        clock: Clock,
-        period: float,
-        camera: CameraReader | None = None,
-        flow: Flow | None = None,
-    ) -> None:
-        self._camera = camera
-        self.watch: CameraWatch | None = None if camera is None else CameraWatch(limiter.robot, camera.file.doubt)
+    def __init__(self, limiter: CommandLimiter, link: Link, period: float) -> None:
+        self.status: RobotStatus | None = None
         self.count = 0
+        self._limiter, self._link, self._clock, self._period = limiter, link, link.clock, period
+        self.watch: CameraWatch | None = None if link.camera is None else CameraWatch(limiter.robot, link.camera.file.doubt)
+        self._flow = None if link.flow is None else FlowSupervision(link.flow, limiter.robot)
         self._broken = 0  # packets until all joints answered last
-        self._limiter, self._imu, self._clock, self._period = limiter, imu, clock, period
-        self._flow = None if flow is None else FlowSupervision(flow, limiter.robot)
 
-    def first(self) -> RobotStatus:
-        """Wait for the IMU; read everything once.
+    @property
+    def known(self) -> RobotStatus:
+        """What was last read.
+
+        Raises:
+            InputError: nothing yet.
+        """
+        if self.status is None:
+            raise InputError("the robot has not been started")
+        return self.status
+
+    def statistics(self) -> dict[str, Any]:
+        """Return what came of camera and optical flow, under their names, of those there are."""
+        camera = {} if self.watch is None else {"camera": camera_statistics(self.watch)}
+        return camera if self._link.flow is None else {**camera, "flow": asdict(self._link.flow.statistics)}
+
+    def begin_run(self) -> RobotStatus:
+        """Let a run begin: the camera's poses count from here. Return what is known."""
+        if self.watch is not None:
+            self.watch.begin_run()
+            self.status = replace(self.known, camera=self.watch.status)
+        return self.known
+
+    def first(self) -> None:
+        """Wait for the IMU; read everything once, with torque off.
 
         Raises:
             NotReadyError: a joint or the IMU does not answer, or the body leans.
@@ -78,7 +89,7 @@ class Sensing:
             raise NotReadyError(f"no answer from {silent}")
         voltage, temperature = self._limiter.read_health()
         self.count = 0
-        return RobotStatus(
+        self.status = RobotStatus(
             time=self._clock.now(),
             position=readings.position,
             velocity=readings.velocity,
@@ -97,7 +108,7 @@ class Sensing:
 
     def _first_imu_reading(self) -> ImuReading:
         end = self._clock.now() + IMU_TIME
-        while (reading := self._imu.read()) is None or reading.age > min(ATTITUDE_AGE, self._limiter.limits.imu_silence):
+        while (reading := self._link.imu.read()) is None or reading.age > min(ATTITUDE_AGE, self._limiter.limits.imu_silence):
             if self._clock.now() > end:
                 raise NotReadyError("imu: no reading; check its port and power")
             self._clock.wait_until(self._clock.now() + self._period)
@@ -116,15 +127,13 @@ class Sensing:
             raise NotReadyError(f"imu: the body leans by {tilt:.2f} rad, limit {limit:g}: it must stand, and be level")
         return up
 
-    def next(self, before: RobotStatus) -> RobotStatus:
-        """Read servos, IMU and camera; what does not answer stays as it was, and its silence grows."""
-        status = self._next_joints_and_imu(before)
-        if self._camera is None or self.watch is None:
-            return status
-        now = self._clock.now()
-        joints = (status.position, status.velocity)
-        seen = self.watch.next(now, joints, status.gyro, self._camera.read(now), self._camera.trouble)
-        return replace(status, camera=seen)
+    def next(self) -> None:
+        """Read servos, IMU, flow and camera; what does not answer stays as it was, and its silence grows."""
+        status, camera = self._next_joints_and_imu(self.known), self._link.camera
+        if camera is not None and self.watch is not None:
+            now, joints = self._clock.now(), (status.position, status.velocity)
+            status = replace(status, camera=self.watch.next(now, joints, status.gyro, camera.read(now), camera.trouble))
+        self.status = status
 
     def _next_joints_and_imu(self, before: RobotStatus) -> RobotStatus:
         now = self._clock.now()
@@ -136,7 +145,7 @@ class Sensing:
         except ConnectionError as error:
             lost = str(error)
         try:
-            reading = self._imu.read()
+            reading = self._link.imu.read()
         except ImuGoneError:
             reading = None
         flow = None if self._flow is None else self._flow.next(status.position, status.velocity, before.gyro, elapsed)

@@ -1,10 +1,13 @@
-"""Runs commissioning tests one after the other: motors off after each, logged, compared with the emulated robot."""
+"""Runs commissioning tests one after the other: motors off after each, logged, compared with the emulated robot.
+
+What was measured goes into the hardware file (:func:`with_measurements`).
+"""
 
 from __future__ import annotations
 
 import contextlib
 import datetime
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,18 +17,15 @@ from wlr_gym.base.files import write_json
 from wlr_gym.data.format import RunMeta
 from wlr_gym.data.record import next_run
 from wlr_gym.data.write import write_run
-from wlr_gym.hardware.commissioning.comparison import StandFinding, compare
-from wlr_gym.hardware.commissioning.contract import PartlyError, Reading, StandTest
-from wlr_gym.hardware.commissioning.emulated_person import EmulatedPerson
-from wlr_gym.hardware.commissioning.errors import PowerError, QuitError, SkippedError, TrippedError, TroubleError
-from wlr_gym.hardware.commissioning.person import Person
-from wlr_gym.hardware.commissioning.stand import Stand
+from wlr_gym.hardware.commissioning.stand import Person, PowerError, QuitError, SkippedError, Stand, TrippedError, TroubleError
+from wlr_gym.hardware.commissioning.stand_tests import PartlyError, Reading, StandQuantity, StandTest
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.emulator.machine import MachineOptions
 from wlr_gym.hardware.emulator.stand import EmulatedStand
 from wlr_gym.hardware.link import Link
+from wlr_gym.hardware.measured import Measured, MeasuredValue
 from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.hardware.safety.preflight import check_servos
 from wlr_gym.hardware.safety.watchdog import Guard
@@ -38,6 +38,64 @@ TRIES = 3
 #: Of the emulated robot's sensor noise: other noise than that of an emulated robot under test, whose seed is 0.
 _SEED = 1
 _TROUBLE = (TroubleError, NoAnswerError, RefusedError, ConnectionError, InputError)
+
+
+@dataclass(frozen=True)
+class StandFinding:
+    """A measured value beside the expected one.
+
+    Attributes:
+        test: name of the test.
+        quantity: what was measured.
+        where: joint, bus, or ``imu``.
+        measured, expected: in the quantity's unit.
+    """
+
+    test: str
+    quantity: StandQuantity
+    where: str
+    measured: float
+    expected: float
+
+    @property
+    def room(self) -> float:
+        """By how much the value may differ."""
+        return self.quantity.tolerance + self.quantity.relative * abs(self.expected)
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether it differs by no more; a value that is no number differs."""
+        return abs(self.measured - self.expected) <= self.room
+
+    @property
+    def verdict(self) -> str:
+        """In words."""
+        return "as expected" if self.is_expected else "differs"
+
+
+def compare(test: StandTest, measured: Sequence[Reading], expected: Sequence[Reading]) -> list[StandFinding]:
+    """Return what was measured beside what the emulated robot showed, in the order it was measured."""
+    quantities = {quantity.name: quantity for quantity in test.quantities}
+    known = {(reading.quantity, reading.where): reading.value for reading in expected}
+    return [
+        StandFinding(test.name, quantities[one.quantity], one.where, one.value, known[one.quantity, one.where])
+        for one in measured
+    ]
+
+
+def with_measurements(hardware: Hardware, findings: Iterable[StandFinding], earlier: Measured | None = None) -> Hardware:
+    """Return the hardware with what was measured; values that were not stay, its own or ``earlier`` ones: the later of two."""
+    kept = {name: dict(getattr(hardware.measured, name)) for name in Measured.model_fields}
+    for name, values in kept.items():
+        for where, value in getattr(earlier or Measured(), name).items():
+            if where not in values or value.date >= values[where].date:
+                values[where] = value
+    today = datetime.datetime.now().astimezone().date().isoformat()
+    for one in findings:
+        if one.quantity.name in kept:
+            value = float(f"{one.measured:.4g}")
+            kept[one.quantity.name][one.where] = MeasuredValue(value=value, unit=one.quantity.unit, date=today)
+    return hardware.model_copy(update={"measured": Measured(**{name: values for name, values in kept.items() if values})})
 
 
 @dataclass(frozen=True)
@@ -64,6 +122,45 @@ class StandResult:
     def is_good(self) -> bool:
         """Whether it was made, or left out on purpose, and nothing differs."""
         return self.state in (DONE, SKIPPED) and all(finding.is_expected for finding in self.findings)
+
+
+class EmulatedPerson:
+    """Does with an emulated robot what is asked for, and never asks."""
+
+    def __init__(self, stand: EmulatedStand) -> None:
+        self._stand = stand
+        self._current = 0.0
+
+    def ready(self, test: str) -> None:
+        """Agree."""
+
+    def turn(self, joint: str, angle: float) -> None:
+        """Turn it."""
+        self._stand.machine.turn(joint, angle)
+
+    def straighten(self, leg: str) -> None:
+        """Hold it straight."""
+        self._stand.machine.straighten(leg)
+
+    def tilt(self, seconds: float, **angles: float) -> None:
+        """Tilt the body; it is there in about 2 s."""
+        self._stand.tilt(**angles)
+
+    def brake(self, joint: str, trouble: str = "") -> None:
+        """Hold it."""
+        self._stand.brake(joint)
+
+    def release(self, joint: str) -> None:
+        """Let go."""
+        self._stand.release(joint)
+
+    def watch_supply(self) -> None:
+        """Note the current."""
+        self._current = self._stand.wheel_current()
+
+    def supply_current(self) -> float | None:
+        """Return what was noted."""
+        return self._current
 
 
 class Commissioning:

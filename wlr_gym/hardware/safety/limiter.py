@@ -17,10 +17,9 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError
-from wlr_gym.hardware.safety import preflight, registers, rules
-from wlr_gym.hardware.safety.check import Check, NotReadyError
-from wlr_gym.hardware.safety.rules import Decision, Memory
-from wlr_gym.hardware.safety.state import Level, RobotStatus
+from wlr_gym.hardware.safety import preflight, rules
+from wlr_gym.hardware.safety.preflight import Check, NotReadyError
+from wlr_gym.hardware.safety.rules import Decision, Level, Memory, RobotStatus
 from wlr_gym.hardware.servos import JointReadings, Servos
 from wlr_gym.hardware.timing import Clock
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
@@ -109,7 +108,7 @@ class CommandLimiter:
         found = self._examine()
         wrong = [check for check in found if not check.ok and check.is_fatal]
         if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
-            registers.mend(self.__servos, wrong)
+            preflight.mend(self.__servos, wrong)
             found = self._examine()
             wrong = [check for check in found if not check.ok and check.is_fatal]
         if not wrong:
@@ -199,7 +198,7 @@ class CommandLimiter:
         for k, joint in enumerate(JOINTS):
             goal_pwm[k] = servos.get(joint, "pwm_limit")
             servos.set(joint, "goal_pwm", int(goal_pwm[k]))
-            registers.reset_tuning(servos, joint)
+            preflight.reset_tuning(servos, joint)
             for item, value in (leg if joint in LEGS else wheel).items():
                 count = round(value / servos.table(joint).per_count(item))
                 servos.set(joint, item, count if value == 0.0 else max(1, count))  # 0 would be no profile at all

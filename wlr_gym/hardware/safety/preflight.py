@@ -1,19 +1,28 @@
-"""Preflight: checks of ports, servos and IMU before anything moves, each with its remedy. Reads only."""
+"""Preflight: checks of ports, servos and sensors before anything moves, each with its remedy.
+
+Looking writes nothing; :func:`mend` repairs registers for who asks for it. The servos' EEPROM must hold what the hardware
+file's ``eeprom`` says, else the factory default (control tables, ROBOTIS e-manual). Gains and profiles, in RAM, are set before
+torque comes on and need no look.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
-from wlr_gym.hardware.config import Bus, FlowPort, Hardware, ImuPort
+from wlr_gym.hardware.camera.config import CameraFile
+from wlr_gym.hardware.camera.reading import CameraReader, CameraReading
+from wlr_gym.hardware.config import FIXED_REGISTERS, Bus, FlowPort, Hardware, ImuPort
 from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import error_names, load_table
 from wlr_gym.hardware.flow.driver import Flow
@@ -21,14 +30,11 @@ from wlr_gym.hardware.imu.driver import Imu
 from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
 from wlr_gym.hardware.imu.reading import ImuGoneError
 from wlr_gym.hardware.ports import PortInUseError, is_pseudo_terminal
-from wlr_gym.hardware.safety.check import Check
-from wlr_gym.hardware.safety.registers import REPAIR, REQUIRED, check_answers, check_registers, expected_count
+from wlr_gym.hardware.safety.camera import LARGEST_AGE, LARGEST_SIGMA
 from wlr_gym.hardware.servos import JointMap, Servos
-from wlr_gym.hardware.timing import processor_share
+from wlr_gym.hardware.timing import Clock, processor_share
+from wlr_gym.perception.vision.live_pose import MEANINGS, NO_FLOOR
 from wlr_gym.robot import JOINTS, LEGS, Robot
-
-if TYPE_CHECKING:
-    from wlr_gym.hardware.timing import Clock
 
 #: Oldest firmware that is driven.
 FIRST_FIRMWARE = 42
@@ -54,6 +60,86 @@ LARGEST_RATE = 0.02
 LARGEST_TILT = math.radians(10.0)
 #: Part that gravity's length may be off.
 LARGEST_LENGTH_ERROR = 0.05
+#: s for which the camera is looked at, and between two looks.
+_CAMERA_TIME, _CAMERA_PERIOD = 1.5, 0.005
+#: Part of the frames asked for that must come, and of those with a floor that must show the robot.
+_LEAST_RATE, _LEAST_POSES = 0.8, 0.8
+_CAMERA_REMEDIES = {
+    "rate": "Lower the resolution or the exposure time, or write the rate that comes into the camera's file (rate).",
+    "shutter": "Calibrate from a video of a moving board, or write its readout (s; 0 = global shutter) into that file.",
+    "floor": "Are all floor markers in the picture, flat, lit, and where the floor's file says?",
+    "robot": "Is the robot in the picture, its plate on, and its markers as the body's file says?",
+    "age": "Use USB 3, fewer pixels, a shorter exposure; find out who else uses the computer.",
+    "accuracy": "Bring the camera nearer, use more pixels, focus it, or print larger markers.",
+}
+#: Item of the EEPROM -> what another count does. Only items that some model has are looked at.
+MEANING = {
+    "return_delay_time": "each answer waits so long",
+    "drive_mode": "it turns the direction round, gives profiles another unit, or lets a setpoint switch torque on",
+    "operating_mode": "setpoints are read as another quantity",
+    "secondary_id": "the servo also obeys what is written to that id",
+    "homing_offset": "angles are off, and a watchdog stop may move the motor (DynamixelSDK #584)",
+    "temperature_limit": "the motor is protected too late, or stops too early",
+    "max_voltage_limit": "a good supply is reported as an error, or a bad one is not",
+    "min_voltage_limit": "a good supply is reported as an error, or a bad one is not",
+    "pwm_limit": "the motor gets a part of its voltage",
+    "current_limit": "the motor gets a part of its current",
+    "velocity_limit": "setpoints of speed are clipped, or refused",
+    "max_position_limit": "setpoints are refused inside the leg's range, or taken outside it",
+    "min_position_limit": "setpoints are refused inside the leg's range, or taken outside it",
+    "startup_configuration": "torque or old setpoints come on with the power",
+    "shutdown": "overload, overheating or electrical shock do not cut torque",
+}
+#: Items without a say in what the robot does, and those that a servo which answers has right.
+IGNORED = ("id", "baud_rate", "protocol_type", "moving_threshold", *(f"external_port_mode_{k}" for k in (1, 2, 3)))
+#: Items that no hardware file can ask for otherwise.
+REQUIRED = ("operating_mode", *FIXED_REGISTERS)
+#: Items that are only slow or inconvenient when they are wrong.
+_WARNINGS = ("return_delay_time",)
+#: Items in RAM that set how a motor moves: profiles, of which the default is none, and gains.
+_TUNING = (
+    *("profile_velocity", "profile_acceleration", "velocity_p_gain", "velocity_i_gain", "position_p_gain"),
+    *("position_i_gain", "position_d_gain", "feedforward_1st_gain", "feedforward_2nd_gain"),
+)
+#: How to write it, for remedies.
+REPAIR = "wlr doctor --mend writes it, and asks first"
+#: Answers to everything.
+_ANSWER_ALL = 2
+
+
+class NotReadyError(RuntimeError):
+    """The robot is not as it must be before it is driven; the message says what is wrong."""
+
+
+class Check(NamedTuple):
+    """One thing that was looked at.
+
+    Attributes:
+        where: joint, bus, or ``robot``.
+        what: name of the check.
+        ok: as it should be.
+        found, expected: in words.
+        remedy: what to do about it.
+        is_fatal: nothing may move while it is not ok; else a warning.
+        fix: item and count to write (torque off) that would mend it; None = by hand.
+    """
+
+    where: str
+    what: str
+    ok: bool
+    found: str
+    expected: str
+    remedy: str
+    is_fatal: bool = True
+    fix: tuple[str, int] | None = None
+
+    def __str__(self) -> str:
+        state = "ok" if self.ok else "FAULT" if self.is_fatal else "warning"
+        text = f"{state:8}{self.where:10} {self.what}: {self.found}"
+        return text if self.ok else f"{text}, expected {self.expected}. {self.remedy}"
+
+
+# ---- ports ----
 
 
 def open_ports(servos: Servos, imu: Imu, hardware: Hardware, flow: Flow | None = None) -> list[Check]:
@@ -95,6 +181,9 @@ def _ports_here(devices: Path = Path("/dev")) -> str:
     named = sorted((devices / "serial" / "by-id").glob("*")) if (devices / "serial" / "by-id").is_dir() else []
     found = named or sorted([*devices.glob("ttyUSB*"), *devices.glob("ttyACM*")])
     return f"here are {', '.join(map(str, found))}" if found else "no USB serial port is here now"
+
+
+# ---- servos ----
 
 
 def check_servos(servos: Servos, robot: Robot, hardware: Hardware, joints: Sequence[str] = JOINTS) -> list[Check]:
@@ -194,6 +283,87 @@ def check_leg(joint_map: JointMap, robot: Robot, hardware: Hardware, joint: str,
     return Check(joint, "position", ok, found, expected, remedy)
 
 
+# ---- registers of the servos that change what the robot does ----
+
+
+def reset_tuning(servos: Servos, joint: str) -> None:
+    """Set a joint's gains and profiles to their defaults, as after a reboot: no profile."""
+    for item in _TUNING:
+        default = servos.table(joint)[item].default
+        assert isinstance(default, int)
+        servos.set(joint, item, default)
+
+
+def expected_count(bus: Bus, item: str) -> int:
+    """Return what an EEPROM item of a bus's servos must hold: the hardware file's count, else the factory default."""
+    default = load_table(bus.model)[item].default
+    assert isinstance(default, int), "only items with a default of their own are looked at"
+    return bus.eeprom.get(item, default)
+
+
+def check_answers(servos: Servos, joint: str) -> Check:
+    """Look at Status Return Level of a servo that answered a ping: does it answer reads and writes too?"""
+    item = "status_return_level"
+    try:
+        found = str(level := servos.get(joint, item))
+    except NoAnswerError:
+        found, level = "no answer to reads", None
+    remedy = f"Refused writes would go unnoticed: {REPAIR}. If it does not help, the line is bad: check cable and ground."
+    return Check(joint, item, level == _ANSWER_ALL, found, str(_ANSWER_ALL), remedy, True, (item, _ANSWER_ALL))
+
+
+def check_registers(servos: Servos, bus: Bus, bus_name: str, joint: str) -> Iterator[Check]:
+    """Compare a servo's EEPROM with what it must hold; a check per item, by address.
+
+    Raises:
+        NoAnswerError, RefusedError, BusGoneError: see :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
+    """
+    for item in (name for name in load_table(bus.model).items if name in MEANING):
+        expected, found = expected_count(bus, item), servos.get(joint, item)
+        if found != expected:
+            found = servos.get(joint, item)  # a late answer to another question looks like this, once
+        remedy = f"Else {MEANING[item]}: {REPAIR}."
+        if item not in REQUIRED:
+            remedy += f" If {found} is meant, give it in buses.{bus_name}.eeprom of the hardware file."
+        is_fatal = item not in _WARNINGS
+        yield Check(joint, item, found == expected, str(found), str(expected), remedy, is_fatal, (item, expected))
+
+
+def mendable(checks: Iterable[Check]) -> list[Check]:
+    """Return the checks that failed and whose fix can be written.
+
+    A servo whose torque is on is left alone: its EEPROM is locked, and what holds it might let go.
+    """
+    wrong = [check for check in checks if not check.ok]
+    is_on = {check.where for check in wrong if check.what == "torque"}
+    return [check for check in wrong if check.fix is not None and check.where not in is_on]
+
+
+def mend(servos: Servos, checks: Sequence[Check]) -> list[Check]:
+    """Write the fixes of the checks that failed, and read them back; return the ones that are not mended.
+
+    Raises:
+        BusGoneError: a port is gone.
+    """
+    mended = [check for check in mendable(checks) if _is_mended(servos, check)]
+    return [check for check in checks if not check.ok and check not in mended]
+
+
+def _is_mended(servos: Servos, check: Check) -> bool:
+    """Write a check's fix, and return whether the servo holds it."""
+    assert check.fix is not None, "only what has a fix is mended"
+    item, count = check.fix
+    try:
+        with contextlib.suppress(NoAnswerError):  # a servo with a low Status Return Level obeys without a word
+            servos.set(check.where, item, count)
+        return servos.get(check.where, item) == count
+    except (NoAnswerError, RefusedError):
+        return False
+
+
+# ---- the line ----
+
+
 def check_bus_speed(servos: Servos, reads: int, budget: float, now: Callable[[], float] = time.perf_counter) -> Check:
     """Time reads of all joints and compare the 99th percentile with the budget.
 
@@ -248,6 +418,9 @@ def check_latency_timers(hardware: Hardware, system: Path = Path("/sys")) -> lis
             remedy = f"echo 1 | sudo tee {setting}, or a udev rule with ATTR{{latency_timer}}=1."
             checks.append(Check(name, "latency timer", found == "1", f"{found} ms", "1 ms", remedy, is_fatal=False))
     return checks
+
+
+# ---- sensors ----
 
 
 class ImuSamples(NamedTuple):
@@ -378,3 +551,63 @@ def _check_rest(samples: ImuSamples) -> list[Check]:
         Check("imu", "gravity", right, f"{length:.2f} m/s2", gravity, scale, False),
         Check("imu", "level", tilt < LARGEST_TILT, f"{math.degrees(tilt):.1f} deg", f"below {level}", stand),
     ]
+
+
+def check_camera(camera: CameraReader, file: CameraFile, clock: Clock) -> list[Check]:
+    """Return the checks of a camera, which is opened for them; closing the link closes it.
+
+    Only a camera without frames is a fault; a robot drives without poses.
+    """
+    where = f"camera {file.name}"
+    try:
+        camera.open()
+    except InputError as error:
+        return [
+            Check(where, "frames", False, str(error), "a camera that gives frames", "Check its plug, number and user group.")
+        ]
+    readings = _listen(camera, clock)
+    checks = [Check(where, "frames", bool(readings), f"{len(readings)} in {_CAMERA_TIME:g} s", "frames", "Check its plug.")]
+    if not readings:
+        return checks
+    rate = len(readings) / _CAMERA_TIME
+    checks.append(_warning(where, "rate", rate >= _LEAST_RATE * file.rate, f"{rate:.1f} per second", f"{file.rate:g}"))
+    age = float(np.median([reading.found - reading.time for reading in readings]))
+    stamps = f" (dated by {dated})" if (dated := getattr(camera, "stamps", "")) else ""
+    checks.append(
+        _warning(where, "age", age < LARGEST_AGE / 2, f"{1e3 * age:.0f} ms{stamps}", f"< {1e3 * LARGEST_AGE / 2:.0f} ms")
+    )
+    found = file.doubt or f"readout {1e3 * (file.calibration.readout or 0.0):g} ms"
+    checks.append(_warning(where, "shutter", not file.doubt, found, "its readout"))
+    return [*checks, *_check_poses(where, readings)]
+
+
+def _listen(camera: CameraReader, clock: Clock) -> list[CameraReading]:
+    readings, end = [], clock.now() + _CAMERA_TIME
+    while clock.now() < end:
+        if (reading := camera.read(clock.now())) is not None:
+            readings.append(reading)
+        clock.wait_until(clock.now() + _CAMERA_PERIOD)
+    return readings
+
+
+def _check_poses(where: str, readings: list[CameraReading]) -> list[Check]:
+    located = [reading for reading in readings if reading.status != NO_FLOOR]
+    checks = [_warning(where, "floor", bool(located), "found" if located else MEANINGS[NO_FLOOR], "its markers found")]
+    if not located:
+        return checks
+    seen = [reading for reading in located if reading.has_pose]
+    lost = Counter(MEANINGS.get(reading.status, reading.status) for reading in located if not reading.has_pose)
+    found = f"in {len(seen)} of {len(located)} frames" + "".join(f"; {why}: {count}" for why, count in lost.most_common())
+    checks.append(_warning(where, "robot", len(seen) >= _LEAST_POSES * len(located), found, "seen in all"))
+    if seen:
+        sigma = np.sqrt(np.median([np.diag(reading.covariance) for reading in seen], axis=0))
+        text = f"{1e3 * max(sigma[:2]):.2f} mm, {sigma[3]:.4f} rad (1 sigma)"
+        is_sharp = max(sigma[:2]) < LARGEST_SIGMA[0] / 2 and sigma[3] < LARGEST_SIGMA[1] / 2
+        checks.append(
+            _warning(where, "accuracy", bool(is_sharp), text, f"{500 * LARGEST_SIGMA[0]:g} mm, {LARGEST_SIGMA[1] / 2:g} rad")
+        )
+    return checks
+
+
+def _warning(where: str, what: str, ok: bool, found: str, expected: str) -> Check:
+    return Check(where, what, ok, found, expected, _CAMERA_REMEDIES[what], False)

@@ -16,7 +16,7 @@ from wlr_gym.data.format import RunMeta
 from wlr_gym.data.record import meta_of
 from wlr_gym.gap.decision import Recorded
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.driving import drive_robot
+from wlr_gym.hardware.deployment import drive_robot
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.envs.core import Core
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.safety.rules import ratings_of
-from wlr_gym.hardware.safety.state import RobotStatus
-from wlr_gym.hardware.safety.supervision import JointMemory, is_frozen, is_lost, remember
+from wlr_gym.hardware.safety.rules import JointMemory, RobotStatus, is_frozen, is_lost, ratings_of, remember_joints
 from wlr_gym.hardware.servos import UNREAD
 from wlr_gym.learning.evaluation.rollout import roll_out
 from wlr_gym.learning.evaluation.subjects import make_player
@@ -61,7 +59,7 @@ class _Watched:
     def look(self) -> None:
         """Judge the robots whose episodes go on."""
         core, limits, ratings = self._core, self._limits, self._ratings
-        self._memory = remember(limits, ratings, self._status(), self._memory, core.actions.setpoints.copy(), self._on)
+        self._memory = remember_joints(limits, ratings, self._status(), self._memory, core.actions.setpoints.copy(), self._on)
         bad = is_frozen(limits, self._memory) | is_lost(limits, ratings, self._memory)
         self.stopped |= bad.any(axis=1) & ~(core.terminated | core.truncated)
 

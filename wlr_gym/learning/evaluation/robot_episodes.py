@@ -18,8 +18,7 @@ from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.compiled_terms import Scores, compile_scores
 from wlr_gym.envs.tasks.success import scales_of, tracking_error
 from wlr_gym.envs.tasks.terms.geometry import yaw_of
-from wlr_gym.hardware.deployment import Deployment, deploy
-from wlr_gym.hardware.driving import refuse_deadman
+from wlr_gym.hardware.deployment import Deployment, deploy, refuse_deadman
 from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core
