@@ -13,11 +13,11 @@ __version__ = "0.1.0"
 
 #: Public name -> module that it lives in.
 HOMES = {
-    "WlrEnv": "wlr_gym.envs.single",
-    "WlrVectorEnv": "wlr_gym.envs.vector",
+    "WlrEnv": "wlr_gym.envs.interfaces",
+    "WlrVectorEnv": "wlr_gym.envs.interfaces",
     "Sb3VecEnv": "wlr_gym.envs.sb3",
     "EnvironmentOptions": "wlr_gym.envs.settings",
-    "register_task": "wlr_gym.envs.user_tasks",
+    "register_task": "wlr_gym.envs.registry",
     "Snapshot": "wlr_gym.base.snapshot",
     "train": "wlr_gym.learning.training",
     "resume_training": "wlr_gym.learning.training",

@@ -38,8 +38,7 @@ from wlr_gym.envs.tasks.describe import (
     randomization_rows,
 )
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
-from wlr_gym.envs.tasks.success import scales_of
-from wlr_gym.envs.tasks.task import ObservationColumn, Task
+from wlr_gym.envs.tasks.task import ObservationColumn, Task, scales_of
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.learning.evaluation.acceptance import acceptance_rows, read_acceptance
 from wlr_gym.physics.effects import EFFECTS

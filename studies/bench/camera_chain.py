@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from studies.bench.measure import Measurement, Size
 from wlr_gym.base.errors import require_package
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.tasks.success import scales_of, tracking_error
-from wlr_gym.envs.tasks.terms.geometry import yaw_of
+from wlr_gym.envs.tasks.signals import yaw_of
+from wlr_gym.envs.tasks.task import scales_of, tracking_error
 from wlr_gym.hardware.camera.config import CameraFile, load_camera_file
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link

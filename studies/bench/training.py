@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback  # noqa: E402
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv  # noqa: E402
 
 from wlr_gym.envs import Sb3VecEnv  # noqa: E402
-from wlr_gym.envs.tasks.task_config import read_task  # noqa: E402
+from wlr_gym.envs.tasks.task import read_task  # noqa: E402
 from wlr_gym.policy import load_agent_config  # noqa: E402
 
 EPOCHS = 4

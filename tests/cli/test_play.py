@@ -13,9 +13,7 @@ from PIL import Image
 
 from wlr_gym.cli import main
 from wlr_gym.cli import play as play_module
-from wlr_gym.envs.tasks.signals import Signals
-from wlr_gym.envs.tasks.terms.geometry import PlanarPose
-from wlr_gym.envs.tasks.terms.references import path_error
+from wlr_gym.envs.tasks.signals import PlanarPose, Signals, path_error
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.evaluation.film import Journey, commands, drive, film, film_length, result
 from wlr_gym.policy import make_policy

@@ -13,7 +13,7 @@ from blocks import PAGES, ROOT, blocks, site_script
 
 import wlr_gym
 from wlr_gym.envs.registry import ENVIRONMENTS
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 
 
 def _public(module: Any) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from velocity import ID, make, make_vec
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs import classes
+from wlr_gym.envs import interfaces as classes
 from wlr_gym.envs.settings import EnvironmentOptions, Settings
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 
 SHORT = {"episode_length": 0.4, "randomization": "wide"}
 

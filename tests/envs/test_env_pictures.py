@@ -12,7 +12,7 @@ from gymnasium.wrappers import AddRenderObservation, RenderCollection
 
 import wlr_gym  # noqa: F401
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs import pictures as pictures_module
+from wlr_gym.envs import interfaces as pictures_module
 from wlr_gym.envs.settings import read_settings
 
 ID = "WLR-Velocity-v0"

@@ -9,9 +9,9 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs import Sb3VecEnv, WlrEnv, register_task
-from wlr_gym.envs.classes import VelocityEnv
+from wlr_gym.envs.interfaces import VelocityEnv
 from wlr_gym.envs.registry import ENVIRONMENTS, title_of
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 
 TASK = """
 name: {name}

@@ -9,9 +9,8 @@ from gymnasium.wrappers import ClipAction, NormalizeObservation, RescaleAction
 import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.envs.classes import PathVectorEnv, PostureEnv
-from wlr_gym.envs.single import WlrEnv
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.interfaces import PathVectorEnv, PostureEnv, WlrEnv
+from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import contract_of, make_policy, policy_environment
 

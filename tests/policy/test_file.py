@@ -8,7 +8,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import contract as task_contract
 from wlr_gym.envs.tasks import load_task
-from wlr_gym.envs.tasks.task_config import ObserverConfig
+from wlr_gym.envs.tasks.task import ObserverConfig
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
 from wlr_gym.policy.file import DEFAULTS, LEFT_OUT, with_defaults

@@ -11,7 +11,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.settings import Settings
 from wlr_gym.envs.tasks.describe import contract
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.policy import (
     contract_of,

@@ -19,7 +19,7 @@ from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.envs.tasks import Randomization, Task, load_randomization, load_task
 from wlr_gym.envs.tasks.describe import DescriptionPart, randomization_section, scaling_sections, task_sections
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 
 PICTURES = (".png", ".svg", ".pdf")
 

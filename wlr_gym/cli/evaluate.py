@@ -29,7 +29,7 @@ from wlr_gym.cli.options import (
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.learning.evaluation import (
     FIRST_SEED,
     MAIN,

@@ -91,7 +91,7 @@ class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
 
 def run(options: PlayOptions) -> int:
     """Play, until the window is closed or the video is written."""
-    from wlr_gym.envs.tasks.task_config import having
+    from wlr_gym.envs.tasks.task import having
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import environment_for, make_policy
 

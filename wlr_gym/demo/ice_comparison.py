@@ -9,7 +9,7 @@ from typing import Any
 from wlr_gym.base.html import heading, table
 from wlr_gym.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, Section, Tell, filmed, paragraph
-from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, unit_of
 from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
 

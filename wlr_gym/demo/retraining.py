@@ -11,7 +11,7 @@ from wlr_gym.base.html import commands, table
 from wlr_gym.demo.hidden_fault import POLICY
 from wlr_gym.demo.settings import ENVIRONMENT, Demo
 from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section, Tell, filmed, paragraph
-from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, places, plain
 from wlr_gym.learning.evaluation import Subject
 

@@ -6,16 +6,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from wlr_gym.envs.interfaces import WlrEnv, WlrVectorEnv
+    from wlr_gym.envs.registry import register_task
     from wlr_gym.envs.sb3 import Sb3VecEnv
-    from wlr_gym.envs.single import WlrEnv
-    from wlr_gym.envs.user_tasks import register_task
-    from wlr_gym.envs.vector import WlrVectorEnv
 
 HOMES = {
-    "WlrEnv": "wlr_gym.envs.single",
-    "WlrVectorEnv": "wlr_gym.envs.vector",
+    "WlrEnv": "wlr_gym.envs.interfaces",
+    "WlrVectorEnv": "wlr_gym.envs.interfaces",
     "Sb3VecEnv": "wlr_gym.envs.sb3",
-    "register_task": "wlr_gym.envs.user_tasks",
+    "register_task": "wlr_gym.envs.registry",
 }
 
 __all__ = ["Sb3VecEnv", "WlrEnv", "WlrVectorEnv", "register_task"]

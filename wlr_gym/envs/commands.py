@@ -11,10 +11,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.random import stream_number
+from wlr_gym.base.random import stream_number, uniform
 from wlr_gym.base.snapshot import RowStore
-from wlr_gym.envs.tasks.draws import uniform
-from wlr_gym.envs.tasks.task_config import TaskConfig
+from wlr_gym.envs.tasks.task import TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS
 from wlr_gym.robot import Robot
 

@@ -6,33 +6,33 @@ What happens to a robot is a function of its own seed and actions: the same alon
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.envs.actions import Actions
+from wlr_gym.base.random import episode_seeds
+from wlr_gym.base.snapshot import RowStore, Snapshot, check_fit, read_rows, take_snapshot, write_snapshot
 from wlr_gym.envs.commands import Commands
-from wlr_gym.envs.episodes import Episodes, is_whole
-from wlr_gym.envs.measured import measurable, measured_truth, require_flow
-from wlr_gym.envs.observation import ObservationPipeline
-from wlr_gym.envs.randomized_robots import RandomizedRobots
+from wlr_gym.envs.observation import Actions, ObservationPipeline
 from wlr_gym.envs.settings import Settings
 from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_scores, not_finite
 from wlr_gym.envs.tasks.describe import contract, describe
-from wlr_gym.envs.tasks.randomization import load_randomization
-from wlr_gym.envs.tasks.signals import PRESENCE, START
-from wlr_gym.envs.tasks.task import Task, bounds, fed_as, load_task
-from wlr_gym.envs.tasks.task_config import RampConfig
-from wlr_gym.envs.tasks.terms.geometry import yaw_of
+from wlr_gym.envs.tasks.randomization import RandomizedRobots, load_randomization
+from wlr_gym.envs.tasks.signals import PRESENCE, START, signals_of, yaw_of
+from wlr_gym.envs.tasks.task import RampConfig, Task, bounds, fed_as, load_task
+from wlr_gym.envs.tasks.terms import COMPUTED, SCALARS
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics import plants
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, Sensors
 from wlr_gym.policy.sources import FED_AS
 
 Array = NDArray[np.float64]
@@ -368,3 +368,246 @@ def _mapping(name: str, given: Any) -> Mapping[str, Any]:
     if not isinstance(given, Mapping):
         raise InputError(f"{name} = {given!r}: expected a mapping {{name: value}}")
     return given
+
+
+# --- episodes: their seeds, how many steps they have lasted, and how they end -----------------------------------------
+
+
+Rows = NDArray[np.intp]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_step(mask: Any, limit: int, over: Any, steps: Any, sooner: Any, terminated: Any, truncated: Any) -> bool:
+    """Count a step and set the end flags. Returns whether any episode ended."""
+    any_done = False
+    for i in range(len(mask)):
+        if not mask[i]:
+            continue
+        terminated[i] = False
+        steps[i] += 1
+        for k in range(over.shape[1]):
+            if over[i, k] > 0.0:
+                terminated[i] = True
+        truncated[i] = steps[i] >= limit - sooner[i]
+        any_done = any_done or terminated[i] or truncated[i]
+    return any_done
+
+
+class Episodes:
+    """The episodes of N robots, all (N,).
+
+    Attributes:
+        robot_seeds: the robots' own seeds. number: which episode of the robot this is, from 0. seeds: of the episodes.
+        seeded: whether the robot has a seed. begun: whether its first episode has begun.
+        steps: control steps since the episode began. sooner: by how many steps before the limit the present one is truncated.
+        terminated, truncated: flags of the last step.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.robot_seeds: NDArray[np.uint64] = np.zeros(count, np.uint64)
+        self.number: NDArray[np.int64] = np.zeros(count, np.int64)
+        self.seeds: NDArray[np.uint64] = np.zeros(count, np.uint64)
+        self.seeded: Mask = np.zeros(count, bool)
+        self.begun: Mask = np.zeros(count, bool)
+        self._all_begun = False
+        self.steps: NDArray[np.int64] = np.zeros(count, np.int64)
+        self.sooner: NDArray[np.int64] = np.zeros(count, np.int64)
+        self.terminated: Mask = np.zeros(count, bool)
+        self.truncated: Mask = np.zeros(count, bool)
+
+    def seed(self, row: int, seed: int) -> None:
+        """Give a robot its seed; its next episode is its first.
+
+        Raises:
+            InputError: see :func:`read_seed`.
+        """
+        self.robot_seeds[row] = _word(read_seed(seed))
+        self.number[row] = -1
+        self.seeded[row] = True
+
+    def next_seeds(self, rows: Rows) -> NDArray[np.uint64]:
+        """Return the seeds of the next episodes of some robots."""
+        return episode_seeds(self.robot_seeds[rows], self.number[rows] + 1)
+
+    def begin(self, rows: Rows, seeds: NDArray[np.uint64]) -> None:
+        """Begin the next episodes of some robots, which have these seeds; :meth:`note_begun` says when they can be stepped."""
+        self.begun[rows] = self._all_begun = False
+        self.number[rows] += 1
+        self.seeds[rows] = seeds
+        self.steps[rows] = self.sooner[rows] = 0
+        self.terminated[rows] = self.truncated[rows] = False
+
+    def count_step(self, mask: Mask, limit: int, over: NDArray[np.float64]) -> bool:
+        """Count a step of the robots in ``mask``: any of their termination terms ``over`` (N, K) above 0 ends the episode, as
+        does step ``limit``. Returns whether any episode ended."""
+        return _count_step(mask, limit, over, self.steps, self.sooner, self.terminated, self.truncated)
+
+    def note_begun(self, mask: Mask) -> None:
+        """Say that the episodes of the robots in ``mask`` can be stepped."""
+        self.begun |= mask
+        self._all_begun = bool(self.begun.all())
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what snapshots hold."""
+        names = ("robot_seeds", "number", "seeds", "seeded", "begun", "steps", "sooner", "terminated", "truncated")
+        return {name: getattr(self, name) for name in names}
+
+    def require_begun(self, what: str, rows: Rows | None = None) -> None:
+        """Refuse what needs the episodes of some robots, None = all, to have begun.
+
+        Raises:
+            gymnasium.error.ResetNeeded: one has not.
+        """
+        if self._all_begun:
+            return
+        asked = np.arange(len(self.begun)) if rows is None else rows
+        waiting = asked[~self.begun[asked]]
+        if waiting.size:
+            raise ResetNeeded(f"call reset() before {what}: no episode of robot {waiting[0]} has begun")
+
+
+def is_whole(value: Any) -> bool:
+    """Return whether a value is a whole number; True and False are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def read_seed(seed: Any) -> int:
+    """Return a seed.
+
+    Raises:
+        InputError: no whole number of 0 or more.
+    """
+    if not is_whole(seed) or seed < 0:
+        raise InputError(f"seed = {seed!r}: expected a whole number of 0 or more")
+    return int(seed)
+
+
+def own_seed(environment: Any) -> int:
+    """Return the seed of an environment's ``np_random``; one drawn from it where the user set it, as its own is not known."""
+    seed = environment.np_random_seed
+    return int(environment.np_random.integers(2**63)) if seed < 0 else seed
+
+
+def _word(seed: int) -> int:
+    """Return the 64 bits that a seed draws from: itself, or, of a larger one such as fresh entropy, its hash."""
+    return seed if seed < 2**64 else int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
+
+
+# --- snapshots of environments: what a batch of robots must have alike to take one, and where its state lives ---------
+
+
+#: Names of the plant's arrays in a snapshot begin with this.
+PLANT = "plant/"
+
+
+class Snapshots:
+    """Takes snapshots of the robots of a core, and sets robots back.
+
+    Args:
+        core: of the environment.
+
+    Raises:
+        InputError: a plant whose state cannot be set.
+    """
+
+    def __init__(self, core: Core) -> None:
+        if not core.plant.capabilities.can_set_state:
+            raise InputError(f"backend '{core.settings.backend}': its robots cannot be saved and set back; simulators can")
+        self._core = core
+        self._fits = {
+            "task": core.task.config.model_dump(mode="json"),
+            "randomization": core.randomization.config.model_dump(mode="json"),
+            "effects": core.patch.content(),
+            "free_wheels": core.settings.free_wheels,
+            "observation": core.settings.observation,
+        }
+        parts = (core.episodes, core.robots, core.actions, core.commands, core.pipeline, core.observer)
+        self._stores: dict[str, RowStore] = {
+            "start": core.start,
+            "end_time": core.end_time,
+            "computed": core.computed,
+            "presence": core.presence,
+        }
+        self._stores |= {f"score_{name}": values for name, values in core.scores._asdict().items()}
+        self._stores |= {name: store for part in parts if part is not None for name, store in part.stores().items()}
+
+    def take(self, rows: int | Sequence[int] | NDArray[Any] | None) -> Snapshot:
+        """Return the snapshot of some robots; see :meth:`wlr_gym.envs.interfaces.TaskMethods.get_state`."""
+        index = read_rows(rows, self._core.count)
+        self._core.episodes.require_begun("get_state()", index)
+        plant = self._core.plant.get_state(index)
+        own = take_snapshot(self._stores, index, self._fits)
+        arrays = {PLANT + name: values for name, values in plant.arrays.items()}
+        return Snapshot({**plant.fits, **own.fits}, {**own.arrays, **arrays})
+
+    def put(self, snapshot: Snapshot, rows: int | Sequence[int] | NDArray[Any] | None) -> None:
+        """Put robots into the state of a snapshot; see :meth:`wlr_gym.envs.interfaces.TaskMethods.set_state`."""
+        core = self._core
+        index = read_rows(rows, core.count)
+        check_fit(snapshot, index, self._fits, self._stores)
+        arrays = {name.removeprefix(PLANT): values for name, values in snapshot.arrays.items() if name.startswith(PLANT)}
+        core.sensors = core.plant.set_state(Snapshot(snapshot.fits, arrays), index)
+        write_snapshot(snapshot, self._stores, index)
+        core.episodes.note_begun(np.isin(np.arange(core.count), index))
+
+
+# --- what is left of a task on a real robot, which has sensors and no truth: the terms that can be measured -----------
+
+
+#: Channel of the truth -> sensor that measures it.
+MEASURED = {
+    "joint_position": "joint_position",
+    "joint_velocity": "joint_velocity",
+    "angular_velocity_in_body": "gyro",
+    "motor_torque": "joint_effort",
+}
+_KNOWN = {f"truth.{element}" for channel in MEASURED for element in TRUTH_LAYOUT.channels[channel].elements}
+
+
+def measured_truth(sensors: Sensors) -> Array:
+    """Return a truth matrix (N, W) filled with what sensors measure; NaN where there is no sensor."""
+    truth = np.full((len(sensors.values), TRUTH_LAYOUT.width), np.nan)
+    for channel, sensor in MEASURED.items():
+        truth[:, TRUTH_LAYOUT.slices[channel]] = sensors.values[:, SENSOR_LAYOUT.slices[sensor]]
+    return truth
+
+
+def measurable(task: Task, has_camera: bool) -> tuple[Task, tuple[str, ...]]:
+    """Return the task with the rewards, terminations and measures that a robot can measure, and the names of those it cannot.
+
+    A robot does not know its speed over the floor, its slip, or the height of its body. The safety rules watch its tilt.
+    The slip observer runs on its sensors, and on the camera's poses where there is one.
+
+    Raises:
+        InputError: an observation that needs the true state, or a camera where there is none.
+    """
+    for column in task.policy:
+        if column.device == "camera" and not has_camera:
+            raise InputError(f"observation '{column.term}': this robot has no camera; see docs/camera.md")
+        if column.source == "truth" or (column.source == "computed" and not _is_known(COMPUTED[column.term].function)):
+            raise InputError(f"observation '{column.term}': only a simulator knows the true state")
+    kept, left_out = {}, []
+    for group, registry in SCALARS.items():
+        chosen = getattr(task.config, group)
+        kept[group] = {name: values for name, values in chosen.items() if _is_known(registry[name].function)}
+        left_out += [name for name in chosen if name not in kept[group]]
+    kept["success"] = {name: limits for name, limits in task.config.success.items() if name in kept["measures"]}
+    config = task.config.model_copy(update=kept)
+    return replace(task, config=config, privileged=()), tuple(dict.fromkeys(left_out))
+
+
+def require_flow(task: Task, has_flow: bool) -> None:
+    """Refuse a task that observes optical flow on a robot without the sensor, unless it is one that does without at times.
+
+    Raises:
+        InputError: names the observation.
+    """
+    always = task.config.sensors.flow is None or task.config.sensors.flow >= 1.0
+    for column in task.policy:
+        if column.device == "flow" and always and not has_flow:
+            raise InputError(f"observation '{column.term}': this robot has no optical-flow sensor; see docs/optical_flow.md")
+
+
+def _is_known(function: Callable[..., Any]) -> bool:
+    """Whether all signals that a term reads can be measured."""
+    return all(name in _KNOWN for name in signals_of(function) if name.startswith(("truth.", "start[")))

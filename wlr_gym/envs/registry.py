@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.paths import find_config
 
 #: id -> task: name in ``configs/task/`` or path.
 ENVIRONMENTS: dict[str, str] = {}
@@ -64,7 +66,7 @@ def register_environments() -> None:
     """Register the shipped tasks; a test compares the versions with the history in their files."""
     for name in ("velocity", "path", "posture", "slope"):
         title = title_of(name)
-        enter(f"WLR-{title}-v0", name, f"wlr_gym.envs.classes:{title}Env", f"wlr_gym.envs.classes:{title}VectorEnv")
+        enter(f"WLR-{title}-v0", name, f"wlr_gym.envs.interfaces:{title}Env", f"wlr_gym.envs.interfaces:{title}VectorEnv")
 
 
 def enter(env_id: str, task: str, single: str, vector: str, **keywords: Any) -> None:
@@ -79,3 +81,37 @@ def enter(env_id: str, task: str, single: str, vector: str, **keywords: Any) -> 
     if env_id not in gymnasium.registry:
         gymnasium.register(env_id, entry_point=single, vector_entry_point=vector, kwargs=keywords)
     ENVIRONMENTS[env_id] = task
+
+
+# --- tasks of users, registered from their files ----------------------------------------------------------------------
+
+
+def register_task(path: str | Path) -> str:
+    """Register the task of a YAML file as an environment of this process, and return its id.
+
+    The id is made of the file's ``name`` and of the last version in its ``history``: ``name: hill_climb`` gives
+    ``WLR-HillClimb-v0``. Gymnasium and every command that takes an id know it from then on. The spec of such an environment
+    holds the whole task: ``gym.make(spec)`` works in a process that never saw the file, such as a worker of
+    ``AsyncVectorEnv`` or Ray. Terms of your own (rewards, observations) are code: there their module must be imported first.
+    Robot and randomisation files of your own that the task names are named by their absolute paths: another machine needs them
+    too (or give a ``Robot`` as ``robot=`` and a mapping as ``randomization=``).
+
+    Args:
+        path: of the file, or the name of one in ``configs/task/``.
+
+    Raises:
+        InputError: no such file, a fault in it, or an id that belongs to another task.
+    """
+    if not isinstance(path, str | Path):
+        raise InputError(f"register_task({path!r}): expected the path of a task file")
+    from wlr_gym.envs.tasks.task import read_task
+
+    source = str(find_config("task", path).resolve())
+    config = read_task(source)
+    env_id = f"WLR-{title_of(config.name)}-{list(config.history)[-1]}"
+    present = ENVIRONMENTS.get(env_id, source)
+    if present != source:
+        raise InputError(f"{source}: '{env_id}' is the task '{present}' already; give it another name")
+    definition = config.model_dump(mode="json", exclude_none=True)  # so that a spec works where neither id nor file is known
+    enter(env_id, source, "wlr_gym.envs.interfaces:WlrEnv", "wlr_gym.envs.interfaces:WlrVectorEnv", definition=definition)
+    return env_id

@@ -13,14 +13,10 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.envs.core import Core, Mask
-from wlr_gym.envs.episodes import read_seed
-from wlr_gym.envs.infos import Infos, row_of
-from wlr_gym.envs.methods import TaskMethods
-from wlr_gym.envs.pictures import Pictures, check_render_mode, metadata
+from wlr_gym.envs.core import Core, Mask, read_seed
+from wlr_gym.envs.interfaces import Infos, Pictures, TaskMethods, check_render_mode, metadata, row_of, seed_robots
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import EnvironmentOptions, read_settings
-from wlr_gym.envs.vector import seed_robots
 
 require_package("stable_baselines3", "train")
 

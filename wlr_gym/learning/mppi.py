@@ -19,7 +19,7 @@ from pydantic import Field
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.envs.core import Core
-from wlr_gym.envs.tasks.success import scales_of
+from wlr_gym.envs.tasks.task import scales_of
 from wlr_gym.policy import make_policy
 from wlr_gym.robot import FIRST_WHEEL, JOINTS
 from wlr_gym.robot.parameters import ELEMENTS, Parameters

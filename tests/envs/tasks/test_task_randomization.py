@@ -9,7 +9,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.envs.tasks import load_randomization
-from wlr_gym.envs.tasks.terms.events import tolerance_of
+from wlr_gym.envs.tasks.entries import tolerance_of
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 

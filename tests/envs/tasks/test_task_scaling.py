@@ -10,7 +10,7 @@ from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.envs.tasks.scaling import QUANTITIES, check_rule, ratio
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.robot import load_robot, robot_content
 
 TASKS = tuple(ENVIRONMENTS.values())

@@ -12,12 +12,12 @@ import pytest
 from studies.paper.experiments import LEG_SPEED, TESTS
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import load_task
+from wlr_gym.envs.tasks import signals as paths
 from wlr_gym.envs.tasks.compiled_terms import compile_computed, compile_scores
-from wlr_gym.envs.tasks.signals import Signals
-from wlr_gym.envs.tasks.success import limits_of, scales_of, succeeded
-from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, ScalarTerm, references
+from wlr_gym.envs.tasks.signals import PlanarPose, Signals, true_pose
+from wlr_gym.envs.tasks.task import limits_of, scales_of, succeeded
+from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, ScalarTerm
 from wlr_gym.envs.tasks.terms.computed import ComputedTerm
-from wlr_gym.envs.tasks.terms.geometry import PlanarPose, true_pose
 from wlr_gym.learning.evaluation.metrics import errors_of
 from wlr_gym.learning.evaluation.rollout import Measure
 from wlr_gym.robot import load_robot
@@ -30,10 +30,10 @@ def signals(**values: Any) -> Signals:
     return Signals(lambda name: values[name.removeprefix("command.").removeprefix("robot.").replace(".", "_")])
 
 
-def error(shape, x, y, yaw: Any = 0.0, *, bend=1.0, wavelength=1.5, offset=0.0, turn=0.0) -> references.PathError:
+def error(shape, x, y, yaw: Any = 0.0, *, bend=1.0, wavelength=1.5, offset=0.0, turn=0.0) -> paths.PathError:
     given = {"path_shape": shape, "path_curvature": bend, "path_wavelength": wavelength}
     pose = PlanarPose(np.asarray(x), np.asarray(y), np.asarray(yaw))
-    return references.path_error(signals(**given, path_offset=offset, path_heading=turn), pose)
+    return paths.error_from_path(signals(**given, path_offset=offset, path_heading=turn), pose)
 
 
 def test_line():
@@ -100,7 +100,7 @@ def sweep(time, first, second, rate):
         "rear_leg_second": second[1],
     }
     home = load_robot().home.leg_angle
-    found = references.leg_references(signals(**given, leg_rate=rate, time=time, home_leg_angle=home))
+    found = paths.leg_references(signals(**given, leg_rate=rate, time=time, home_leg_angle=home))
     return np.array([angle for angle, _ in found]), np.array([rate for _, rate in found])
 
 
@@ -113,7 +113,7 @@ def test_the_papers_tests_are_among_the_sweeps(name):
         assert limits == pytest.approx((math.radians(30), math.radians(150)), abs=1e-4)
     assert terms["leg_rate"][0] < LEG_SPEED < terms["leg_rate"][1]
     first, second = np.repeat(test.start, 2), np.repeat(test.end, 2)
-    begins = references.SWEEP_BEGINS
+    begins = paths.SWEEP_BEGINS
     assert sweep(begins, test.start, test.end, LEG_SPEED)[0] == pytest.approx(first)
     angle, rate = sweep(begins + 1.0, test.start, test.end, LEG_SPEED)
     assert angle == pytest.approx(first + np.sign(second - first) * LEG_SPEED)
@@ -133,7 +133,7 @@ def test_leg_rates_are_the_slopes_of_the_leg_angles():
 
 def test_climbing_ends_when_its_time_is_over():
     for time, speed in ((0.0, 0.0), (0.3, 0.03), (0.5, 0.05), (7.0, 0.05), (7.2, 0.03), (7.5, 0.0), (9.0, 0.0)):
-        assert references.climb_speed(signals(climb_speed=0.05, climb_time=7.0, time=time)) == pytest.approx(speed, abs=1e-12)
+        assert paths.climb_speed(signals(climb_speed=0.05, climb_time=7.0, time=time)) == pytest.approx(speed, abs=1e-12)
 
 
 def test_motion_is_seen_from_the_start():

@@ -9,10 +9,9 @@ import yaml
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import main
-from wlr_gym.envs.registry import ENVIRONMENTS
+from wlr_gym.envs.registry import ENVIRONMENTS, register_task
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
-from wlr_gym.envs.tasks.task_config import having
-from wlr_gym.envs.user_tasks import register_task
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.learning.evaluation.acceptance import (
     ACCEPTANCE_FILE,
     FAMILIES,

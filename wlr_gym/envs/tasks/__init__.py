@@ -2,8 +2,7 @@
 
 from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import Randomization, load_randomization
-from wlr_gym.envs.tasks.task import Task, load_task
-from wlr_gym.envs.tasks.task_config import TaskConfig
+from wlr_gym.envs.tasks.task import Task, TaskConfig, load_task
 
 __all__ = [
     "Randomization",

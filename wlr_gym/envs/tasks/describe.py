@@ -10,9 +10,7 @@ from typing import Any
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.scaling import QUANTITIES, quantities_of, scaled_numbers
-from wlr_gym.envs.tasks.success import limits_within
-from wlr_gym.envs.tasks.task import ObservationColumn, Task
-from wlr_gym.envs.tasks.task_config import TaskConfig
+from wlr_gym.envs.tasks.task import ObservationColumn, Task, TaskConfig, limits_within
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash, servo_hash
 from wlr_gym.robot.parameter_table import spec_of

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.random import stream_numbers, uniforms
 from wlr_gym.base.settings import SettingsModel
-from wlr_gym.envs.tasks.draws import stream_numbers, uniforms
-from wlr_gym.envs.tasks.terms.events import DISTRIBUTIONS, number_of, tolerance_of
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, range_in_words, spec_of
 from wlr_gym.robot.parameters import Parameters
@@ -267,3 +266,61 @@ def _range(area: AreaConfig, field: str, where: str) -> Range | None:
     if limits and max(map(abs, limits)) > SPECS["patch.x_max"].high:
         raise InputError(f"{where}: area.{field} = {list(limits)}: the floor ends at {SPECS['patch.x_max'].high:g} m")
     return limits
+
+
+# --- distributions and tolerances that randomisation events draw from: quantile functions of one uniform number -------
+
+
+def uniform(u: Array, low: Array, high: Array, cut: Array) -> Array:
+    """Evenly spread between ``low`` and ``high``."""
+    return low + (high - low) * u
+
+
+def loguniform(u: Array, low: Array, high: Array, cut: Array) -> Array:
+    """Evenly spread in the logarithm between ``low`` and ``high`` (both positive)."""
+    return low * (high / low) ** u
+
+
+def normal(u: Array, mean: Array, sigma: Array, cut: Array) -> Array:
+    """Normal with ``mean`` and ``sigma``, cut off ``cut`` sigmas from the mean (the rest is renormalised)."""
+    from scipy.special import ndtr, ndtri
+
+    tail = ndtr(-cut)
+    return mean + sigma * ndtri(tail + (1.0 - 2.0 * tail) * u)
+
+
+def half_normal(u: Array, mean: Array, sigma: Array, cut: Array) -> Array:
+    """Normal folded at its mean: never below it."""
+    return mean + np.abs(normal(u, np.zeros_like(mean), sigma, cut))
+
+
+#: Distribution -> quantile function of (u, first parameter, second parameter, cut).
+DISTRIBUTIONS: dict[str, Callable[[Array, Array, Array, Array], Array]] = {
+    "uniform": uniform,
+    "loguniform": loguniform,
+    "normal": normal,
+    "half_normal": half_normal,
+}
+
+
+def tolerance_of(robot: Robot, element: str) -> tuple[str, float]:
+    """Return how well the robot file says an element is known: operation (``scale`` or ``add``) and 1 sigma."""
+    spec = spec_of(element)
+    stated = robot.tolerances.get(spec.tolerance)
+    if stated is None:
+        raise InputError(
+            f"robot '{robot.name}' states no tolerance for parameter '{spec.name}'; known: {', '.join(robot.tolerances)}"
+        )
+    return "scale" if stated.unit is None else "add", stated.of(element)
+
+
+def number_of(value: float | str, robot: Robot, where: str) -> float:
+    """Return a number given as such or as a dotted path into the robot's file (``sensors.imu.gyro_bias``)."""
+    if not isinstance(value, str):
+        return float(value)
+    found: Any = robot
+    for part in value.split("."):
+        found = getattr(found, part, None)
+    if not isinstance(found, (int, float)):
+        raise InputError(f"{where} = {value!r}: neither a number nor the path of a number in robot '{robot.name}'")
+    return float(found)

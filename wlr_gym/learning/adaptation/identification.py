@@ -9,7 +9,7 @@ from typing import Any
 
 from wlr_gym.data.read import run_files
 from wlr_gym.envs.registry import task_source_of
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
 from wlr_gym.gap.decision import Budget, Decided, Recorded, decide
 from wlr_gym.gap.report.result import PATCH_FILE

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
-from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
 from wlr_gym.learning.adaptation.supervised import may_stop_more, stopped_episodes
 from wlr_gym.learning.adaptation.uncertainty import STATED, TRAINED_SHARE, Family, Uncertainty

@@ -13,7 +13,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.tasks.randomization import load_randomization
-from wlr_gym.envs.tasks.task_config import read_task
+from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.learning.evaluation.card import MAIN
 from wlr_gym.learning.evaluation.scoring import Tell, evaluate, randomization_said
 from wlr_gym.learning.evaluation.subjects import Source, identity, read_subjects

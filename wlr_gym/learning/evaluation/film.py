@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.envs.infos import Infos
-from wlr_gym.envs.tasks.signals import Signals
-from wlr_gym.envs.tasks.terms.geometry import yaw_of
-from wlr_gym.envs.tasks.terms.references import climb_speed, path_point
+from wlr_gym.envs.interfaces import Infos
+from wlr_gym.envs.tasks.signals import Signals, climb_speed, path_point, yaw_of
 from wlr_gym.render.colours import DRIVEN, WANTED
 from wlr_gym.render.view import View
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.plots import new_figure, save
-from wlr_gym.envs.tasks.draws import episode_seeds
+from wlr_gym.base.random import episode_seeds
 from wlr_gym.robot import CORNER_SIGNS
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.envs.tasks.success import FALL, Which, limits_within, scales_within, succeeded, tracking_error
+from wlr_gym.envs.tasks.task import FALL, Which, limits_within, scales_within, succeeded, tracking_error
 from wlr_gym.learning.evaluation.rollout import Measure, Rollout
 
 Array = NDArray[np.float64]

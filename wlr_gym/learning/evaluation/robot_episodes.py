@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.core import make_task
-from wlr_gym.envs.measured import measured_truth
+from wlr_gym.envs.core import make_task, measured_truth
 from wlr_gym.envs.registry import task_source_of
 from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.compiled_terms import Scores, compile_scores
-from wlr_gym.envs.tasks.success import scales_of, tracking_error
-from wlr_gym.envs.tasks.terms.geometry import yaw_of
+from wlr_gym.envs.tasks.signals import yaw_of
+from wlr_gym.envs.tasks.task import scales_of, tracking_error
 from wlr_gym.hardware.deployment import Deployment, deploy, refuse_deadman
 from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.hardware.plant import RobotPlant

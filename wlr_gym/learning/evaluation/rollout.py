@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.tasks.terms.geometry import yaw_of
+from wlr_gym.envs.tasks.signals import yaw_of
 from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ def roll_out(
     Raises:
         InputError: a real robot.
     """
-    from wlr_gym.envs.infos import Infos
+    from wlr_gym.envs.interfaces import Infos
 
     if not core.plant.capabilities.has_truth:
         raise InputError(f"backend '{core.settings.backend}' has no truth to score by; to drive the robot: wlr deploy")

@@ -13,7 +13,7 @@ from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
-from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
 from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, Watch, play, work
 from wlr_gym.learning.evaluation.subjects import Source, common_robot, identity, read_subjects

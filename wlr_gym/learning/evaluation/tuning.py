@@ -20,7 +20,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
-from wlr_gym.envs.infos import Infos
+from wlr_gym.envs.interfaces import Infos
 from wlr_gym.learning.evaluation.metrics import has_limits
 from wlr_gym.learning.evaluation.rollout import make_core, measures_of, start_episodes
 from wlr_gym.policy import Policy, Training, write_contract

@@ -4,13 +4,10 @@
 """
 
 from wlr_gym.envs.tasks.terms.commands import COMMANDS
-from wlr_gym.envs.tasks.terms.computed import COMPUTED, computed
-from wlr_gym.envs.tasks.terms.controllers import CONTROLLER
-from wlr_gym.envs.tasks.terms.measures import MEASURES
+from wlr_gym.envs.tasks.terms.computed import COMPUTED, CONTROLLER, computed
+from wlr_gym.envs.tasks.terms.measures import MEASURES, POSITIVE, TERMINATIONS, ScalarTerm, registered
 from wlr_gym.envs.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
 from wlr_gym.envs.tasks.terms.rewards import REWARDS
-from wlr_gym.envs.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
-from wlr_gym.envs.tasks.terms.terminations import TERMINATIONS
 
 #: Group of a task's terms that are single numbers -> those there are.
 SCALARS = {"rewards": REWARDS, "terminations": TERMINATIONS, "measures": MEASURES}

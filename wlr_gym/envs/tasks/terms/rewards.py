@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import math
 
-from wlr_gym.envs.tasks.signals import Signals, Value, mean, norm
-from wlr_gym.envs.tasks.terms import references
-from wlr_gym.envs.tasks.terms.geometry import true_pose
-from wlr_gym.envs.tasks.terms.scalar import POSITIVE, ScalarTerm, registered
+from wlr_gym.envs.tasks.signals import Signals, Value, climb_speed, error_from_path, leg_errors, mean, norm, true_pose
+from wlr_gym.envs.tasks.terms.measures import POSITIVE, ScalarTerm, registered
 from wlr_gym.physics.codegen import ops
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS
 
@@ -69,7 +67,7 @@ def estimate_error(signals: Signals, *, scale: Value = 0.01) -> Value:
 @registered(REWARDS, lateral=POSITIVE, heading=POSITIVE)
 def path_error(signals: Signals, *, lateral: Value = 0.015, heading: Value = 0.2) -> Value:
     """Distance from the path over ``lateral`` (m), heading error over ``heading`` (rad), each r as |r| / (1 + |r| / 8)."""
-    error = references.path_error(signals, true_pose(signals))
+    error = error_from_path(signals, true_pose(signals))
     return _levelling(error.lateral / lateral) + _levelling(error.heading / heading)
 
 
@@ -83,19 +81,19 @@ def course_error(signals: Signals, *, lateral: Value = 0.01, heading: Value = 0.
 @registered(REWARDS, scale=POSITIVE)
 def leg_error(signals: Signals, *, scale: Value = 0.1) -> Value:
     """Mean |error| of the leg angles over ``scale`` (rad)."""
-    return mean([ops.absolute(error) for error in references.leg_errors(signals)]) / scale
+    return mean([ops.absolute(error) for error in leg_errors(signals)]) / scale
 
 
 @registered(REWARDS, width=POSITIVE)
 def track_climb_speed(signals: Signals, *, width: Value = 0.03) -> Value:
     """exp(-(error / width)^2) of the forward velocity, while climbing and while holding; width in m/s."""
-    return _kernel(references.climb_speed(signals) - signals.truth("linear_velocity_in_body")[0], width)
+    return _kernel(climb_speed(signals) - signals.truth("linear_velocity_in_body")[0], width)
 
 
 @registered(REWARDS, scale=POSITIVE)
 def climb_speed_error(signals: Signals, *, scale: Value = 0.015) -> Value:
     """|error| of the forward velocity over ``scale`` (m/s), while climbing and while holding."""
-    return ops.absolute(references.climb_speed(signals) - signals.truth("linear_velocity_in_body")[0]) / scale
+    return ops.absolute(climb_speed(signals) - signals.truth("linear_velocity_in_body")[0]) / scale
 
 
 @registered(REWARDS, linear=POSITIVE, angular=POSITIVE)
