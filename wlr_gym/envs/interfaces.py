@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.snapshot import Snapshot
-from wlr_gym.envs.core import OPTIONS, Core, Mask, Snapshots, own_seed, read_options, read_seed
+from wlr_gym.envs.core import OPTIONS, Core, Snapshots, read_options
+from wlr_gym.envs.episodes import Mask, own_seed, read_seed
 from wlr_gym.envs.observation import read_actions
 from wlr_gym.envs.settings import EnvironmentOptions, read_settings, task_of
 from wlr_gym.envs.tasks.task import limits_of, scales_of, succeeded, tracking_error

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import normals4, stream_numbers, uniforms
 from wlr_gym.base.snapshot import RowStore
-from wlr_gym.envs.core import Episodes
+from wlr_gym.envs.episodes import Episodes
 from wlr_gym.envs.tasks.compiled_terms import MATRICES
 from wlr_gym.envs.tasks.entries import normal
 from wlr_gym.envs.tasks.randomization import RandomizationConfig

@@ -13,7 +13,8 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.envs.core import Core, Mask, read_seed
+from wlr_gym.envs.core import Core
+from wlr_gym.envs.episodes import Mask, read_seed
 from wlr_gym.envs.interfaces import Infos, Pictures, TaskMethods, check_render_mode, metadata, row_of, seed_robots
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.settings import EnvironmentOptions, read_settings

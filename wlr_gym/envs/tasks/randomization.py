@@ -20,7 +20,7 @@ from wlr_gym.base.paths import named_in
 from wlr_gym.base.random import stream_numbers, uniforms
 from wlr_gym.base.settings import Layer, SettingsModel, layers_of, overlay, parse_config, read_config
 from wlr_gym.base.snapshot import RowStore
-from wlr_gym.envs.core import Episodes
+from wlr_gym.envs.episodes import Episodes
 from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Entry, EventConfig, Sampler, elements_of, entries_of
 from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.envs.tasks.task import SensorsConfig
