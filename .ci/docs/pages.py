@@ -33,7 +33,7 @@ API = {
     "The contract of a plant": "wlr_gym.physics.plants.base",
     "Effects": "wlr_gym.physics.effects",
     "What an effect is made of": "wlr_gym.physics.effects.effect",
-    "How an effect is looked for": "wlr_gym.physics.effects.search",
+    "How an effect is looked for": "wlr_gym.physics.effects.effect",
     "Slip": "wlr_gym.robot.slip",
     "Slip observer": "wlr_gym.perception.observer",
     "Runs": "wlr_gym.data",

@@ -25,8 +25,7 @@ from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, standing_state
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, RobotOptions, standing_state
 from wlr_gym.policy import environment_for, make_policy
 from wlr_gym.robot.parameters import Parameters
 

@@ -28,8 +28,8 @@ from wlr_gym.physics.plants.base import (
     check_setpoints,
     standing_state,
 )
-from wlr_gym.physics.plants.mujoco.batch import GEAR_IMPEDANCE
 from wlr_gym.physics.plants.mujoco.mjcf import CONTACT_IMPEDANCE, build_model
+from wlr_gym.physics.plants.mujoco.plant import GEAR_IMPEDANCE
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.robot import FIRST_WHEEL, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot, standing_height
 from wlr_gym.robot.parameters import Parameters

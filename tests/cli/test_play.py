@@ -13,7 +13,7 @@ from PIL import Image
 
 from wlr_gym.cli import main
 from wlr_gym.cli import play as play_module
-from wlr_gym.envs.tasks.signals import PlanarPose, Signals, path_error
+from wlr_gym.envs.tasks.signals import PlanarPose, Signals, error_from_path
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.evaluation.film import Journey, commands, drive, film, film_length, result
 from wlr_gym.policy import make_policy
@@ -107,7 +107,7 @@ def test_a_commanded_path_is_drawn_on_the_floor_it_was_commanded_on(shape):
     read = Signals({f"command.{name}": np.full(500, value) for name, value in given.items()}.__getitem__)
     away = wanted - [1.0, -2.0]
     pose = PlanarPose(away @ [np.cos(0.7), np.sin(0.7)], away @ [-np.sin(0.7), np.cos(0.7)], np.zeros(500))
-    assert np.abs(path_error(read, pose).lateral).max() < 1e-5
+    assert np.abs(error_from_path(read, pose).lateral).max() < 1e-5
     length = np.hypot(*np.diff(wanted, axis=0).T).sum()
     assert length == pytest.approx(0.1 * 499 * core.task.config.control_period, rel=1e-3)
 

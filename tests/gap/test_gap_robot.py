@@ -45,8 +45,7 @@ from wlr_gym.physics.effects import (
     apply_patch,
     load_patch,
 )
-from wlr_gym.physics.effects.effect import multiply
-from wlr_gym.physics.effects.search import WHEEL_SETS, Search, steps
+from wlr_gym.physics.effects.effect import WHEEL_SETS, Search, multiply, steps
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
 from wlr_gym.robot.parameter_table import SPECS
 from wlr_gym.robot.parameters import Parameters

@@ -10,8 +10,7 @@ from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.rig import kernel, law
 from wlr_gym.gap.rig.model import QUANTITIES, model_of, pack
 from wlr_gym.gap.rig.recording import Recording
-from wlr_gym.physics.plants.drive import fitted_weight
-from wlr_gym.physics.plants.gears import TEETH_DAMPING
+from wlr_gym.physics.plants.drive import TEETH_DAMPING, fitted_weight
 from wlr_gym.physics.servo import motor_constants, motor_torque
 
 K, R = motor_constants(0.52, 10.8, 5.0)

@@ -18,8 +18,7 @@ from wlr_gym.hardware.flow.stream import FlowStream
 from wlr_gym.hardware.flow.supervision import floor_velocity, lens_height
 from wlr_gym.hardware.loop import Phase
 from wlr_gym.hardware.plant import RobotPlant
-from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 from wlr_gym.robot import load_robot
 
 ROBOT = load_robot("flow")

@@ -24,8 +24,7 @@ from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.adaptation.robots import interrupted
 from wlr_gym.learning.evaluation import make_core
-from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 from wlr_gym.policy import make_policy
 
 ADVICE = "CUT THE POWER: torque is not confirmed off at wheel_lf, wheel_rf, wheel_lr, wheel_rr"

@@ -19,8 +19,7 @@ from wlr_gym.hardware.operator import STOP_SIGNALS, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.hardware.safety import preflight
 from wlr_gym.hardware.safety.limiter import CALM_SPEED
-from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
 
 @pytest.fixture

@@ -19,8 +19,7 @@ from wlr_gym.envs.settings import Settings
 from wlr_gym.learning.evaluation import make_core, roll_out
 from wlr_gym.physics.effects import Patch
 from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, Sensors
-from wlr_gym.physics.plants.robot_options import RobotOptions, read_robot_options
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, RobotOptions, Sensors, read_robot_options
 from wlr_gym.robot.parameters import Parameters
 
 QUIET = PlantOptions(sensor_noise=False)

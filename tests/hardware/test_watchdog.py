@@ -26,7 +26,7 @@ import sys, numpy as np
 from pathlib import Path
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import RobotOptions
 from wlr_gym.hardware.loop import StoppedError
 from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.robot import load_robot

@@ -7,8 +7,7 @@ import pytest
 from rig import HOME, ROBOT, contact_force, drive, lock, make_plant
 
 from wlr_gym.base.settings import overlay
-from wlr_gym.physics.feasibility import capability_of, stance_of
-from wlr_gym.physics.feasibility.stance import hip_torque
+from wlr_gym.physics.feasibility import capability_of, hip_torque, stance_of
 from wlr_gym.robot import Robot
 
 CAN = capability_of(ROBOT)

@@ -6,8 +6,8 @@ from energy import mechanical_energy, wheel_gaps
 from two_plants import ROBOT, make
 
 from wlr_gym.physics.plants.base import Truth
-from wlr_gym.physics.plants.mujoco.batch import RobotBatch
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
+from wlr_gym.physics.plants.mujoco.plant import RobotBatch
 from wlr_gym.robot.parameters import Parameters
 
 INERTIAL = (

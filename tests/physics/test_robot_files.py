@@ -10,7 +10,7 @@ import pytest
 
 from wlr_gym.base.settings import overlay
 from wlr_gym.physics.model import dynamics
-from wlr_gym.physics.plants.mujoco.mjcf_file import mjcf_text, read_mjcf
+from wlr_gym.physics.plants.mujoco.mjcf import mjcf_text, read_mjcf
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, load_robot
 from wlr_gym.robot.interchange import parse_urdf, recognise, urdf_text
 from wlr_gym.robot.parameters import Parameters

@@ -20,7 +20,7 @@ from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
 from wlr_gym.cli.tables import print_table
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
-from wlr_gym.physics.effects.document import coordinates, places
+from wlr_gym.physics.effects.library import coordinates, places
 from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameter_table import ELEMENTS, spec_of

@@ -99,8 +99,7 @@ class WiringOption:
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
         """Return the robot as a plant, torque off; every start is logged in a new run of ``log``. ``seed``: :meth:`link_to`."""
         from wlr_gym.hardware.plant import RobotPlant
-        from wlr_gym.physics.plants.base import PlantOptions
-        from wlr_gym.physics.plants.robot_options import RobotOptions
+        from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
         hardware = self.load_hardware()
         options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)

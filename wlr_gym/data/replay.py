@@ -242,7 +242,7 @@ def _simulate(
 def tick_setpoints(run: Run, parameters: Parameters, begin: Array, ticks: int, clock: float) -> tuple[Array, NDArray[np.bool_]]:
     """Setpoints (ticks, robots, 8) and torque switches on the plant's clock: each row's holds until the next row's.
 
-    Setpoints are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.setpoints.SetpointHistory`.
+    Setpoints are delayed, switching the torque is not: as in :class:`wlr_gym.physics.plants.simulator.SetpointHistory`.
     """
     commands = np.stack([run[name] for name in COMMANDS], axis=1)
     written = held_setpoints(run)

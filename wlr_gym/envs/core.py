@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.snapshot import RowStore, Snapshot, check_fit, read_rows, take_snapshot, write_snapshot
-from wlr_gym.envs.episodes import Commands, Episodes, Mask, is_whole
+from wlr_gym.envs.episodes import Commands, Episodes, Mask, RandomizedRobots, is_whole
 from wlr_gym.envs.observation import Actions, ObservationPipeline
 from wlr_gym.envs.settings import Settings
 from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_scores, not_finite
 from wlr_gym.envs.tasks.describe import contract, describe
-from wlr_gym.envs.tasks.randomization import RandomizedRobots, load_randomization
+from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.envs.tasks.signals import PRESENCE, START, signals_of, yaw_of
 from wlr_gym.envs.tasks.task import RampConfig, Task, bounds, fed_as, load_task
 from wlr_gym.envs.tasks.terms import COMPUTED, SCALARS

@@ -12,7 +12,7 @@ from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.physics.effects import Patch, Source
 from wlr_gym.physics.plants import REAL
-from wlr_gym.physics.plants.robot_options import RobotOptions, read_robot_options
+from wlr_gym.physics.plants.base import RobotOptions, read_robot_options
 from wlr_gym.render.view import View, read_view
 from wlr_gym.robot import WHEELS, Robot, RobotSource
 
@@ -63,7 +63,7 @@ class EnvironmentOptions(TypedDict, total=False):
         view: what pictures show (with ``render_mode``): mapping of ``size`` (width, height), ``camera`` (follow, chase, side,
             top), ``friction``, ``slip``, ``forces``, ``text`` (True or False), see :class:`wlr_gym.render.View`.
         hardware: of the real robot: name in ``configs/hardware/``, path of such a file, or mapping of the fields of
-            :class:`wlr_gym.physics.plants.robot_options.RobotOptions` (``{"emulated": True}``).
+            :class:`wlr_gym.physics.plants.base.RobotOptions` (``{"emulated": True}``).
     """
 
     backend: str

@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.config import Hardware, load_hardware
     from wlr_gym.hardware.deployment import Deployment, DriveResult, deploy, drive_robot
     from wlr_gym.hardware.plant import RobotPlant
-    from wlr_gym.physics.plants.robot_options import RobotOptions
+    from wlr_gym.physics.plants.base import RobotOptions
 
 HOMES = {
     "Deployment": "wlr_gym.hardware.deployment",
     "DriveResult": "wlr_gym.hardware.deployment",
     "Hardware": "wlr_gym.hardware.config",
-    "RobotOptions": "wlr_gym.physics.plants.robot_options",
+    "RobotOptions": "wlr_gym.physics.plants.base",
     "RobotPlant": "wlr_gym.hardware.plant",
     "deploy": "wlr_gym.hardware.deployment",
     "drive_robot": "wlr_gym.hardware.deployment",

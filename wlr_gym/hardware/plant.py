@@ -16,8 +16,7 @@ from wlr_gym.hardware.config import Hardware, load_hardware, require_leg_range, 
 from wlr_gym.hardware.limits import require_deadman
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
-from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors, Truth
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
 from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameter_table import ELEMENTS
 from wlr_gym.robot.parameters import Parameters

@@ -10,7 +10,7 @@ from llvmlite import binding
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.codegen import Graph, emit, hoist, load_module, ops
-from wlr_gym.physics.codegen.module import cache_directory
+from wlr_gym.physics.codegen.compilation import cache_directory
 
 
 def formula(x, y, p):

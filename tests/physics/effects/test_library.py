@@ -10,8 +10,8 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.effects import EFFECTS, STAGES, UNKNOWN_EFFECT, Effect, EffectParameter, apply_patch, load_patch
-from wlr_gym.physics.effects.document import places
 from wlr_gym.physics.effects.effect import add, multiply, put
+from wlr_gym.physics.effects.library import places
 from wlr_gym.robot import JOINTS, load_robot
 from wlr_gym.robot.parameters import Parameters
 

@@ -7,7 +7,7 @@ import pytest
 sp = pytest.importorskip("sympy")
 
 from wlr_gym.physics.model import derivation as d  # noqa: E402
-from wlr_gym.physics.model import equations, generate  # noqa: E402
+from wlr_gym.physics.model import equations  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -16,14 +16,14 @@ def assembly():
 
 
 def test_committed_equations_are_what_the_generator_writes():
-    assert Path(equations.__file__).read_text(encoding="utf-8") == generate.source()
+    assert Path(equations.__file__).read_text(encoding="utf-8") == d.source()
 
 
 def test_generator_refuses_an_entry_that_is_not_the_derived_one():
-    program = generate.platform_program()
+    program = d.platform_program()
     program.bias[4] = -program.bias[4]
     with pytest.raises(ArithmeticError, match=r"bias\[4\]"):
-        generate.prove(program, d.derive_platform())
+        d.prove(program, d.derive_platform())
 
 
 def test_masses_enter_only_through_their_three_moments():
@@ -61,7 +61,7 @@ def test_bias_does_no_work_beyond_the_change_of_the_mass_matrix(assembly):
 def test_operation_count():
     """The engine runs this code in its innermost loop, four assemblies each step."""
     counts = []
-    for program in (generate.platform_program(), generate.assembly_program()):
+    for program in (d.platform_program(), d.assembly_program()):
         counts.append(sp.count_ops([*program.steps.values(), *program.mass_matrix.values(), *program.bias.values()]))
     assert counts[0] <= 60
     assert counts[1] <= 150

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import Plant, PlantOptions, Sensors
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions, Sensors
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
-from wlr_gym.physics.plants.setpoints import SetpointHistory
+from wlr_gym.physics.plants.simulator import SetpointHistory
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 

@@ -7,9 +7,8 @@ from collections.abc import Collection
 from wlr_gym.gap.problem import Candidate, Probe, Start, Unknown
 from wlr_gym.gap.rig.effects import RIG_EFFECTS, RigEffect
 from wlr_gym.gap.rig.model import JOINT
-from wlr_gym.physics.effects.effect import PatchEffect
-from wlr_gym.physics.effects.registry import EFFECTS
-from wlr_gym.physics.effects.search import Change
+from wlr_gym.physics.effects.effect import Change, PatchEffect
+from wlr_gym.physics.effects.library import EFFECTS
 
 
 def rig_candidates(present: Collection[str]) -> tuple[list[Probe], list[Candidate]]:

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.physics.effects.effect import EffectParameter
-from wlr_gym.physics.effects.registry import EFFECTS
-from wlr_gym.physics.effects.search import Change, Guess, one_step
+from wlr_gym.physics.effects.effect import Change, EffectParameter, Guess, one_step
+from wlr_gym.physics.effects.library import EFFECTS
 
 Numbers = dict[str, float]
 Apply = Callable[[Numbers, Mapping[str, float]], None]

@@ -21,8 +21,9 @@ from wlr_gym.gap.rig.formula import rig_force
 from wlr_gym.gap.rig.recording import FULL_DUTY, Recording
 from wlr_gym.physics import servo
 from wlr_gym.physics.effects.effect import PatchEffect
-from wlr_gym.physics.effects.registry import UNKNOWN_EFFECT
-from wlr_gym.physics.plants import drive, gears
+from wlr_gym.physics.effects.library import UNKNOWN_EFFECT
+from wlr_gym.physics.plants import drive
+from wlr_gym.physics.plants.drive import TEETH_DAMPING
 from wlr_gym.physics.plants.forces import Force
 
 Array = NDArray[np.float64]
@@ -126,7 +127,7 @@ def pack(models: Sequence[RigModel], recording: Recording, step: float) -> Array
         "half_play": 0.5 * play,
         "rotor_inertia": armature,
         "teeth_stiffness": np.full(len(models), TEETH_STIFFNESS),
-        "teeth_damping": gears.TEETH_DAMPING * np.sqrt(TEETH_STIFFNESS * armature),
+        "teeth_damping": TEETH_DAMPING * np.sqrt(TEETH_STIFFNESS * armature),
         "gain": np.full(len(models), recording.gain * DUTY_PER_GAIN),
         "gravity": GRAVITY * length * (recording.mass + arm / 2.0),
         "inertia": np.where(play > 0.0, link, with_rotor),

@@ -17,7 +17,7 @@ from wlr_gym.gap.problem import Candidate, Probe, Start, Tolerance, Unknown
 from wlr_gym.gap.robot.observed import observe
 from wlr_gym.gap.robot.quantities import REACH
 from wlr_gym.physics.effects import EFFECTS, Effect, PatchEffect
-from wlr_gym.physics.effects.search import Change, Coordinates, Guess, Known, Observed, Places, Search
+from wlr_gym.physics.effects.effect import Change, Coordinates, Guess, Known, Observed, Places, Search
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]

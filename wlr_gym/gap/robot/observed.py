@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.physics.effects.search import Observed
+from wlr_gym.physics.effects.effect import Observed
 from wlr_gym.robot import JOINTS
 from wlr_gym.robot.parameters import Parameters
 

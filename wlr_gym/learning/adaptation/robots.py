@@ -24,8 +24,7 @@ from wlr_gym.hardware.operator import STOP_KEYS, STOP_SIGNALS
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.physics.effects import Patch, apply_patch
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import PlantOptions, standing_state
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import PlantOptions, RobotOptions, standing_state
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 

@@ -22,8 +22,7 @@ from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
-from wlr_gym.physics.plants.base import TRUTH_LAYOUT
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, RobotOptions
 from wlr_gym.policy import environment_for, make_policy
 
 if TYPE_CHECKING:

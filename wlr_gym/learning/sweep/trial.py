@@ -146,7 +146,7 @@ def _compiled(environment: str, keywords: Mapping[str, Any]) -> Path | None:
     """
     import llvmlite.binding
 
-    from wlr_gym.physics.codegen.module import cache_directory, fingerprint
+    from wlr_gym.physics.codegen.compilation import cache_directory, fingerprint
 
     texts = (environment, json.dumps(keywords, sort_keys=True), str(PACKAGE), str(git_commit()), __version__)
     key = hashlib.sha256("\0".join((fingerprint(*texts), str(llvmlite.binding.get_host_cpu_name()))).encode()).hexdigest()[:16]

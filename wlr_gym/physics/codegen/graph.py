@@ -225,7 +225,7 @@ def _store_times(outputs: Mapping[str, Operand], order: Sequence[Node]) -> dict[
 def straight_line_source(name: str, parameters: Sequence[str], lines: Sequence[str]) -> list[str]:
     """Return the source of an intrinsic ``name`` with positional ``parameters`` that runs the ``lines`` of :func:`emit`.
 
-    numba compiles them without analysing them: :mod:`wlr_gym.physics.codegen.straight_line`.
+    numba compiles them without analysing them: :mod:`wlr_gym.physics.codegen.compilation`.
     """
     listed = ", ".join(parameters)
     return [

@@ -1,8 +1,8 @@
 """Named effects, formulas and patch files: what the nominal model lacks, added to any simulator."""
 
 from wlr_gym.physics.effects.effect import STAGES, Effect, EffectParameter, PatchEffect
+from wlr_gym.physics.effects.library import EFFECTS, UNKNOWN_EFFECT
 from wlr_gym.physics.effects.patch import Patch, Source, apply_patch, compose, load_patch, save_patch
-from wlr_gym.physics.effects.registry import EFFECTS, UNKNOWN_EFFECT
 
 __all__ = [
     "EFFECTS",

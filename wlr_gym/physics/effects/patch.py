@@ -26,9 +26,8 @@ from wlr_gym.base.paths import find_config
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.effects.effect import Effect, EffectParameter, PatchEffect
-from wlr_gym.physics.effects.formula import KEYS, PLACES, force_of, parse_formula
-from wlr_gym.physics.effects.registry import EFFECTS, UNKNOWN_EFFECT, stage
-from wlr_gym.physics.plants.forces import Force
+from wlr_gym.physics.effects.library import EFFECTS, UNKNOWN_EFFECT, stage
+from wlr_gym.physics.plants.forces import COORDINATES, Force, make_force
 from wlr_gym.robot.parameter_table import range_in_words, unit_in_words
 from wlr_gym.robot.parameters import Parameters
 
@@ -234,3 +233,46 @@ def _require_keys(data: Mapping[str, Any], valid: Sequence[str] | Mapping[str, A
     for key in data:
         if key not in valid:
             raise unknown_name("key", str(key), valid, place)
+
+
+# --- unknown effects: a formula for a generalised force, as the gap workflow reports what no named effect explains ----
+
+
+KEYS = ("name", "where", "formula", "parameters", "units")
+
+
+def parse_formula(entry: Mapping[str, Any], where: tuple[str, ...], place: str) -> PatchEffect:
+    """Return the checked unknown effect of a patch file.
+
+    Args:
+        entry: mapping of :data:`KEYS`.
+        where: its places, of :data:`wlr_gym.physics.plants.forces.COORDINATES`.
+        place: start of every message.
+
+    Raises:
+        InputError: see :func:`wlr_gym.physics.plants.forces.make_force`.
+    """
+    formula = entry.get("formula")
+    if not isinstance(formula, str):
+        raise InputError(f"{place}: 'formula' is {formula!r}: expected text such as '-k * (leg_angle - a0)'")
+    parameters, units = (_mapping(entry, key, place) for key in ("parameters", "units"))
+    try:
+        force = make_force(where, formula, parameters, units)
+    except InputError as error:
+        raise InputError(f"{place}: {error}") from None
+    return PatchEffect(entry["name"], where, force.parameters, formula, units, place)
+
+
+def force_of(effect: PatchEffect) -> Force:
+    """Return the force of an unknown effect."""
+    return make_force(effect.where, effect.formula, effect.parameters, effect.units)
+
+
+def _mapping(entry: Mapping[str, Any], key: str, place: str) -> dict[str, Any]:
+    given = entry.get(key)
+    if given is not None and not (isinstance(given, Mapping) and all(isinstance(name, str) for name in given)):
+        raise InputError(f"{place}: '{key}' must be a mapping of the formula's constants, got {given!r}")
+    return dict(given or {})
+
+
+PLACES = tuple(COORDINATES)

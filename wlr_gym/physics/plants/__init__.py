@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.physics.plants.base import Plant, PlantOptions
+from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions
 from wlr_gym.physics.plants.forces import Force
-from wlr_gym.physics.plants.robot_options import RobotOptions
 from wlr_gym.robot import RobotSource, load_robot
 
 #: Backend -> "module:class", imported when it is first made.

@@ -1,13 +1,97 @@
-"""Vectors, turns, and the geometry of the wheels on the floor, as generic scalar arithmetic."""
+"""The engine's lanes by name: what a step keeps, what it reads, and what it shows.
+
+Every function of the step maps lanes (state, parameters, inputs; each a scalar) to new lanes.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
 from wlr_gym.physics.plants import drive
-from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, SINGLE
+from wlr_gym.physics.plants.forces import COORDINATES
+from wlr_gym.physics.plants.forces import INPUTS as INPUTS_OF_FORMULAS
+
+CORNERS = range(4)
+AXES = "xyz"
+
+STATE: tuple[str, ...] = (
+    *(f"p{a}" for a in AXES),
+    *(f"q{a}" for a in "wxyz"),
+    *(f"v{a}" for a in AXES),
+    *(f"w{a}" for a in AXES),
+    *(f"leg_angle{i}" for i in CORNERS),
+    *(f"wheel_angle{i}" for i in CORNERS),
+    *(f"leg_rate{i}" for i in CORNERS),
+    *(f"wheel_rate{i}" for i in CORNERS),
+    *drive.STATE,
+    # what the step remembers: velocities one step ago, impulses of the last step (warm start), sensor filters
+    *(f"last_w{a}" for a in AXES),
+    *(f"last_leg_rate{i}" for i in CORNERS),
+    *(f"last_wheel_rate{i}" for i in CORNERS),
+    *(f"last_gap_rate{i}" for i in CORNERS),
+    *(f"friction_{a}{i}" for i in CORNERS for a in "xy"),
+    *(f"multiplier{i}" for i in CORNERS),
+    *(f"gear_friction{j}" for j in range(8)),
+    *(f"rolling_friction{i}" for i in CORNERS),
+    *(f"gyro_{a}" for a in AXES),
+    *(f"acceleration_{a}" for a in AXES),
+    # single precision only: what rounding has added to the position so far, and where wheel angles are counted from: whole
+    # turns, an angle, and what that lacks by rounding
+    *(f"rounding_p{a}" for a in "xy"),
+    *(f"turns{i}" for i in CORNERS),
+    *(f"zero_angle{i}" for i in CORNERS),
+    *(f"zero_rest{i}" for i in CORNERS),
+)
+#: Among the features: single precision, in which a sum over hours must not be one number.
+SINGLE = "single"
+#: A turn of a wheel, rad.
+TURN = 2.0 * math.pi
+#: Results of the last substep or of the whole tick, kept with the state for the observation block.
+RESULTS: tuple[str, ...] = (
+    *(f"normal{i}" for i in CORNERS),
+    *(f"motor_torque{j}" for j in range(8)),
+    *(f"current_torque{j}" for j in range(8)),
+    *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
+    "mechanical_energy",
+    "electrical_energy",
+)
+TICK_SUMS: tuple[str, ...] = RESULTS[-10:]
+STORED: tuple[str, ...] = STATE + RESULTS
+#: Written each control tick.
+INPUTS: tuple[str, ...] = (
+    *(f"goal{j}" for j in range(8)),
+    *(f"old_goal{j}" for j in range(8)),
+    *(f"switch_time{j}" for j in range(8)),
+    *(f"on{j}" for j in range(8)),
+)
+#: Inertia of body and loads, and of one corner: arguments of the generated equations (:mod:`wlr_gym.physics.model.equations`).
+PLATFORM = (
+    "platform_mass",
+    *(f"platform_moment_{a}" for a in AXES),
+    *(f"platform_inertia_{a}" for a in ("xx", "yy", "zz", "xy", "xz", "yz")),
+)
+ASSEMBLY = (
+    *(f"hip_{a}" for a in AXES),
+    "assembly_mass",
+    "first_moment",
+    "second_moment",
+    "leg_ixx",
+    "leg_iyy",
+    "leg_izz",
+    "wheel_transverse",
+    "wheel_spin",
+    "armature_leg",
+    "armature_wheel",
+)
+#: Lanes that formula forces read and write; each group lies side by side in this order.
+FORMULA_INPUTS: tuple[str, ...] = tuple(f"formula_input_{name}" for name in INPUTS_OF_FORMULAS)
+FORMULA_OUTPUTS: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
+
+
+# --- vectors, turns, and the geometry of the wheels on the floor, as generic scalar arithmetic ------------------------
 
 
 def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:

@@ -16,8 +16,8 @@ from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import MEMORY, Force, compile_forces
-from wlr_gym.physics.plants.gibbs_appell import kernel, packing
-from wlr_gym.physics.plants.gibbs_appell.lanes import STORED, TURN
+from wlr_gym.physics.plants.gibbs_appell import kernel
+from wlr_gym.physics.plants.gibbs_appell.kinematics import STORED, TURN
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -121,7 +121,7 @@ class GibbsAppellPlant(Simulator):
         self._width = 1 if count == 1 else kernel.WIDTH[self.options.precision]
         self._tiles = -(-count // self._width)
         self._lanes = np.zeros((self._tiles, len(STORED) * self._width), self._float)
-        self._constants = np.zeros((self._tiles, len(packing.PARAMETER_LANES) * self._width), self._float)
+        self._constants = np.zeros((self._tiles, len(kernel.PARAMETER_LANES) * self._width), self._float)
         self._torque_on = np.ones((count, 8))
         self._chunks = self._shared_out(self._tiles)
         self._helpers = min(self.options.threads, len(self._chunks)) - 1
@@ -141,7 +141,7 @@ class GibbsAppellPlant(Simulator):
     # ---- parameters and state ----
 
     def _use_parameters(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
-        _scatter(self._constants, self._width, rows, packing.pack(chosen, self.robot, self.options.physics_step))
+        _scatter(self._constants, self._width, rows, kernel.pack(chosen, self.robot, self.options.physics_step))
         self._pad(self._constants)
         self._choose_kernel()
 

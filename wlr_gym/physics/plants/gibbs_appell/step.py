@@ -29,6 +29,11 @@ from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
+    AXES,
+    CORNERS,
+    INPUTS_OF_FORMULAS,
+    SINGLE,
+    TURN,
     contact_place,
     cross,
     dot,
@@ -41,7 +46,6 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     wheel_angle,
     wheel_points,
 )
-from wlr_gym.physics.plants.gibbs_appell.lanes import AXES, CORNERS, INPUTS_OF_FORMULAS, SINGLE, TURN
 from wlr_gym.robot import FIRST_WHEEL
 
 

@@ -19,20 +19,28 @@ Choices, and why:
   mass, which is divided out after compiling.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot import CORNER_SIGNS, FIRST_WHEEL, JOINTS, LEGS, WHEELS, Robot, standing_height
+from wlr_gym.robot.interchange import LinkJoint, LinkShape, LinkTree, Placement, RigidLink
 from wlr_gym.robot.parameters import Parameters
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+
 
 WheelShape = Literal["sphere", "capsule"]
 
@@ -228,3 +236,298 @@ def _set_contact_springs(model: mujoco.MjModel, row: Parameters) -> None:
         scale = (1.0 - CONTACT_IMPEDANCE) * model.body_invweight0[model.geom_bodyid[geom], 0] / sharing
         stiffness, damping = row["ground.normal_stiffness"][0, wheel], row["ground.normal_damping"][0, wheel]
         model.pair_solref[pair] = -scale * stiffness, -scale * damping
+
+
+# --- robots as MJCF files: the MuJoCo plant's model written in full digits, and models of others read as links and join
+
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+
+
+Array = NDArray[np.float64]
+
+#: What of a robot file an MJCF cannot hold.
+NOT_IN_MJCF = (
+    "sensors", "tolerances", "dynamixel_ids", "servo gains, no-load speeds, currents, gear stiffness and supply voltage",
+)  # fmt: skip
+_GEOM = mujoco.mjtGeom
+_JOINT = mujoco.mjtJoint
+_SPAN = 1e-9
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+def mjcf_text(robot: Robot) -> str:
+    """Return the robot as MJCF (XML): the MuJoCo plant's model with the floor's contacts, leg limits and a motor per joint.
+
+    Joint angles are those of the robot; the reference pose is its home pose. The motors take torques (N m): the servo's law is
+    no part of the file.
+    """
+    kept: list[Any] = []
+    model = build_model(robot, Parameters.nominal(robot), extend=functools.partial(_complete, robot=robot, kept=kept))
+    root = ElementTree.fromstring(kept[0].to_xml())
+    _write_full_digits(root, model)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _complete(spec: Any, robot: Robot, kept: list[Any]) -> None:
+    """Add what the plant does not need, take away what only it needs."""
+    kept.append(spec)
+    spec.delete(spec.body("payload"))
+    for leg in LEGS:
+        joint = spec.joint(leg)
+        joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, robot.leg_limits
+    for joint, torque in zip(JOINTS, Parameters.nominal(robot)["servo.stall_torque"][0], strict=True):
+        spec.add_actuator(
+            name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
+            ctrlrange=[-torque, torque],
+        )  # fmt: skip
+
+
+def _write_full_digits(root: ElementTree.Element, model: Any) -> None:
+    """MuJoCo writes six digits: put the compiled model's numbers in their place."""
+    for element in root.iter("body"):
+        body = model.body(element.get("name")).id
+        _write(element, pos=model.body_pos[body], quat=model.body_quat[body])
+        for inertial in element.findall("inertial"):
+            _write(inertial, mass=model.body_mass[body], pos=model.body_ipos[body], diaginertia=model.body_inertia[body])
+        for offset, geom in enumerate(element.findall("geom")):
+            index = model.body_geomadr[body] + offset
+            _write(geom, size=model.geom_size[index], pos=model.geom_pos[index], quat=model.geom_quat[index])
+        for joint in element.findall("joint"):
+            if joint.get("type") != "free":
+                _write_joint(joint, model)
+    for index, element in enumerate(root.iter("pair")):
+        element.set("solref", "")  # set after compiling, so that it is not in the text
+        _write(element, friction=model.pair_friction[index], solref=model.pair_solref[index])
+    for element in root.iter("general"):  # as MuJoCo writes every actuator; with its defaults it is a motor
+        element.tag = "motor"
+        _write(element, ctrlrange=model.actuator(element.get("name")).ctrlrange)
+    for option in root.iter("option"):
+        _write(option, gravity=model.opt.gravity, timestep=model.opt.timestep)
+
+
+def _write_joint(element: ElementTree.Element, model: Any) -> None:
+    joint = model.joint(element.get("name"))
+    _write(
+        element, ref=joint.qpos0, armature=joint.armature, damping=joint.damping, frictionloss=joint.frictionloss,
+        range=joint.range,
+    )  # fmt: skip
+
+
+def _write(element: ElementTree.Element, **numbers: Any) -> None:
+    """Set those attributes that the element has."""
+    for name, values in numbers.items():
+        if name in element.attrib:
+            count = len(element.get(name, "").split()) or None
+            element.set(name, " ".join(repr(float(value)) for value in np.ravel(values)[:count]))
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_mjcf(path: str | Path) -> LinkTree:
+    """Return the links and joints of an MJCF file, as MuJoCo compiles it.
+
+    Raises:
+        InputError: MuJoCo cannot load it, or it holds no robot, several, or a coupling that the engine does not know.
+    """
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{path}: MuJoCo cannot load it: {' '.join(str(error).split())}") from None
+    source = str(path)
+    _refuse_couplings(model, source)
+    members = _robot_bodies(model, source)
+    links = {_name(model, "body", body): _link(model, body) for body in members}
+    joints = tuple(_joint(model, body, members[0], source) for body in members[1:])
+    numbers = _scene_numbers(model, members[0], source)
+    return LinkTree(mujoco.MjSpec.from_file(source).modelname, source, links, joints, numbers)
+
+
+def _name(model: Any, kind: str, index: int) -> str:
+    """Return the name of a part; parts may have none."""
+    return getattr(model, kind)(index).name or f"{kind} {index}"
+
+
+def _refuse_couplings(model: Any, source: str) -> None:
+    couplings = (
+        ("equality constraint", "equality", model.neq),
+        ("tendon", "tendon", model.ntendon),
+        ("flex", "flex", model.nflex),
+    )
+    for words, kind, count in couplings:
+        if count:
+            raise InputError(f"{source}: {words} '{_name(model, kind, 0)}': expected legs and wheels that move one by one")
+
+
+def _robot_bodies(model: Any, source: str) -> list[int]:
+    """Return the bodies of the one robot, its base first: all below the body of the world that has hinges below it."""
+    tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+    families = [[body for body in range(1, model.nbody) if _top(model, body) == top] for top in tops]
+    moving = [family for family in families if any(model.body_jntnum[body] for body in family[1:])]
+    if len(moving) != 1:
+        names = ", ".join(f"'{_name(model, 'body', family[0])}'" for family in moving) or "none"
+        raise InputError(f"{source}: expected one robot in the world, found {len(moving)}: {names}")
+    base = moving[0][0]
+    start, count = model.body_jntadr[base], model.body_jntnum[base]
+    if any(model.jnt_type[joint] != _JOINT.mjJNT_FREE for joint in range(start, start + count)):
+        joint = _name(model, "joint", start)
+        raise InputError(
+            f"{source}: body '{_name(model, 'body', base)}' hangs on joint '{joint}': expected a free joint, or none"
+        )
+    return moving[0]
+
+
+def _top(model: Any, body: int) -> int:
+    while model.body_parentid[body] != 0:
+        body = model.body_parentid[body]
+    return body
+
+
+def _link(model: Any, body: int) -> RigidLink:
+    rotation = _rotation(model.body_iquat[body])
+    inertia = rotation @ np.diag(model.body_inertia[body]) @ rotation.T
+    start = model.body_geomadr[body]
+    shapes = [_shape(model, geom) for geom in range(start, start + model.body_geomnum[body])]
+    return RigidLink(
+        _name(model, "body", body), float(model.body_mass[body]), model.body_ipos[body].copy(), inertia,
+        tuple(shape for shape in shapes if shape is not None),
+    )  # fmt: skip
+
+
+def _shape(model: Any, geom: int) -> LinkShape | None:
+    kind, size = model.geom_type[geom], [float(value) for value in model.geom_size[geom]]
+    placement = Placement(model.geom_pos[geom].copy(), _rotation(model.geom_quat[geom]))
+    match kind:
+        case _GEOM.mjGEOM_BOX:
+            return LinkShape("box", tuple(2.0 * value for value in size), placement)
+        case _GEOM.mjGEOM_CYLINDER | _GEOM.mjGEOM_CAPSULE:
+            name = "cylinder" if kind == _GEOM.mjGEOM_CYLINDER else "capsule"
+            return LinkShape(name, (size[0], 2.0 * size[1]), placement)
+        case _GEOM.mjGEOM_SPHERE:
+            return LinkShape("sphere", (size[0],), placement)
+        case _GEOM.mjGEOM_MESH:
+            start = model.mesh_vertadr[model.geom_dataid[geom]]
+            corners = model.mesh_vert[start : start + model.mesh_vertnum[model.geom_dataid[geom]]]
+            return LinkShape("mesh", (), placement, corners.astype(np.float64))
+        case _:
+            return None
+
+
+def _joint(model: Any, body: int, base: int, source: str) -> LinkJoint:
+    """The joint that a body hangs on, with the body's placement where its angle is 0."""
+    parent, child = _name(model, "body", model.body_parentid[body]), _name(model, "body", body)
+    placement = Placement(model.body_pos[body].copy(), _rotation(model.body_quat[body]))
+    count, index = model.body_jntnum[body], model.body_jntadr[body]
+    if count == 0:
+        return LinkJoint(f"{child} (fixed)", "fixed", parent, child, placement, np.array([0.0, 0.0, 1.0]))
+    if count > 1:
+        names = ", ".join(f"'{_name(model, 'joint', joint)}'" for joint in range(index, index + count))
+        raise InputError(f"{source}: body '{child}' moves by {count} joints ({names}): expected one hinge")
+    name, kind = _name(model, "joint", index), model.jnt_type[index]
+    if kind != _JOINT.mjJNT_HINGE:
+        return LinkJoint(name, "slide" if kind == _JOINT.mjJNT_SLIDE else "ball", parent, child, placement, np.zeros(3))
+    return _hinge(model, index, LinkJoint(name, "hinge", parent, child, placement, model.jnt_axis[index].copy()), source)
+
+
+def _hinge(model: Any, index: int, joint: LinkJoint, source: str) -> LinkJoint:
+    if model.jnt_stiffness[index].any():
+        raise InputError(
+            f"{source}: joint '{joint.name}': has a spring: no robot file holds one; add the effect 'leg_spring' instead"
+        )
+    if np.abs(model.jnt_pos[index]).max() > _SPAN:
+        raise InputError(
+            f"{source}: joint '{joint.name}': pos = {model.jnt_pos[index]}: expected the axis through its body's origin"
+        )
+    turn = _rotation(_turned(joint.axis, -float(model.qpos0[model.jnt_qposadr[index]])))
+    rates, angle = model.jnt_dofadr[index], model.jnt_qposadr[index]
+    limits = model.jnt_range[index] if model.jnt_limited[index] else None
+    return replace(
+        joint,
+        placement=joint.placement @ Placement(rotation=turn),
+        limits=None if limits is None else (float(limits[0]), float(limits[1])),
+        effort=_effort(model, index, joint.name, source),
+        damping=float(np.ravel(model.dof_damping[rates])[0]),
+        friction=float(model.dof_frictionloss[rates]),
+        armature=float(model.dof_armature[rates]),
+        home=float(_home(model)[angle]),
+    )
+
+
+def _home(model: Any) -> Array:
+    """Joint coordinates of the keyframe ``home``, else of the pose that the file is written in."""
+    names = [model.key(index).name for index in range(model.nkey)]
+    return model.key_qpos[names.index("home")] if "home" in names else model.qpos0
+
+
+def _effort(model: Any, joint: int, name: str, source: str) -> float | None:
+    """Largest torque of the joint's actuator, N m; None: nothing says it."""
+    found = []
+    for actuator in range(model.nu):
+        if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT or model.actuator_trnid[actuator, 0] != joint:
+            continue
+        gear = float(model.actuator_gear[actuator, 0])
+        if gear <= 0.0:
+            label = _name(model, "actuator", actuator)
+            raise InputError(f"{source}: actuator '{label}' of joint '{name}': gear = {gear:g}: expected more than 0")
+        found += _torques(model, actuator, gear)
+    if model.jnt_actfrclimited[joint]:
+        found.append(float(np.abs(model.jnt_actfrcrange[joint]).max()))
+    return min(found) if found else None
+
+
+def _torques(model: Any, actuator: int, gear: float) -> list[float]:
+    """Limits (N m) that an actuator has: of its force, and, where it is a plain motor, of its control."""
+    found = []
+    if model.actuator_forcelimited[actuator]:
+        found.append(gear * float(np.abs(model.actuator_forcerange[actuator]).max()))
+    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    if model.actuator_ctrllimited[actuator] and is_motor:
+        gain = float(np.ravel(model.actuator_gainprm[actuator])[0])
+        found.append(gear * gain * float(np.abs(model.actuator_ctrlrange[actuator]).max()))
+    return found
+
+
+def _rotation(quaternion: Sequence[float] | Array) -> Array:
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quaternion, np.float64))
+    return matrix.reshape(3, 3)
+
+
+def _turned(axis: Array, angle: float) -> Array:
+    quaternion = np.zeros(4)
+    mujoco.mju_axisAngle2Quat(quaternion, np.asarray(axis, np.float64), angle)
+    return quaternion
+
+
+# --- gravity, home pose, floor ----------------------------------------------------------------------------------------
+
+
+def _scene_numbers(model: Any, base: int, source: str) -> dict[str, float | list[float]]:
+    """What a model says of gravity, and of contacts that are pairs of their own, as the plant's are."""
+    gravity = float(np.linalg.norm(model.opt.gravity))
+    numbers: dict[str, float | list[float]] = {"gravity": gravity}
+    if gravity and abs(model.opt.gravity[1]) < 1e-9 * gravity:
+        numbers["ground.slope"] = float(np.arcsin(-model.opt.gravity[0] / gravity)) + 0.0
+    if model.npair == 4 and (model.pair_solref < 0.0).all() and (model.pair_solimp[:, 0] == CONTACT_IMPEDANCE).all():
+        numbers |= _contact_numbers(model)
+    return numbers
+
+
+def _contact_numbers(model: Any) -> dict[str, float | list[float]]:
+    """Friction and springs of the pairs that :func:`wlr_gym.physics.plants.mujoco.mjcf.build_model` writes, undone."""
+    geom = int(model.pair_geom2[0])
+    sharing = 2 if model.geom_type[geom] == _GEOM.mjGEOM_CAPSULE else 1
+    scale = (1.0 - CONTACT_IMPEDANCE) * float(model.body_invweight0[model.geom_bodyid[geom], 0]) / sharing
+    stiffness, damping = (-float(value) / scale for value in model.pair_solref[0])
+    along_axle, along_heading = (float(value) for value in model.pair_friction[0, :2])
+    return {
+        "ground.mu_x": along_heading,
+        "ground.mu_y": along_axle,
+        "ground.normal_stiffness": stiffness,
+        "ground.normal_damping": damping,
+    }

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
+from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
@@ -12,12 +14,12 @@ from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import COORDINATES, INPUTS, MEMORY, Force, compile_forces
-from wlr_gym.physics.plants.mujoco import packing
-from wlr_gym.physics.plants.mujoco.batch import RobotBatch
-from wlr_gym.physics.plants.mujoco.kernel import addresses, load_kernel
-from wlr_gym.physics.plants.mujoco.step import STATE, TICK_SUMS
+from wlr_gym.physics.plants.mujoco.kernel import PARAMETER_LANES, addresses, load_kernel, pack
+from wlr_gym.physics.plants.mujoco.mjcf import build_model, principal_inertia
+from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH, STATE, TICK_SUMS
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
-from wlr_gym.robot import LEG_SLICE, Robot
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEELS, Robot
+from wlr_gym.robot.parameter_table import SPECS
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -58,7 +60,7 @@ class MujocoPlant(Simulator):
         self._step = self.options.physics_step
         self._batch = RobotBatch(robot, count, self._step, self.options.threads)
         self._state = np.zeros((count, len(STATE)))
-        self._lanes = np.zeros((count, len(packing.PARAMETER_LANES)))
+        self._lanes = np.zeros((count, len(PARAMETER_LANES)))
         self._inputs = [np.zeros((count, 8)) for _ in range(4)]
         self._formulas = compile_forces(forces) if forces else None
         self._force_inputs = np.zeros((len(INPUTS), count if forces else 1))
@@ -82,7 +84,7 @@ class MujocoPlant(Simulator):
     # ---- parameters and state ----
 
     def _use_parameters(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
-        self._lanes[rows] = packing.pack(chosen, self.robot, self._step)
+        self._lanes[rows] = pack(chosen, self.robot, self._step)
         self._batch.set_parameters(rows, chosen)
 
     def _look(self, rows: NDArray[np.intp]) -> None:
@@ -173,3 +175,170 @@ class MujocoPlant(Simulator):
 
     def close(self) -> None:
         """Nothing to release."""
+
+
+# --- a batch of robots in MuJoCo: one model, per-robot numbers as expanded fields, live arrays for the substep kernel -
+
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+
+
+#: Impedance of contacts. It adds d/(1-d) times the apparent mass to the contact, and a push off the floor of that mass times
+#: friction times slip speed over the step: as small as MuJoCo allows, the contact is the parameters' spring and damper.
+CONTACT_IMPEDANCE = 1e-4
+#: Regularisation of friction over apparent inverse mass. What sticks creeps at step x friction force/apparent mass times this.
+FRICTION_SOFTNESS = 1e-3
+#: Impedance of gear friction, MuJoCo's largest.
+GEAR_IMPEDANCE = 0.9999
+#: Radius (m) of the bounding sphere of the geoms that touch: they move about in their wheels, see step.py.
+BOUND = 0.5
+#: Parameters from which mj_setConst derives constants.
+_GEOMETRY = ("body", "payload", "leg", "wheel", "hip")
+_INERTIAL = (*(name for name in SPECS if name.partition(".")[0] in _GEOMETRY and name != "wheel.grip"), "servo.armature")
+
+
+def build_batch_model(robot: Robot, physics_step: float) -> mujoco.MjModel:
+    """Return the model that all robots of a batch share."""
+
+    def extend(spec: mujoco.MjSpec) -> None:
+        option = spec.option
+        option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        option.impratio = (1.0 - CONTACT_IMPEDANCE) / CONTACT_IMPEDANCE / FRICTION_SOFTNESS
+        option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+        for name in WHEELS:
+            _add_force_sensor(spec, name)
+
+    model = build_model(robot, Parameters.nominal(robot), physics_step=physics_step, wheel_shape="capsule", extend=extend)
+    model.dof_damping[:] = 0.0
+    model.dof_solref[:] = -1.0, -GEAR_IMPEDANCE / physics_step
+    model.dof_solimp[:, :2] = GEAR_IMPEDANCE
+    model.pair_dim[:] = 3
+    model.pair_solimp[:, :2] = CONTACT_IMPEDANCE
+    model.pair_solreffriction[:] = -1.0, -CONTACT_IMPEDANCE / physics_step
+    return model
+
+
+def _add_force_sensor(spec: mujoco.MjSpec, wheel: str) -> None:
+    """Total force of the floor on a wheel, in the floor frame."""
+    geom = mujoco.mjtObj.mjOBJ_GEOM
+    sensor = spec.add_sensor(
+        name=wheel, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom, objname="floor", reftype=geom, refname=wheel
+    )
+    net_force = 3
+    sensor.intprm = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), net_force, 1]
+
+
+class RobotBatch:
+    """``count`` robots in a :class:`mujoco.batch.Batch`.
+
+    Attributes:
+        qpos, qvel, applied, warmstart, constraint, contact: live arrays (N, ...) of MuJoCo's state, inputs and results.
+        armature, gear_bound, pair_friction, pair_margin, geom_size, geom_pos, geom_quat: live model fields (N, ...); the last
+            three of the four geoms that touch.
+    """
+
+    def __init__(self, robot: Robot, count: int, physics_step: float, threads: int) -> None:
+        self.model = model = build_batch_model(robot, physics_step)
+        self._batch = batch = Batch(model, count, threads)
+        self._body = {name: model.body(name).id for name in ("body", "payload", *LEGS, *WHEELS)}
+        self.geoms = [model.geom(name).id for name in WHEELS]
+        start, stride = self.geoms[0], self.geoms[1] - self.geoms[0]
+        touching = slice(start, start + 3 * stride + 1, stride)
+        self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
+        self.applied, self.warmstart = batch.bind("qfrc_applied"), batch.bind("qacc_warmstart")
+        self.constraint, self.contact = batch.bind("qfrc_constraint"), batch.bind("sensordata")
+        self.armature, self.gear_bound = batch.expand("dof_armature"), batch.expand("dof_frictionloss")
+        self.pair_friction, self.pair_margin = batch.expand("pair_friction"), batch.expand("pair_margin")
+        self._solref = batch.expand("pair_solref")
+        self._gravity = batch.expand("opt.gravity")
+        self._mass, self._inertia = batch.expand("body_mass"), batch.expand("body_inertia")
+        self._axes = batch.expand("body_iquat")
+        self._centre, self._place = batch.expand("body_ipos"), batch.expand("body_pos")
+        self._size, self._pos, self._quat = (batch.expand(f"geom_{name}") for name in ("size", "pos", "quat"))
+        self._bound = batch.expand("geom_rbound")
+        self._inverse_weight = batch.expand("body_invweight0")
+        for derived in ("dof_invweight0", "body_subtreemass", "dof_M0"):
+            batch.expand(derived)
+        self.geom_size, self.geom_pos, self.geom_quat = (field[:, touching] for field in (self._size, self._pos, self._quat))
+        self.geom_size[:, :, 1] = CAPSULE_HALF_LENGTH
+        self._known: Array | None = None
+
+    def set_parameters(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Take the parameters (len(rows)) of robots ``rows``."""
+        inertial = np.hstack([parameters[name].reshape(len(rows), -1) for name in _INERTIAL])
+        if self._known is None:
+            self._known = np.full((len(self.qpos), inertial.shape[1]), np.nan)
+        changed = (self._known[rows] != inertial).any(axis=1)
+        self._known[rows] = inertial
+        self._gravity[rows] = gravity_in_floor(parameters)
+        if changed.any():
+            self._set_inertia(rows[changed], Parameters(parameters.values[changed]))
+        self._set_contact_springs(rows, parameters)
+
+    def _set_inertia(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        body, signs = self._body, np.array(CORNER_SIGNS)
+        self._set_body(rows, body["body"], parameters["body.mass"], parameters["body.com_offset"], parameters["body.inertia"])
+        self._mass[rows, body["payload"]] = parameters["payload.mass"]
+        self._place[rows, body["payload"]] = parameters["payload.position"]
+        self._inertia[rows, body["payload"]], self._axes[rows, body["payload"]] = principal_inertia(
+            parameters["payload.inertia"]
+        )
+        leg_inertia = parameters["leg.inertia"].reshape(-1, 4, 3)[:, :, [2, 1, 0]]  # the leg's frame has x along the leg
+        zero = np.zeros(len(rows))
+        for corner, (leg, wheel) in enumerate(zip(LEGS, WHEELS, strict=True)):
+            sign = np.array([*signs[corner], 1.0])
+            self._place[rows, body[leg]] = parameters["hip.position"] * sign
+            centre = np.stack([parameters["leg.com_along_leg"][:, corner], zero, zero], axis=1)
+            self._set_body(rows, body[leg], parameters["leg.mass"][:, corner], centre, leg_inertia[:, corner])
+            self._place[rows, body[wheel]] = np.stack([parameters["leg.length"][:, corner], zero, zero], axis=1)
+            across, spin = parameters["wheel.transverse_inertia"][:, corner], parameters["wheel.spin_inertia"][:, corner]
+            self._set_body(
+                rows, body[wheel], parameters["wheel.mass"][:, corner], 0.0, np.stack([across, spin, across], axis=1)
+            )
+        self._derive_constants(rows, parameters)
+
+    def _set_body(self, rows: NDArray[np.intp], body: int, mass: Array, centre: Array | float, inertia: Array) -> None:
+        self._mass[rows, body], self._centre[rows, body], self._inertia[rows, body] = mass, centre, inertia
+
+    def _derive_constants(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Run mj_setConst with the rotors' own inertia and the touching geoms anywhere but in their wheels' frame."""
+        self.armature[rows[:, None], 6 + np.array([0, 2, 4, 6, 1, 3, 5, 7])] = parameters["servo.armature"]
+        self.geom_pos[rows] = 0.0, CAPSULE_HALF_LENGTH, 0.0
+        self.geom_quat[rows] = np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0
+        self._batch.set_const(rows)
+        self._bound[rows[:, None], self.geoms] = BOUND
+        self.geom_quat[rows, :, 3] = 0.0
+
+    def _set_contact_springs(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Set ``solref`` to the parameters' spring and damper: MuJoCo scales it by the contact's apparent mass at home.
+
+        MuJoCo: force = (K d pos + B vel)/R with K = solref0/d^2, B = solref1/d, R = (1 - d)/d/apparent mass.
+        """
+        wheels = [self._body[name] for name in WHEELS]
+        scale = (1.0 - CONTACT_IMPEDANCE) * self._inverse_weight[rows[:, None], wheels, 0]
+        self._solref[rows, :, 0] = -scale * parameters["ground.normal_stiffness"]
+        self._solref[rows, :, 1] = -scale * parameters["ground.normal_damping"]
+
+    def divide_virtual_mass(self, divisor: float) -> None:
+        """Make the mass that the impedance adds to contacts, and its push on sliding wheels, ``divisor`` times smaller.
+
+        That push grows as the step shrinks, and MuJoCo allows no smaller impedance. Springs, dampers and friction stay as
+        they are from the next :meth:`set_parameters` on, which must leave inertia and geometry alone.
+        """
+        self._inverse_weight[:, [self._body[name] for name in WHEELS]] *= divisor
+        self._batch.expand("opt.impratio")[:] *= divisor
+
+    def stores(self) -> dict[str, RowStore]:
+        """Return what a step takes from the one before it."""
+        names = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")
+        moving = ("pair_friction", "pair_margin", "geom_size", "geom_pos", "geom_quat")
+        return {name: getattr(self, name) for name in (*names, *moving)}
+
+    def model_of(self, robot: int) -> mujoco.MjModel:
+        """Return a copy of the model with the numbers of one robot."""
+        return self._batch.get_model(robot)
+
+    def step(self) -> None:
+        """One MuJoCo step of every robot."""
+        self._batch.step()
