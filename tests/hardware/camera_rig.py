@@ -14,7 +14,7 @@ from wlr_gym.hardware.emulator.camera import true_pose
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.loop import ControlLoop
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import RobotOptions
 
 STAND = np.array([math.pi / 2] * 4 + [0.0] * 4)
 FORWARD = STAND + np.array([0.0] * 4 + [2.0] * 4)

@@ -19,7 +19,7 @@ from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.loop import ControlLoop, Phase, StoppedError
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import RobotOptions
 from wlr_gym.robot import JOINTS, load_robot
 
 loop_module.TIMED_READS = 20  # in emulated time they all take the same

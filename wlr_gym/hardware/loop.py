@@ -40,8 +40,7 @@ from wlr_gym.hardware.safety.rules import REQUESTS, Decision, Level, RobotStatus
 from wlr_gym.hardware.safety.watchdog import Guard
 from wlr_gym.hardware.sensing import Sensing
 from wlr_gym.hardware.timing import Clock, Pacer
-from wlr_gym.physics.plants.base import Sensors
-from wlr_gym.physics.plants.robot_options import RobotOptions
+from wlr_gym.physics.plants.base import RobotOptions, Sensors
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
 
 Array = NDArray[np.float64]
