@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies.bench.measure import Size
+from studies.bench.paper_method import paper_pose
 from studies.bench.vision_clutter import clutter
 from studies.bench.vision_drives import FilmedDrive, film, paper_test, skid_turn, true_slip
 from studies.bench.vision_scenes import CAMERA, HOME_HEIGHT, LENS, STRONG_LENSES, pose_error, random_pose, shown_robot
@@ -36,7 +37,6 @@ from wlr_gym.perception.scene import (
     view,
 )
 from wlr_gym.perception.vision.analysis import analyse
-from wlr_gym.perception.vision.paper_method import paper_pose
 from wlr_gym.perception.vision.tracking import Tracker, VideoFrame, locate_floor
 from wlr_gym.robot import load_robot
 

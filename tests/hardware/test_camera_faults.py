@@ -10,8 +10,7 @@ from camera_rig import FORWARD, STAND, TURN, CameraRig
 from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS
 from wlr_gym.hardware.emulator import FAULTS
 from wlr_gym.hardware.safety.camera import BACKWARD, CONTRADICTIONS, SETTLING, STALLED, TOO_OLD
-from wlr_gym.perception.vision.live_pose import DARK, FROZEN, GLARE, MEANINGS, NO_FLOOR
-from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED
+from wlr_gym.perception.vision.tracking import DARK, FROZEN, GLARE, IMPOSSIBLE, LOST, MEANINGS, MOVED, NO_FLOOR
 
 #: s for which a wrong pose may be believed.
 BOUND = 0.2

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from wlr_gym.perception.markers.boards import Board
+    from wlr_gym.perception.markers.calibration import Board, Readout
     from wlr_gym.perception.markers.camera import Camera
-    from wlr_gym.perception.markers.shutter import Readout
     from wlr_gym.perception.vision.video import Frames
 
 
@@ -104,7 +103,7 @@ def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions |
 
 def _camera(options: CameraOptions) -> int:
     from wlr_gym.base.files import refuse_existing
-    from wlr_gym.perception.markers.boards import Board
+    from wlr_gym.perception.markers.calibration import Board
     from wlr_gym.perception.markers.camera import save_camera
     from wlr_gym.perception.vision.video import Frames
 
@@ -144,8 +143,7 @@ def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[C
     from rich.console import Console
 
     from wlr_gym.base.progress import progress
-    from wlr_gym.perception.markers.calibration import calibrate, calibrate_film
-    from wlr_gym.perception.markers.shutter import Readout
+    from wlr_gym.perception.markers.calibration import Readout, calibrate, calibrate_film
 
     with progress(Console(highlight=False)) as tell:
         named = _named(options.images, frames, lambda doing, share: tell("", doing, share))
@@ -179,7 +177,7 @@ def _shutter(camera: Camera, told: Readout) -> str:
 
 def _targets(options: TargetsOptions) -> int:
     from wlr_gym.base.files import make_output_folder, refuse_existing
-    from wlr_gym.perception.markers.boards import Board
+    from wlr_gym.perception.markers.calibration import Board
     from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 

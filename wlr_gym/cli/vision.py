@@ -121,7 +121,7 @@ def run(options: VisionOptions) -> int:
 
 def _filmed(options: VisionOptions, camera: Camera, console: Console) -> VisionOptions:
     """Film, and say how to analyse the film (again); returns the options for that."""
-    from wlr_gym.perception.vision.live_camera import film
+    from wlr_gym.perception.vision.video import film
 
     if options.times is not None or options.rate is not None:
         raise InputError("--times, --rate: a live camera's frames have the times at which they come")

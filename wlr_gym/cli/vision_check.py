@@ -14,7 +14,7 @@ from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.results import print_json
 
 if TYPE_CHECKING:
-    from wlr_gym.perception.vision.sheet_check import SheetCheck
+    from wlr_gym.perception.vision.sheets import SheetCheck
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def run(options: VisionCheckOptions) -> int:
     require_package("cv2", "vision")
 
     from wlr_gym.perception.vision import load_camera, load_target
-    from wlr_gym.perception.vision.sheet_check import check_sheets
+    from wlr_gym.perception.vision.sheets import check_sheets
     from wlr_gym.perception.vision.video import read_image
 
     if options.only not in (None, "markers", "floor"):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from wlr_gym.perception.markers.boards import CHESSBOARD, Board
+from wlr_gym.perception.markers.calibration import CHESSBOARD, Board
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.vision.tracking import VideoFrame
 

@@ -10,7 +10,7 @@ from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection
 from wlr_gym.perception.markers.pose import TargetPose, circle_centres
 from wlr_gym.perception.markers.targets import load_target, ring_radii
-from wlr_gym.perception.vision.camera_motion import camera_motion
+from wlr_gym.perception.vision.self_calibration import camera_motion
 from wlr_gym.perception.vision.tracking import LOST, Sample
 
 CAMERA = Camera(width=1280, height=720, focal=(800.0, 800.0), centre=(639.5, 359.5))

@@ -7,7 +7,7 @@ from studies.bench.lab_renderer import Lab, frames, lens, true_places
 from studies.bench.vision_drives import skid_turn, true_slip
 from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.perception.vision.analysis import analyse
-from wlr_gym.perception.vision.live_pose import PoseFinder
+from wlr_gym.perception.vision.tracking import PoseFinder
 from wlr_gym.robot import load_robot
 
 SECONDS, RATE = 4.6, 15.0

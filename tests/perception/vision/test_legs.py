@@ -11,7 +11,7 @@ from test_measure import OFFSET, samples_of
 from studies.bench.vision_drives import paper_test, pose_at, skid_turn, true_slip
 from wlr_gym.data import Run
 from wlr_gym.perception.vision import slip
-from wlr_gym.perception.vision.legs import STANDING, leg_readings
+from wlr_gym.perception.vision.motion import STANDING, leg_readings
 from wlr_gym.perception.vision.slip import measure_slip
 from wlr_gym.perception.vision.tracking import angles
 from wlr_gym.robot import load_robot

@@ -20,10 +20,9 @@ from wlr_gym.perception.markers.camera import Camera, load_camera, save_camera
 from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, rotation_of
-from wlr_gym.perception.vision.live_camera import film
-from wlr_gym.perception.vision.sheets import Board, Box, Disc, board_page, pdf, svg, target_pages
+from wlr_gym.perception.vision.sheets import Board, Box, Disc, board_page, target_pages, write_pages
 from wlr_gym.perception.vision.tracking import Sample, VideoFrame
-from wlr_gym.perception.vision.video import AnnotatedVideo, Frames, annotate
+from wlr_gym.perception.vision.video import AnnotatedVideo, Frames, annotate, film
 
 TRUE = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0), distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
 
@@ -59,16 +58,17 @@ def test_printed_sheet_shows_the_target_to_scale():
     assert all(d.radius == pytest.approx(2000 * target.radii[0], abs=0.1) for d in markers)
 
 
-def test_svg_and_pdf_have_the_size_of_the_page():
+def test_svg_and_pdf_have_the_size_of_the_page(tmp_path):
     pages = target_pages(load_target("floor"))
     assert len(pages) == 4
-    assert 'width="297mm" height="210mm" viewBox="0 0 297 210"' in svg(pages[0])
-    boxes = re.findall(rb"MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf(pages))
+    pdf, *drawings = write_pages(tmp_path, "floor_markers", pages)
+    width, height = re.findall(r'<svg [^>]*height="([\d.]+)pt"|width="([\d.]+)pt"', drawings[0].read_text())[:2]
+    assert sorted(float("".join(side)) / 72 * 25.4 for side in (width, height)) == pytest.approx([210, 297], abs=1e-3)
+    boxes = re.findall(rb"MediaBox \[ ?0 0 ([\d.]+) ([\d.]+) ?\]", pdf.read_bytes())
     assert len(boxes) == 4
     assert float(boxes[0][0]) / 72 * 25.4 == pytest.approx(297, abs=1e-3)
-    file = pdf(pages)
-    start = int(file.rsplit(b"startxref\n", 1)[1].split()[0])
-    assert file[start : start + 4] == b"xref"
+    again = write_pages(tmp_path / "..", "floor_markers", pages)
+    assert [path.read_bytes() for path in (pdf, *drawings)] == [path.read_bytes() for path in again]
 
 
 def test_calibration_recovers_the_lens_from_the_printed_board():

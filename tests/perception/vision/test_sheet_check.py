@@ -6,7 +6,7 @@ from vision_studio import pose_of
 
 from wlr_gym.cli import BAD_INPUT, FAILED, OK, main
 from wlr_gym.perception.markers.camera import save_camera
-from wlr_gym.perception.vision.sheet_check import check_sheets
+from wlr_gym.perception.vision.sheets import check_sheets
 
 
 @pytest.fixture(scope="module")

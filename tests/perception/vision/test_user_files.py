@@ -8,10 +8,8 @@ from board_films import board_film
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.perception.markers.boards import CHESSBOARD, LEGACY, Board
-from wlr_gym.perception.markers.calibration import calibrate, calibrate_film
+from wlr_gym.perception.markers.calibration import CHESSBOARD, LEGACY, Board, Readout, calibrate, calibrate_film
 from wlr_gym.perception.markers.camera import Camera, load_camera
-from wlr_gym.perception.markers.shutter import Readout
 from wlr_gym.perception.vision.video import Frames, VideoFile
 
 LENS = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0))

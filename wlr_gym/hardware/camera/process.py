@@ -26,10 +26,8 @@ from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS, RenderedCamera
 from wlr_gym.hardware.camera.slot import Slot
 from wlr_gym.hardware.camera.stamps import StampClock
 from wlr_gym.perception.markers.detection import Image
-from wlr_gym.perception.vision.live_camera import open_device
-from wlr_gym.perception.vision.live_pose import PoseFinder
-from wlr_gym.perception.vision.tracking import VideoFrame
-from wlr_gym.perception.vision.video import grey
+from wlr_gym.perception.vision.tracking import PoseFinder, VideoFrame
+from wlr_gym.perception.vision.video import grey, open_device
 from wlr_gym.robot import Robot
 
 #: How much less urgent than the control loop it is.

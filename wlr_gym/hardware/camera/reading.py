@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.hardware.camera.config import CameraFile
-from wlr_gym.perception.vision.live_pose import MEANINGS
-from wlr_gym.perception.vision.tracking import OK, PARTIAL, Sample
+from wlr_gym.perception.vision.tracking import MEANINGS, OK, PARTIAL, Sample
 
 Array = NDArray[np.float64]
 
@@ -31,7 +30,7 @@ class CameraReading:
     Attributes:
         number: of frames until this one; 0 = none yet.
         time: s, mid-exposure. arrival: when it was there. found: when its pose was. All on this computer's monotonic clock.
-        status: ``ok``, ``partial``, or a key of :data:`wlr_gym.perception.vision.live_pose.MEANINGS`.
+        status: ``ok``, ``partial``, or a key of :data:`wlr_gym.perception.vision.tracking.MEANINGS`.
         pose: (6,) x, y, z (m), yaw, pitch, roll (rad) of the body in the floor frame; NaN without one.
         covariance: (6, 6) of it.
     """

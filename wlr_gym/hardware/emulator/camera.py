@@ -14,8 +14,7 @@ from wlr_gym.hardware.camera.reading import CameraReading, reading_of
 from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS, Exposure, RenderedCamera
 from wlr_gym.hardware.camera.stamps import StampClock
 from wlr_gym.hardware.emulator.machine import Machine
-from wlr_gym.perception.vision.live_pose import PoseFinder
-from wlr_gym.perception.vision.tracking import VideoFrame
+from wlr_gym.perception.vision.tracking import PoseFinder, VideoFrame
 from wlr_gym.robot import LEG_SLICE
 
 #: s between two poses in the feed of an emulated robot in real time.

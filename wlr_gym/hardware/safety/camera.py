@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from wlr_gym.hardware.camera.reading import CameraReading
 from wlr_gym.hardware.safety.rules import CameraStatus
 from wlr_gym.hardware.timing import percentiles
-from wlr_gym.perception.vision.live_pose import MEANINGS
+from wlr_gym.perception.vision.tracking import MEANINGS
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE, Robot
 
 Array = NDArray[np.float64]

@@ -33,7 +33,7 @@ from wlr_gym.hardware.ports import PortInUseError, is_pseudo_terminal
 from wlr_gym.hardware.safety.camera import LARGEST_AGE, LARGEST_SIGMA
 from wlr_gym.hardware.servos import JointMap, Servos
 from wlr_gym.hardware.timing import Clock, processor_share
-from wlr_gym.perception.vision.live_pose import MEANINGS, NO_FLOOR
+from wlr_gym.perception.vision.tracking import MEANINGS, NO_FLOOR
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 #: Oldest firmware that is driven.

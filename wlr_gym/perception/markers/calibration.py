@@ -1,20 +1,256 @@
-"""Calibrate a camera from views of a board: its lens, and from a film of a moving board its shutter."""
+"""Calibrate a camera from views of a board (ChArUco, chessboard): its lens, and from a film of a moving board its shutter.
+
+A row v of a frame at time t shows the board where it is at t + readout (v / height - 1/2). With the board's motion known from
+the frames before and after, what the corners miss of a pose that all rows share is linear in the readout.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError
-from wlr_gym.perception.markers.boards import MINIMUM_CORNERS, Board
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.perception.markers.camera import Camera, Quality
-from wlr_gym.perception.markers.shutter import LONGEST, BoardView, Readout, at_frame_time, board_motion, readout_of
 
 Array = NDArray[np.float64]
+
+#: Kinds of boards: with coded markers; the same as OpenCV drew them before 4.6 (differs with an even number of rows); plain.
+CHARUCO, LEGACY, CHESSBOARD = "charuco", "charuco-legacy", "chessboard"
+KINDS = (CHARUCO, LEGACY, CHESSBOARD)
+#: Corners that a view needs, and that a board must have.
+MINIMUM_CORNERS, FEWEST_CORNERS = 12, 6
+#: A chessboard is looked for in a picture of at most so many pixels along its longer side, then refined in the whole one.
+_CHESS_SIDE = 1280
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board of squares.
+
+    Attributes:
+        columns, rows: squares along and across. square: their side (m).
+        kind: one of :data:`KINDS`. marker: side of a marker (m); None = 0.7 of a square.
+        dictionary: of the markers, as OpenCV names it without ``DICT_``, e.g. ``5X5_100``.
+    """
+
+    columns: int = 9
+    rows: int = 6
+    square: float = 0.028
+    kind: str = CHARUCO
+    marker: float | None = None
+    dictionary: str = "5X5_100"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise unknown_name("board", self.kind, KINDS)
+        if min(self.columns, self.rows) < 2 or self.corners < FEWEST_CORNERS:
+            raise InputError(
+                f"a board of {self.columns} x {self.rows} squares has {max(0, self.corners)} inner corners; at least "
+                f"{FEWEST_CORNERS} are needed"
+            )
+        if self.marker is not None and not 0 < self.marker < self.square:
+            raise InputError(f"marker = {self.marker:g} m: expected more than 0 and less than a square ({self.square:g} m)")
+        if self.kind != CHESSBOARD:
+            known, needed = len(self._words.bytesList), self.columns * self.rows // 2
+            if needed > known:
+                raise InputError(
+                    f"a board of {self.columns} x {self.rows} squares has {needed} markers, but dictionary "
+                    f"{self.dictionary} has {known}; name the one that was printed"
+                )
+
+    @property
+    def corners(self) -> int:
+        """Number of inner corners."""
+        return (self.columns - 1) * (self.rows - 1)
+
+    @cached_property
+    def _words(self) -> Any:
+        import cv2
+
+        names = {name.removeprefix("DICT_"): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
+        if self.dictionary.upper() not in names:
+            raise unknown_name("dictionary", self.dictionary, names)
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, names[self.dictionary.upper()]))
+
+    def aruco(self) -> Any:
+        """Return OpenCV's board of the coded kinds."""
+        import cv2
+
+        marker = 0.7 * self.square if self.marker is None else self.marker
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, marker, self._words)
+        board.setLegacyPattern(self.kind == LEGACY)
+        return board
+
+    @cached_property
+    def places(self) -> NDArray[np.float32]:
+        """(C, 3) m, inner corners, row by row."""
+        y, x = np.mgrid[1 : self.rows, 1 : self.columns].reshape(2, -1)
+        return np.column_stack([self.square * x, self.square * y, np.zeros(len(x))]).astype(np.float32)
+
+    @cached_property
+    def _detector(self) -> Any:
+        import cv2
+
+        return cv2.aruco.CharucoDetector(self.aruco())
+
+    def find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Places (N, 3) m and pixels (N, 2) of the corners in a picture; None = too few are seen."""
+        if self.kind == CHESSBOARD:
+            pixels = _chess_corners(image, self.columns - 1, self.rows - 1)
+            return None if pixels is None else (self.places, pixels)
+        corners, ids, _, _ = self._detector.detectBoard(image)
+        if ids is None or len(ids) < min(MINIMUM_CORNERS, self.corners):
+            return None
+        seen = np.asarray(ids, np.intp).reshape(-1)
+        return self.places[seen], np.asarray(corners, np.float32).reshape(-1, 2)
+
+
+def _chess_corners(image: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.float32] | None:
+    import cv2
+
+    scale = min(1.0, _CHESS_SIDE / max(image.shape))
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image
+    found, corners = cv2.findChessboardCornersSB(small, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
+    if not found:
+        return None
+    pixels = (np.asarray(corners, np.float32).reshape(-1, 2) + 0.5) / scale - 0.5
+    if scale == 1:
+        return pixels.astype(np.float32)
+    pixels = np.ascontiguousarray(pixels, np.float32)
+    apart = float(np.linalg.norm(np.diff(pixels.reshape(rows, columns, 2), axis=1), axis=2).min())
+    reach = int(np.clip(apart / 4, 2, 15))
+    end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.001)
+    return np.asarray(cv2.cornerSubPix(image, pixels, (reach, reach), (-1, -1), end), np.float32)
+
+
+# --- the shutter ------------------------------------------------------------------------------------------------------
+
+
+#: s, 1 sigma up to which a readout counts as known; from where on a shutter is not global, and by so many sigmas.
+LARGEST_STD, LEAST_READOUT, SURE = 0.00025, 0.001, 4.0
+LONGEST = 0.1  # s; longer ones are not readouts
+#: Share of the image's width that corners may move by from the frame before to the frame after; more is another board.
+_LARGEST_MOTION = 0.5
+_FEWEST_VIEWS = 3
+_SINGULAR = 1e12
+_LENS = 8  # focal lengths, centre, k1, k2, p1, p2
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """Corners of a board in one frame: time s, places (N, 3) m on the board, pixels (N, 2)."""
+
+    name: str
+    time: float
+    places: Array
+    pixels: Array
+
+
+@dataclass(frozen=True)
+class Readout:
+    """s from the first row to the last, and 1 sigma; infinite where no view tells."""
+
+    value: float = 0.0
+    std: float = math.inf
+
+    @property
+    def known(self) -> float | None:
+        """The readout to write into a camera file, 0 = a global shutter; None = these views do not tell."""
+        if not (self.std <= LARGEST_STD and abs(self.value) < LONGEST):
+            return None
+        return self.value if abs(self.value) > max(LEAST_READOUT, SURE * self.std) else 0.0
+
+
+def board_motion(before: BoardView, view: BoardView, after: BoardView, camera: Camera) -> Array | None:
+    """Velocity (N, 2) px/s of a view's corners, from the views before and after; None where they do not belong together."""
+    step = after.time - before.time
+    poses = [_board_pose(v, camera) for v in (before, view, after)]
+    if step <= 0 or any(pose is None for pose in poses):
+        return None
+    first, middle, last = (pose for pose in poses if pose is not None)
+    first[:3], last[:3] = _nearest_turn(first[:3], middle[:3]), _nearest_turn(last[:3], middle[:3])
+    velocity: Array = (_slopes(view, middle, camera)[1][:, :6] @ ((last - first) / step)).reshape(-1, 2)
+    return velocity if np.abs(velocity).max() * step < _LARGEST_MOTION * camera.width else None
+
+
+def readout_of(views: Sequence[tuple[BoardView, Array]], camera: Camera) -> Readout:
+    """Readout that explains best what the corners miss; its sigma from what every view does to it (jackknife).
+
+    Args:
+        views: with the velocities (N, 2) px/s of their corners. camera: its lens.
+    """
+    if len(views) < _FEWEST_VIEWS:
+        return Readout()
+    columns = [_without_pose(view, velocity, camera) for view, velocity in views]
+    sizes = np.linalg.norm(np.concatenate(columns), axis=0)
+    scaled = [part / np.maximum(sizes, 1e-12) for part in columns]
+    products = np.stack([part.T @ part for part in scaled])  # a lens can look like a shutter: both are solved for
+    total = products.sum(axis=0)
+    if np.linalg.cond(total[1:, 1:]) > _SINGULAR:
+        return Readout()
+    values = [_solved(total), *(_solved(total - product) for product in products)]
+    value, *without = np.array(values) * sizes[0] / sizes[1]
+    count = len(without)
+    return Readout(float(value), math.sqrt((count - 1) ** 2 / count) * float(np.std(without)))
+
+
+def _solved(products: Array) -> float:
+    return float(np.linalg.solve(products[1:, 1:], products[1:, 0])[0])
+
+
+def at_frame_time(view: BoardView, velocity: Array, camera: Camera, readout: float) -> BoardView:
+    """The view as a shutter that is open for all rows at the frame's time would show it."""
+    return replace(view, pixels=view.pixels - readout * _rows(view, camera) * velocity)
+
+
+def _rows(view: BoardView, camera: Camera) -> Array:
+    return view.pixels[:, [1]] / camera.height - 0.5
+
+
+def _without_pose(view: BoardView, velocity: Array, camera: Camera) -> Array:
+    """(2 N, 2 + L) px: what the corners miss, and their derivatives by readout and lens, less what a pose can explain."""
+    pose = _board_pose(view, camera)
+    if pose is None:
+        return np.zeros((0, 2 + _LENS))
+    predicted, slopes = _slopes(view, pose, camera)
+    basis = np.linalg.qr(slopes[:, :6])[0]
+    columns = np.column_stack([(view.pixels - predicted).ravel(), (_rows(view, camera) * velocity).ravel(), slopes[:, 6:]])
+    return columns - basis @ (basis.T @ columns)
+
+
+def _board_pose(view: BoardView, camera: Camera) -> Array | None:
+    """(6,) rotation vector (rad) and position (m) of the board in the camera frame."""
+    import cv2
+
+    solved, turn, place = cv2.solvePnP(view.places, view.pixels, camera.matrix, np.array(camera.distortion))
+    return np.concatenate([turn.ravel(), place.ravel()]).astype(np.float64) if solved else None
+
+
+def _slopes(view: BoardView, pose: Array, camera: Camera) -> tuple[Array, Array]:
+    """Pixels (N, 2) of the corners at a pose, and their derivatives (2 N, 6 + L) by it and by the lens without k3."""
+    import cv2
+
+    found = cv2.projectPoints(view.places, pose[:3], pose[3:], camera.matrix, np.array(camera.distortion))
+    return np.asarray(found[0], np.float64).reshape(-1, 2), np.asarray(found[1], np.float64)[:, : 6 + _LENS]
+
+
+def _nearest_turn(turn: Array, other: Array) -> Array:
+    """The rotation vector of the same turn that is nearest to another one."""
+    angle = float(np.linalg.norm(turn))
+    if angle < 1e-9:
+        return turn
+    turns = [turn * (1 + 2 * math.pi * k / angle) for k in (-1, 0, 1)]
+    return min(turns, key=lambda found: float(np.linalg.norm(found - other)))
+
+
+# --- lens and shutter together ----------------------------------------------------------------------------------------
+
 
 MINIMUM_VIEWS = 6
 #: A view whose corners miss by more than this many times the median of all views is left out.

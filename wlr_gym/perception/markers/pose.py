@@ -12,7 +12,8 @@ which follows from its dual conic M diag(1, 1, -1) M^T, M = [r e1, r e2, C], so 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 from typing import Any
@@ -23,9 +24,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.compiled import inner_kernel
 from wlr_gym.perception.markers.camera import Camera, distort
-from wlr_gym.perception.markers.detection import Detection
-from wlr_gym.perception.markers.rings import solve_normal
-from wlr_gym.perception.markers.targets import Target, ring_radii
+from wlr_gym.perception.markers.detection import Detection, solve_normal
+from wlr_gym.perception.markers.targets import CODE_NAMES, Target, ring_radii
 
 Array = NDArray[np.float64]
 
@@ -354,3 +354,42 @@ def _expected(centre: Any, rotation: Any, radius: Any, camera: Any, ellipse: Any
         ellipse[2 + axis] = ((ru - u) * a + (du - u) * b) / 1e-5
         ellipse[4 + axis] = ((rv - v) * a + (dv - v) * b) / 1e-5
     return True
+
+
+# --- say why a target is not found among the markers of a picture: wrong sheets, swapped ones, too few ----------------
+
+
+def sheet_fault(detections: Sequence[Detection], target: Target, camera: Camera) -> str:
+    """Why ``target`` is not found, in words that end a sentence; what was seen is named."""
+    count = len(target.markers)
+    seen = Counter(CODE_NAMES[detection.code] for detection in detections)
+    own = Counter(marker.code for marker in target.markers)
+    found = ", ".join(f"{number} {name}" for name, number in sorted(seen.items())) or "no marker"
+    if not any(seen[code] for code in own):
+        others = f"; {found} seen: are the sheets or the files of floor and robot swapped?" if seen else ""
+        return f"0 of the {count} markers of '{target.name}' seen{others}"
+    key = target.markers[target.key].code
+    if seen[key] > 1:
+        return f"{found} seen, but '{target.name}' has one {key}: is a sheet of it there twice?"
+    swaps = list(_swaps(detections, target, camera))
+    if swaps:
+        names = " or ".join(f"'{target.markers[target.key].name}' and '{name}'" for name in swaps)
+        return f"the sheets {names} of '{target.name}' lie in each other's places"
+    together = sum(seen[code] for code in own)
+    return (
+        f"{together} of the {count} markers of '{target.name}' seen, and at least 4 must fit together (check their positions "
+        "in the target file, and the light)"
+    )
+
+
+def _swaps(detections: Sequence[Detection], target: Target, camera: Camera) -> Iterator[str]:
+    """Names of the markers that, with the key's sheet in their place and theirs in its, fit what is seen."""
+    key = target.key
+    for other, marker in enumerate(target.markers):
+        if other == key:
+            continue
+        markers = list(target.markers)
+        markers[key] = markers[key].model_copy(update={"code": marker.code})
+        markers[other] = marker.model_copy(update={"code": target.markers[key].code})
+        if find_laid_target(detections, target.model_copy(update={"markers": tuple(markers)}), camera):
+            yield marker.name

@@ -3,6 +3,8 @@
 Frames: *start* (the floor frame as the body stood at the reset: x along its heading), *heading* (turns with the body about the
 floor's normal; x along the wheels, y to the left in the floor), *body*. Velocities are estimated in the heading frame, each
 direction by a filter of its own (:mod:`wlr_gym.perception.observer.kalman`), heading and gyroscope bias by a third.
+
+A step predicts (the gyroscope turns, the accelerometer drives, the uncertainty grows) and takes in wheels, camera and flow.
 """
 
 from __future__ import annotations
@@ -12,14 +14,531 @@ from typing import Any
 
 from numba import njit
 
-from wlr_gym.perception.observer import kalman
-from wlr_gym.perception.observer.camera import see_camera
-from wlr_gym.perception.observer.contacts import LEAST_LOAD, carry, look, pull
-from wlr_gym.perception.observer.correction import RADIUS, guess_velocity, see_rest, see_rolling
-from wlr_gym.perception.observer.flow import ROTATION, SCALE, see_flow
+from wlr_gym.perception.observer.kalman import (
+    LEAK,
+    LENS,
+    RADIUS,
+    VELOCITY,
+    correct,
+    correct_yaw,
+    guess_velocity,
+    predict_direction,
+    see_position,
+    see_rest,
+    see_rolling,
+    see_velocity,
+)
 from wlr_gym.perception.observer.layout import ESTIMATE, SENSOR
-from wlr_gym.perception.observer.prediction import measure_force, move, sense_force, settle, spread, turn
 from wlr_gym.perception.observer.trust import gather, judge
+from wlr_gym.robot import FIRST_WHEEL
+
+_WHEEL_RATE = SENSOR.joint_velocity + FIRST_WHEEL
+_WHEEL_EFFORT = SENSOR.joint_effort + FIRST_WHEEL
+#: N. Less than this counts as a wheel in the air when something is divided by its load.
+LEAST_LOAD = 0.5
+
+
+@njit(cache=True, nogil=True)
+def look(robot: Any, sensors: Any, r: Any) -> None:
+    """Find heading, left and contact points for the floor normal ``r.normal``, and how each wheel rolls.
+
+    ``r.rolling[i]`` is the velocity of the body origin along heading and left with which wheel ``i`` would not slip;
+    ``r.lift[i]`` that along the normal with which it would stay on the floor (equations of :mod:`wlr_gym.robot.slip`).
+
+    Args:
+        robot: geometry.
+        sensors: (SENSOR_LAYOUT.width,) joint angles and rates are read.
+        r: record of the robot; reads ``normal``, ``rate`` (body's angular velocity, body frame).
+    """
+    nx, ny, nz = r.normal[0], r.normal[1], r.normal[2]
+    scale = 1.0 / math.sqrt(nx * nx + nz * nz + 1e-12)
+    hx, hz = nz * scale, -nx * scale
+    r.heading[0], r.heading[1], r.heading[2] = hx, 0.0, hz
+    r.left[0], r.left[1], r.left[2] = ny * hz, nz * hx - nx * hz, -ny * hx
+    wx, wy, wz = r.rate[0], r.rate[1], r.rate[2]
+    reach = robot.wheel_radius * scale
+    for i in range(4):
+        leg_rate, wheel_rate = sensors[SENSOR.joint_velocity + i], sensors[_WHEEL_RATE + i]
+        r.leg[i, 0], r.leg[i, 1] = math.cos(sensors[i]), math.sin(sensors[i])
+        leg_x, leg_z = robot.leg_length * r.leg[i, 0], -robot.leg_length * r.leg[i, 1]
+        rim_x, rim_z = -reach * nx, -reach * nz
+        x = robot.hip[i, 0] + leg_x + rim_x
+        y = robot.hip[i, 1]
+        z = robot.hip[i, 2] + leg_z + rim_z
+        ux = wy * z - wz * y + leg_rate * (leg_z + rim_z) + wheel_rate * rim_z
+        uy = wz * x - wx * z
+        uz = wx * y - wy * x - leg_rate * (leg_x + rim_x) - wheel_rate * rim_x
+        r.point[i, 0] = hx * x + hz * z
+        r.point[i, 1] = r.left[0] * x + r.left[1] * y + r.left[2] * z
+        r.point[i, 2] = nx * x + ny * y + nz * z
+        r.rolling[i, 0] = -(hx * ux + hz * uz)
+        r.rolling[i, 1] = -(r.left[0] * ux + r.left[1] * uy + r.left[2] * uz)
+        r.lift[i] = -(nx * ux + ny * uy + nz * uz)
+
+
+@njit(cache=True, nogil=True)
+def _centre_of_mass(robot: Any, r: Any) -> Any:
+    """Centre of mass of the whole robot along heading, left and normal, m."""
+    x, y, z = robot.body_mass * robot.body_com[0], robot.body_mass * robot.body_com[1], robot.body_mass * robot.body_com[2]
+    assembly = robot.leg_mass + robot.wheel_mass
+    moment = robot.leg_mass * robot.leg_com + robot.wheel_mass * robot.leg_length
+    for i in range(4):
+        x += assembly * robot.hip[i, 0] + moment * r.leg[i, 0]
+        y += assembly * robot.hip[i, 1]
+        z += assembly * robot.hip[i, 2] - moment * r.leg[i, 1]
+    x, y, z = x / robot.mass, y / robot.mass, z / robot.mass
+    return (
+        r.heading[0] * x + r.heading[2] * z,
+        r.left[0] * x + r.left[1] * y + r.left[2] * z,
+        r.normal[0] * x + r.normal[1] * y + r.normal[2] * z,
+    )
+
+
+@njit(cache=True, nogil=True)
+def carry(robot: Any, r: Any) -> Any:
+    """Find the normal forces that hold the robot: ``r.load`` (4,) N; return the tilt of the floor they imply.
+
+    Four feet on a floor are one too many for statics; their springs decide. The body sinks into the springs as a plane:
+    N_i = k max(0, a + b x_i + c y_i - z_i), with a, b, c such that force and both moments about the centre of mass balance
+    those of the measured acceleration (the robot is taken not to tumble). It is the engine's own rest state. Corrected
+    equations (16), (17) of the paper are its level case with legs pairwise equal.
+
+    Returns:
+        b, c: slope of the true floor over the assumed one along heading and left; 0, 0 when fewer than three wheels carry.
+    """
+    fx, fy, fz = r.force[0], r.force[1], max(r.force[2], 1.0)
+    cx, cy, cz = _centre_of_mass(robot, r)
+    height = cz - 0.25 * (r.point[0, 2] + r.point[1, 2] + r.point[2, 2] + r.point[3, 2])
+    weight = robot.mass * fz / robot.stiffness
+    mx = weight * cx - robot.mass * height * fx / robot.stiffness
+    my = weight * cy - robot.mass * height * fy / robot.stiffness
+    r.carries[:] = 1.0
+    a, b, c = 0.0, 0.0, 0.0
+    for _ in range(4):
+        n, sx, sy, sxx, sxy, syy, sz, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(4):
+            on = r.carries[i]
+            x, y, z = r.point[i, 0], r.point[i, 1], r.point[i, 2]
+            n += on
+            sx += on * x
+            sy += on * y
+            sxx += on * x * x
+            sxy += on * x * y
+            syy += on * y * y
+            sz += on * z
+            sxz += on * x * z
+            syz += on * y * z
+        if n < 2.5:
+            break
+        p, q, s = weight + sz, mx + sxz, my + syz
+        k00, k01, k02 = sxx * syy - sxy * sxy, sy * sxy - sx * syy, sx * sxy - sy * sxx
+        k11, k12, k22 = n * syy - sy * sy, sx * sy - n * sxy, n * sxx - sx * sx
+        inverse = 1.0 / (n * k00 + sx * k01 + sy * k02)
+        a = (k00 * p + k01 * q + k02 * s) * inverse
+        b = (k01 * p + k11 * q + k12 * s) * inverse
+        c = (k02 * p + k12 * q + k22 * s) * inverse
+        changed = False
+        for i in range(4):
+            on = 1.0 if a + b * r.point[i, 0] + c * r.point[i, 1] > r.point[i, 2] else 0.0
+            changed = changed or on != r.carries[i]
+            r.carries[i] = on
+        if not changed:
+            break
+    total = 0.0
+    for i in range(4):
+        r.load[i] = max(0.0, robot.stiffness * (a + b * r.point[i, 0] + c * r.point[i, 1] - r.point[i, 2]))
+        total += r.load[i]
+    share = robot.mass * fz / max(total, LEAST_LOAD)
+    for i in range(4):
+        r.load[i] *= share
+    return b, c
+
+
+@njit(cache=True, nogil=True)
+def pull(robot: Any, sensors: Any, r: Any) -> None:
+    """Find the traction of every wheel, ``r.traction`` (4,) N: effort less gear friction and spin inertia, over the radius.
+
+    Equations (25) to (28) of the paper as corrected.
+    """
+    for i in range(4):
+        rate = sensors[_WHEEL_RATE + i]
+        spin = rate + sensors[SENSOR.joint_velocity + i] + r.rate[1]
+        spin_up = (spin - r.spin[i]) / robot.period
+        dry = robot.gear_friction * math.tanh(rate / robot.velocity_count)
+        torque = sensors[_WHEEL_EFFORT + i] - dry - robot.spin_inertia * spin_up
+        r.traction[i] = torque / robot.wheel_radius
+        r.spin[i] = spin
+
+
+# --- prediction -------------------------------------------------------------------------------------------------------
+
+
+# What the prediction takes for granted; 1 sigma where it is an uncertainty. Chosen on simulated runs: docs/slip_observer.md.
+#: Share of the change of an IMU reading from step to step that one sample per step misses.
+_ALIAS = 0.25
+#: rad/s per root second: random walk of the gyroscope's bias.
+_GYRO_WANDER = 1e-5
+#: s: how fast the tilt follows the legs.
+_SETTLE = 1.5
+#: s: low-pass of the friction demand.
+_SMOOTH = 0.06
+
+
+@njit(cache=True, nogil=True)
+def rate_noise(robot: Any, changed: Any) -> Any:
+    """Variance (rad2/s2) of a gyroscope's reading that has changed by so much, rad/s."""
+    missed = _ALIAS * changed
+    return robot.gyro_noise**2 + missed * missed
+
+
+@njit(cache=True, nogil=True)
+def shaking(robot: Any, changed: Any, square: Any) -> Any:
+    """Variance (m2/s4) of what one reading of the specific force per step misses.
+
+    Args:
+        robot: how much, learned. changed: by how much it has changed, m/s2. square: mean square of the legs' rates.
+    """
+    return (robot.alias * changed) ** 2 + robot.velocity_legs**2 * square
+
+
+@njit(cache=True, nogil=True)
+def leak_noise(robot: Any, square: Any) -> Any:
+    """Variance per s (m2/s5) of the walk of the accelerometer's leak; ``square``: mean square of the legs' rates."""
+    return robot.leak_wander**2 + robot.leak_legs**2 * square
+
+
+@njit(cache=True, nogil=True)
+def turn(robot: Any, r: Any) -> None:
+    """Turn floor normal and heading with the gyroscope."""
+    before, dt = r.yaw_rate, robot.period
+    wx, wy, wz = r.rate[0], r.rate[1], r.rate[2]
+    for k in range(3):
+        r.last_rate[k] = r.rate[k]
+        r.rate[k] = r.seen[SENSOR.gyro + k]
+    mx, my, mz = (0.5 * dt * (r.rate[0] + wx), 0.5 * dt * (r.rate[1] + wy), 0.5 * dt * (r.rate[2] + wz))
+    nx, ny, nz = r.normal[0], r.normal[1], r.normal[2]
+    x, y, z = nx - (my * nz - mz * ny), ny - (mz * nx - mx * nz), nz - (mx * ny - my * nx)
+    set_normal(r, x, y, z)
+    r.yaw_rate = r.normal[0] * r.rate[0] + r.normal[1] * r.rate[1] + r.normal[2] * r.rate[2] - r.gyro_bias
+    turned = dt * ((0.5 - robot.lag) * before + (0.5 + robot.lag) * r.yaw_rate)
+    r.yaw += turned
+    r.turned = turned
+    c = r.yaw_covariance
+    c[0] += dt * (dt * c[2] - 2.0 * c[1]) + dt * dt * rate_noise(robot, r.yaw_rate - before)
+    c[1] -= dt * c[2]
+    c[2] += _GYRO_WANDER**2 * dt
+
+
+@njit(cache=True, nogil=True)
+def set_normal(r: Any, x: float, y: float, z: float) -> None:
+    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+    r.normal[0], r.normal[1], r.normal[2] = x * scale, y * scale, z * scale
+
+
+@njit(cache=True, nogil=True)
+def measure_force(r: Any) -> None:
+    """Turn the accelerometer's reading into the heading frame: ``r.last_force``."""
+    x, y, z = r.seen[SENSOR.accelerometer], r.seen[SENSOR.accelerometer + 1], r.seen[SENSOR.accelerometer + 2]
+    r.last_force[0] = r.heading[0] * x + r.heading[2] * z
+    r.last_force[1] = r.left[0] * x + r.left[1] * y + r.left[2] * z
+    r.last_force[2] = r.normal[0] * x + r.normal[1] * y + r.normal[2] * z
+
+
+@njit(cache=True, nogil=True)
+def sense_force(robot: Any, r: Any) -> None:
+    """Mean specific force over the step, how much it changed along the floor, and friction demand."""
+    x, y, z = r.last_force[0], r.last_force[1], r.last_force[2]
+    measure_force(r)
+    old, new = 0.5 - robot.lag, 0.5 + robot.lag
+    r.force[0] = old * x + new * r.last_force[0]
+    r.force[1] = old * y + new * r.last_force[1]
+    r.force[2] = old * z + new * r.last_force[2]
+    along = math.sqrt((r.force[0] - r.leak[0]) ** 2 + (r.force[1] - r.leak[1]) ** 2)
+    demand = along / max(r.force[2], 0.2 * robot.gravity)
+    r.demand += (1.0 - math.exp(-robot.period / _SMOOTH)) * (demand - r.demand)
+    r.shaken = math.sqrt((r.last_force[0] - x) ** 2 + (r.last_force[1] - y) ** 2)
+
+
+@njit(cache=True, nogil=True)
+def move(robot: Any, r: Any) -> None:
+    """Carry pose and velocity over the step."""
+    dt, turned = robot.period, r.turned
+    # in the frame of the step's middle: turned by half, kicked, turned by half
+    ch, sh = math.cos(0.5 * turned), math.sin(0.5 * turned)
+    c, s = ch * ch - sh * sh, 2.0 * ch * sh
+    gx, gy = r.slope[0], r.slope[1]
+    r.slope[0], r.slope[1] = c * gx + s * gy, c * gy - s * gx
+    ax = r.force[0] - r.leak[0] - 0.5 * (gx + r.slope[0])
+    ay = r.force[1] - r.leak[1] - 0.5 * (gy + r.slope[1])
+    r.kick[0], r.kick[1] = ax, ay
+    r.pointing[0], r.pointing[1] = math.cos(r.yaw), math.sin(r.yaw)
+    cm, sm = ch * r.pointing[0] + sh * r.pointing[1], ch * r.pointing[1] - sh * r.pointing[0]
+    vx, vy = r.velocity[0], r.velocity[1]
+    r.last_velocity[0], r.last_velocity[1] = vx, vy
+    bx, by = ch * vx + sh * vy, ch * vy - sh * vx
+    ex, ey = bx + dt * ax, by + dt * ay
+    r.velocity[0], r.velocity[1] = ch * ex + sh * ey, ch * ey - sh * ex
+    mx, my = 0.5 * dt * (bx + ex), 0.5 * dt * (by + ey)
+    r.position[0] += cm * mx - sm * my
+    r.position[1] += sm * mx + cm * my
+    kick_x, kick_y = dt * (cm * ax - sm * ay), dt * (sm * ax + cm * ay)
+    length = r.raw.shape[0]
+    now, last = int(r.tick) % length, int(r.tick - 1.0) % length
+    r.raw[now, 0] = r.raw[last, 0] + dt * (r.raw_velocity[0] + 0.5 * kick_x)
+    r.raw[now, 1] = r.raw[last, 1] + dt * (r.raw_velocity[1] + 0.5 * kick_y)
+    r.raw[now, 2] = r.raw[last, 2] + turned
+    r.raw_velocity[0] += kick_x
+    r.raw_velocity[1] += kick_y
+
+
+@njit(cache=True, nogil=True)
+def spread(robot: Any, r: Any) -> None:
+    """Carry the uncertainty over the step."""
+    dt = robot.period
+    square = 0.0
+    for i in range(4):
+        square += 0.25 * r.seen[SENSOR.joint_velocity + i] ** 2
+    r.legs = math.sqrt(square)
+    # how bias and slope share what the accelerometer read at first is a guess, which shows as the robot turns
+    guess = (robot.leak_turn * r.guess * r.turned) ** 2
+    r.inclined = min(1.0, (r.slope[0] ** 2 + r.slope[1] ** 2) / robot.accel_bias**2)
+    wander = leak_noise(robot, square) * dt + guess
+    velocity_noise = dt * dt * (robot.accel_noise**2 + r.wander[0] * shaking(robot, r.shaken, square))
+    for k in range(2):
+        predict_direction(r.covariance[k], dt, velocity_noise, r.wander[1] * wander)
+
+
+@njit(cache=True, nogil=True)
+def settle(robot: Any, r: Any) -> None:
+    """Loads of the wheels; let the tilt follow the legs."""
+    b, c = carry(robot, r)
+    share = robot.period / _SETTLE
+    b, c = share * b, share * c
+    set_normal(
+        r,
+        r.normal[0] - b * r.heading[0] - c * r.left[0],
+        r.normal[1] - c * r.left[1],
+        r.normal[2] - b * r.heading[2] - c * r.left[2],
+    )
+
+
+# --- camera: late frames, frames that are not believed, a camera that has been moved ----------------------------------
+
+
+#: Squared normalised innovation beyond which a frame is refused.
+CAMERA_GATE = 20.0
+#: s: refused frames that are off by the same for so long say that the camera has been moved.
+_CAMERA_PATIENCE = 0.25
+#: s: frames that steadily move away for so long say that the robot does, whatever wheels and IMU say.
+_LONG_PATIENCE = 0.5
+#: m, rad: what counts as the same.
+_SAME = 0.006
+_SAME_YAW = 0.03
+#: s without a frame after which nothing is said about the last one.
+_CAMERA_SILENCE = 0.5
+
+
+@njit(cache=True, nogil=True)
+def see_camera(robot: Any, sensors: Any, r: Any) -> None:
+    """Take in a camera pose where there is a new one; it shows where the robot was ``camera_age`` ago.
+
+    Frames come in two ways: as they are, and in the frame of a camera that has been moved (``r.anchor``). A frame that fits
+    neither is refused. When frames have been off by the same for a while, it is the camera that has been moved: a robot does
+    not jump. The estimate then stays, and only motion is learned from the camera. When they steadily move away, it is the
+    robot that slides. A frame that repeats the last one to the last bit is no new picture.
+    """
+    r.frame_time += robot.period
+    x, y, yaw = sensors[SENSOR.camera_pose], sensors[SENSOR.camera_pose + 1], sensors[SENSOR.camera_pose + 2]
+    if robot.camera == 0.0 or not r.seen[SENSOR.camera_is_new] > 0.5 or not math.isfinite(x + y + yaw):
+        if r.frame_time > _CAMERA_SILENCE:
+            r.camera_off = r.camera_rejected = r.refused = 0.0
+        return
+    repeated = x == r.frame[0] and y == r.frame[1] and yaw == r.frame[2]
+    r.frame[0], r.frame[1], r.frame[2] = x, y, yaw
+    age = min(max(r.seen[SENSOR.camera_age], 0.0), r.tick * robot.period, (r.raw.shape[0] - 2) * robot.period)
+    then_x, then_y, then_yaw = _pose_before(robot, age, r)
+    off = _off(robot, age, x - then_x, y - then_y, yaw - then_yaw, r)
+    dx, dy, dyaw = x - then_x, y - then_y, yaw - then_yaw
+    if off <= CAMERA_GATE:
+        r.anchor[:] = 0.0
+    elif r.anchor[0] != 0.0 or r.anchor[1] != 0.0 or r.anchor[2] != 0.0:
+        c, s = math.cos(r.anchor[2]), math.sin(r.anchor[2])
+        dx = r.anchor[0] + c * x - s * y - then_x
+        dy = r.anchor[1] + s * x + c * y - then_y
+        dyaw = yaw + r.anchor[2] - then_yaw
+        off = _off(robot, age, dx, dy, dyaw, r)
+    r.camera_off = math.sqrt(off)
+    if off > CAMERA_GATE or (repeated and off > 1.0):
+        r.camera_rejected = 1.0
+        if not repeated:
+            _refuse(x, y, yaw, then_x, then_y, then_yaw, dx, dy, dyaw, r)
+    elif not repeated:
+        r.camera_rejected = r.refused = 0.0
+        _believe(robot, age, dx, dy, dyaw, r)
+    r.frame_time = 0.0
+
+
+@njit(cache=True, nogil=True)
+def _pose_before(robot: Any, age: float, r: Any) -> Any:
+    """Return where the robot was ``age`` s ago, start frame: its estimate less the IMU's way since."""
+    length = r.raw.shape[0]
+    back = r.tick - age / robot.period
+    whole = math.floor(back)
+    part = back - whole
+    now, a = int(r.tick) % length, int(whole) % length
+    b = (a + 1) % length if part > 0.0 else a
+    c, s = r.pointing[0], r.pointing[1]
+    # what the corrections since then have added to the velocity
+    ex = c * r.velocity[0] - s * r.velocity[1] - r.raw_velocity[0]
+    ey = s * r.velocity[0] + c * r.velocity[1] - r.raw_velocity[1]
+    x = r.position[0] - (r.raw[now, 0] - r.raw[a, 0] - part * (r.raw[b, 0] - r.raw[a, 0])) - ex * age
+    y = r.position[1] - (r.raw[now, 1] - r.raw[a, 1] - part * (r.raw[b, 1] - r.raw[a, 1])) - ey * age
+    return x, y, r.yaw - (r.raw[now, 2] - r.raw[a, 2] - part * (r.raw[b, 2] - r.raw[a, 2]))
+
+
+@njit(cache=True, nogil=True)
+def _yaw_variance(robot: Any, age: float, r: Any) -> float:
+    p = r.yaw_covariance
+    return p[0] + 2.0 * age * p[1] + age * age * p[2] + robot.camera_yaw_noise**2
+
+
+@njit(cache=True, nogil=True)
+def _off(robot: Any, age: float, dx: float, dy: float, dyaw: float, r: Any) -> float:
+    """Return the largest squared normalised innovation of a frame that is off by so much in the start frame."""
+    c, s = r.pointing[0], r.pointing[1]
+    off = dyaw * dyaw / _yaw_variance(robot, age, r)
+    for k in range(2):
+        along = c * dx + s * dy if k == 0 else c * dy - s * dx
+        off = max(off, along * along / (see_position(r.covariance[k], age, r.column) + robot.camera_noise**2))
+    return off
+
+
+@njit(cache=True, nogil=True)
+def _believe(robot: Any, age: float, dx: float, dy: float, dyaw: float, r: Any) -> None:
+    c, s = r.pointing[0], r.pointing[1]
+    for k in range(2):
+        along = c * dx + s * dy if k == 0 else c * dy - s * dx
+        correct(r, k, along, see_position(r.covariance[k], age, r.column) + robot.camera_noise**2)
+    correct_yaw(r, 1.0, age, dyaw, _yaw_variance(robot, age, r))
+
+
+@njit(cache=True, nogil=True)
+def _refuse(
+    x: float, y: float, yaw: float, then_x: float, then_y: float, then_yaw: float, dx: float, dy: float, dyaw: float, r: Any
+) -> None:
+    """Follow how refused frames are off: by the same, then the camera has been moved; or steadily moving away."""
+    if r.refused == 0.0:
+        r.first_off[0], r.first_off[1], r.first_off[2] = dx, dy, dyaw
+        r.off[0], r.off[1], r.off[2] = dx, dy, dyaw
+        r.refused = 1e-9
+        return
+    before = r.refused
+    r.refused += r.frame_time
+    ahead = r.frame_time / before if before > r.frame_time else 0.0
+    jump_x = dx - r.off[0] - ahead * (r.off[0] - r.first_off[0])
+    jump_y = dy - r.off[1] - ahead * (r.off[1] - r.first_off[1])
+    if abs(jump_x) > _SAME or abs(jump_y) > _SAME or abs(dyaw - r.off[2]) > _SAME_YAW:
+        r.refused = 0.0
+        return
+    r.off[0], r.off[1], r.off[2] = dx, dy, dyaw
+    moved = max(abs(dx - r.first_off[0]), abs(dy - r.first_off[1]))
+    if r.refused >= _CAMERA_PATIENCE and moved < _SAME:
+        turned = then_yaw - yaw
+        c, s = math.cos(turned), math.sin(turned)
+        r.anchor[0], r.anchor[1], r.anchor[2] = then_x - c * x + s * y, then_y - s * x - c * y, turned
+        r.refused = 0.0
+    elif r.refused >= _LONG_PATIENCE:
+        for k in range(2):
+            p = r.covariance[k]
+            p[0, 0] += dx * dx + dy * dy
+            p[1, 1] += (moved / r.refused) ** 2
+        r.doubt = moved / r.refused
+        r.refused = 0.0
+
+
+# --- optical flow: a velocity, with a scale and a rotation that are learned on the way --------------------------------
+
+
+# What the sensor's scale and mounting are taken for, 1 sigma.
+SCALE = 0.03
+ROTATION = 0.03
+#: Squared normalised innovation beyond which a reading is refused.
+FLOW_GATE = 16.0
+#: s of refused readings, moving as the IMU says, after which it is the estimate that may be wrong.
+_FLOW_PATIENCE = 0.5
+#: Readings in a row, the same to the last bit, after which the sensor counts as stuck.
+_REPEATS = 8.0
+#: s without a reading after which nothing is said about the last one.
+_FLOW_SILENCE = 0.5
+#: m: shortest distance from lens to floor that is taken for one.
+_LEAST_HEIGHT = 0.02
+
+
+@njit(cache=True, nogil=True)
+def see_flow(robot: Any, sensors: Any, r: Any) -> None:
+    """Take in a flow reading where there is a new one: flow_x = v_x/h - w_y, flow_y = v_y/h + w_x of the lens, body frame."""
+    r.flow_time += robot.period
+    x, y = sensors[SENSOR.flow], sensors[SENSOR.flow + 1]
+    if robot.flow == 0.0 or not r.seen[SENSOR.flow_is_new] > 0.5 or not math.isfinite(x + y):
+        if r.flow_time > _FLOW_SILENCE:
+            r.flow_off = r.flow_rejected = r.flow_refused = 0.0
+        return
+    r.repeats = r.repeats + 1.0 if x == r.reading[0] and y == r.reading[1] else 0.0
+    stuck = r.repeats >= _REPEATS
+    r.reading[0], r.reading[1] = x, y
+    mean_x, mean_y, height = _seen_velocity(robot, x, y, r)
+    if height < _LEAST_HEIGHT:
+        return
+    age = max(r.seen[SENSOR.flow_age], 0.0) + 0.5 * robot.period  # of the middle of its interval
+    poor = max(robot.flow_quality / max(r.seen[SENSOR.flow_quality], 1e-3), 1.0)
+    noise = (height * poor * robot.flow_noise) ** 2
+    blur = (poor * robot.flow_speed_noise) ** 2
+    off, ahead = 0.0, r.velocity[0] - age * r.kick[0]
+    for k in range(2):
+        mean = mean_x if k == 0 else mean_y
+        r.flow_variance[k] = noise + blur * mean * mean
+        r.flow_error[k] = mean - (r.velocity[k] - age * r.kick[k])
+        spread = see_velocity(r.covariance[k], age, ahead, r.column)
+        off = max(off, r.flow_error[k] ** 2 / (spread + r.flow_variance[k]))
+    r.flow_off = math.sqrt(off)
+    if off > FLOW_GATE or stuck:
+        r.flow_rejected = 1.0 if off > 1.0 else 0.0
+        r.flow_refused = 0.0 if stuck else r.flow_refused + min(r.flow_time, 2.0 * robot.period)
+        if r.flow_refused > _FLOW_PATIENCE:
+            for k in range(2):
+                r.covariance[k, 1, 1] += r.flow_error[k] ** 2
+            r.flow_refused = 0.0
+    else:
+        r.flow_rejected = r.flow_refused = 0.0
+        for k in range(2):
+            total = see_velocity(r.covariance[k], age, ahead, r.column) + r.flow_variance[k]
+            correct(r, k, r.flow_error[k], total)
+    r.flow_time = 0.0
+
+
+@njit(cache=True, nogil=True)
+def _seen_velocity(robot: Any, x: float, y: float, r: Any) -> Any:
+    """Return the body origin's velocity along heading and left by a reading, and the lens's distance to the floor."""
+    n, lens = r.normal, robot.lens
+    floor, carried, rise = 0.0, 1e-12, 0.0
+    for i in range(4):
+        floor += r.load[i] * r.point[i, 2]
+        rise += r.load[i] * r.lift[i]
+        carried += r.load[i]
+    floor, rise = floor / carried, rise / carried
+    height = (n[0] * lens[0] + n[1] * lens[1] + n[2] * lens[2] - floor) / n[2]
+    c, s = math.cos(r.lens[1]), math.sin(r.lens[1])
+    x, y = (1.0 + r.lens[0]) * (c * x - s * y), (1.0 + r.lens[0]) * (s * x + c * y)
+    wx, wy = 0.5 * (r.rate[0] + r.last_rate[0]), 0.5 * (r.rate[1] + r.last_rate[1])
+    wz = 0.5 * (r.rate[2] + r.last_rate[2])
+    bx = height * (x + wy) - (wy * lens[2] - wz * lens[1]) - rise * n[0]
+    by = height * (y - wx) - (wz * lens[0] - wx * lens[2]) - rise * n[1]
+    along = bx / r.heading[0]
+    return along, (by - along * r.heading[1]) / r.left[1], height
+
+
+# --- the step ---------------------------------------------------------------------------------------------------------
+
 
 #: m, 1 sigma at the start.
 _START_PLACE = 1e-4
@@ -81,9 +600,9 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
         r.leak[k], r.slope[k] = bias, total - bias
         r.position[k] = r.velocity[k] = r.raw_velocity[k] = r.last_velocity[k] = r.kick[k] = 0.0
         r.covariance[k, 0, 0] = _START_PLACE**2
-        r.covariance[k, kalman.VELOCITY, kalman.VELOCITY] = robot.start_speed**2
-        r.covariance[k, kalman.LEAK, kalman.LEAK] = robot.start_leak**2
-        r.covariance[k, kalman.LENS, kalman.LENS] = (SCALE if k == 0 else ROTATION) ** 2
+        r.covariance[k, VELOCITY, VELOCITY] = robot.start_speed**2
+        r.covariance[k, LEAK, LEAK] = robot.start_leak**2
+        r.covariance[k, LENS, LENS] = (SCALE if k == 0 else ROTATION) ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -139,7 +658,7 @@ def _report(robot: Any, r: Any, out: Any) -> None:
         out[ESTIMATE.gravity_in_body + k] = -(gx * h[k] + gy * left[k] + gz * n[k])
     vote = (robot.velocity_count * robot.wheel_radius) ** 2 / 6.0
     for k in range(2):
-        variance = max(r.covariance[k, kalman.VELOCITY, kalman.VELOCITY], 0.0)
+        variance = max(r.covariance[k, VELOCITY, VELOCITY], 0.0)
         out[ESTIMATE.linear_velocity_sigma + k] = math.sqrt(variance)
         for i in range(4):
             own = vote + (RADIUS * r.rolling[i, 0]) ** 2 if k == 0 else (robot.gyro_noise * r.point[i, 0]) ** 2

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.perception.observer import kalman
+from wlr_gym.perception.observer.kalman import DIRECTION_SIZE
 from wlr_gym.perception.observer.trust import MEMORY, load_trust
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
@@ -80,7 +80,7 @@ def state_type(history: int) -> np.dtype[Any]:
         "leak": (2,),  # of the accelerometer, m/s2
         "guess": (),  # what the accelerometer read along the floor at first, m/s2
         "slope": (2,),  # gravity along the floor, m/s2
-        "covariance": (2, kalman.SIZE, kalman.SIZE),
+        "covariance": (2, DIRECTION_SIZE, DIRECTION_SIZE),
         "yaw_covariance": (3,),  # yaw, yaw with bias, bias
         "gyro_bias": (),  # about the normal
         "normal": (3,),  # of the floor, body frame
@@ -135,7 +135,7 @@ def state_type(history: int) -> np.dtype[Any]:
         "lead": (4,),
         "wander": (2,),
         # scratch
-        "column": (kalman.SIZE,),
-        "change": (kalman.SIZE,),
+        "column": (DIRECTION_SIZE,),
+        "change": (DIRECTION_SIZE,),
     }
     return np.dtype([(name, np.float64, shape) for name, shape in numbers.items()])

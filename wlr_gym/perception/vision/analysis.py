@@ -22,12 +22,17 @@ from wlr_gym.data.robot_file import own_robot
 from wlr_gym.data.write import write_run
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import detect
-from wlr_gym.perception.markers.sheet_fault import sheet_fault
+from wlr_gym.perception.markers.pose import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.alignment import Alignment, align, joint_signals
-from wlr_gym.perception.vision.frame_noise import without_repeats
 from wlr_gym.perception.vision.motion import smoothed_poses
-from wlr_gym.perception.vision.self_calibration import UNSURE, SelfCalibration, calibration_findings, self_calibrated
+from wlr_gym.perception.vision.self_calibration import (
+    UNSURE,
+    SelfCalibration,
+    calibration_findings,
+    self_calibrated,
+    without_repeats,
+)
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, REPEATED, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames

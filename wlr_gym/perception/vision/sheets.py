@@ -1,20 +1,31 @@
-"""Sheets to print at 100 %: the robot's markers, one page per floor marker, the calibration board. SVG and PDF, to scale.
+"""Sheets to print at 100 %, and their check from one photograph.
 
-A page is a list of shapes in millimetres, x right, y down from its upper left corner. Every page has a ruler of 100 mm: a
-printer that scales shows there.
+The robot's markers, one page per floor marker, the calibration board: SVG and PDF, to scale. A page is a list of shapes in
+millimetres, x right, y down from its upper left corner. Every page has a ruler of 100 mm: a printer that scales shows there.
+
+The camera's calibration makes tilt and distance known, so four markers in a plane leave two things that a photograph shows: how
+much more the print is stretched along x than along y, and how far the layout is out of square. Its scale needs a caliper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from wlr_gym.base.files import replace_file, write_text
-from wlr_gym.perception.markers.boards import Board
+from wlr_gym.base.files import replace_file
+from wlr_gym.perception.markers.calibration import Board
+from wlr_gym.perception.markers.camera import Camera
+from wlr_gym.perception.markers.detection import Detection, Image, detect
+from wlr_gym.perception.markers.pose import FLOOR_TOLERANCE, find_laid_target, sheet_fault
 from wlr_gym.perception.markers.targets import QUIET_ZONE, Marker, Target, ring_radii
+from wlr_gym.perception.vision.adjustment import TargetView, adjust
+from wlr_gym.perception.vision.tracking import check_size, seen_at
 
 # Landscape, mm.
 A4 = (297.0, 210.0)
@@ -23,7 +34,7 @@ A3 = (420.0, 297.0)
 _BLACK = 0.0
 _GREY = 0.6
 _MARGIN = 8.0  # mm that printers leave white
-_ARC = 0.5522847498  # control points of a quarter circle
+_INCH = 25.4  # mm
 
 
 @dataclass(frozen=True)
@@ -91,11 +102,20 @@ def board_page(board: Board) -> Page:
 
 def write_pages(folder: Path, name: str, pages: Sequence[Page]) -> list[Path]:
     """Write ``name``.pdf with all pages, and one SVG per page; return the paths."""
-    paths = [folder / f"{name}.pdf"]
-    replace_file(paths[0], lambda temporary: temporary.write_bytes(pdf(pages)))
-    for page in pages:
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    def write_pdf(path: Path) -> None:
+        with PdfPages(path, metadata={"CreationDate": None}) as file:
+            for figure in figures:
+                file.savefig(figure)
+
+    figures, paths = [drawn(page) for page in pages], [folder / f"{name}.pdf"]
+    replace_file(paths[0], write_pdf)
+    for page, figure in zip(pages, figures, strict=True):
         paths.append(folder / f"{page.name}.svg")
-        write_text(paths[-1], svg(page))
+        with rc_context({"svg.hashsalt": page.name}):  # else every writing names its parts anew
+            replace_file(paths[-1], lambda path, figure=figure: figure.savefig(path, format="svg", metadata={"Date": None}))
     return paths
 
 
@@ -155,66 +175,119 @@ def _black_boxes(black: np.ndarray) -> list[tuple[int, int, int, int]]:
     return boxes
 
 
-def svg(page: Page) -> str:
-    """The page as SVG, one user unit = 1 mm."""
+def drawn(page: Page) -> Figure:
+    """Return a page as a figure of its size, to be saved as SVG or PDF; one unit of its axes is 1 mm."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle, Rectangle
+
     width, height = page.size
-    head = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}mm" height="{height:g}mm" viewBox="0 0 {width:g} {height:g}">'
-    )
-    body = [f'<rect width="{width:g}" height="{height:g}" fill="#fff"/>', *(_svg_shape(shape) for shape in page.shapes)]
-    return "\n".join([head, *body, "</svg>", ""])
+    figure = Figure((width / _INCH, height / _INCH), facecolor="white")
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(0, width), ylim=(height, 0))
+    axes.set_axis_off()
+    for order, shape in enumerate(page.shapes):
+        if isinstance(shape, Text):
+            axes.text(shape.x, shape.y, shape.words, fontsize=72 / _INCH * shape.height, zorder=order)
+        elif isinstance(shape, Disc):
+            axes.add_patch(Circle((shape.x, shape.y), shape.radius, color=str(shape.shade), linewidth=0, zorder=order))
+        else:
+            corner = shape.x, shape.y
+            axes.add_patch(Rectangle(corner, shape.width, shape.height, color=str(shape.shade), linewidth=0, zorder=order))
+    return figure
 
 
-def _svg_shape(shape: Shape) -> str:
-    if isinstance(shape, Text):
-        words = shape.words.replace("&", "&amp;").replace("<", "&lt;")
-        font = f'font-size="{shape.height:g}" font-family="Helvetica, Arial"'
-        return f'<text x="{shape.x:.4f}" y="{shape.y:.4f}" {font}>{words}</text>'
-    level = round(255 * shape.shade)
-    fill = f'fill="#{level:02x}{level:02x}{level:02x}"'
-    if isinstance(shape, Disc):
-        return f'<circle cx="{shape.x:.4f}" cy="{shape.y:.4f}" r="{shape.radius:.4f}" {fill}/>'
-    return f'<rect x="{shape.x:.4f}" y="{shape.y:.4f}" width="{shape.width:.4f}" height="{shape.height:.4f}" {fill}/>'
+# --- check of a photograph --------------------------------------------------------------------------------------------
 
 
-def pdf(pages: Sequence[Page]) -> bytes:
-    """All pages as a PDF 1.4 file."""
-    count = len(pages)
-    kids = " ".join(f"{4 + 2 * k} 0 R" for k in range(count))
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R >>",
-        f"<< /Type /Pages /Kids [{kids}] /Count {count} >>".encode(),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
-    ]
-    for k, page in enumerate(pages):
-        width, height = (side * 72 / 25.4 for side in page.size)
-        objects.append(
-            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4f} {height:.4f}] /Contents {5 + 2 * k} 0 R "
-            "/Resources << /Font << /F1 3 0 R >> >> >>".encode()
-        )
-        content = "\n".join(
-            [f"{72 / 25.4:.8f} 0 0 {72 / 25.4:.8f} 0 0 cm", *(_pdf_shape(s, page.size[1]) for s in page.shapes)]
-        )
-        data = content.encode("cp1252", "replace")
-        objects.append(b"<< /Length %d >>\nstream\n%s\nendstream" % (len(data), data))
-    file, places = b"%PDF-1.4\n", []
-    for number, content in enumerate(objects, start=1):
-        places.append(len(file))
-        file += b"%d 0 obj\n%s\nendobj\n" % (number, content)
-    table = b"".join(b"%010d 00000 n \n" % place for place in places)
-    start = len(file)
-    file += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1) + table
-    return file + b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, start)
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+#: 1 sigma of a print's stretch before the photograph is looked at, where the target file states none.
+_STRETCH = 0.01
+#: m, 1 sigma of a marker's place on a sheet, stretch apart.
+_PRINT = 0.0001
+#: A print that is stretched by less is right.
+_RIGHT = 0.001
+#: Sigmas from which on something is worth a warning.
+_FAR = 3.0
 
 
-def _pdf_shape(shape: Shape, height: float) -> str:
-    y = height - shape.y  # PDF counts up
-    if isinstance(shape, Text):
-        words = shape.words.replace("\u2192", "->").replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
-        return f"0 g BT /F1 {shape.height:g} Tf {shape.x:.4f} {y:.4f} Td ({words}) Tj ET"
-    if isinstance(shape, Box):
-        return f"{shape.shade:g} g {shape.x:.4f} {y - shape.height:.4f} {shape.width:.4f} {shape.height:.4f} re f"
-    x, r, c = shape.x, shape.radius, _ARC * shape.radius
-    arcs = [(r, c, c, r, 0, r), (-c, r, -r, c, -r, 0), (-r, -c, -c, -r, 0, -r), (c, -r, r, -c, r, 0)]
-    curves = " ".join(f"{x + a:.5f} {y + b:.5f} {x + d:.5f} {y + e:.5f} {x + f:.5f} {y + g:.5f} c" for a, b, d, e, f, g in arcs)
-    return f"{shape.shade:g} g {x + r:.5f} {y:.5f} m {curves} f"
+@dataclass(frozen=True, eq=False)
+class SheetCheck:
+    """What a photograph says about one target.
+
+    Attributes:
+        target: as its file has it. seen: number of its markers. fault: why it was not found; empty = found.
+        stretch, stretch_std: (2,) along x and y of a target that is one print, and 1 sigma; None = separate sheets.
+        difference_std: 1 sigma of the difference of the two.
+        misfit: m, rms by which the markers miss the places in the file, as far as a photograph shows it.
+    """
+
+    target: Target
+    seen: int
+    fault: str = ""
+    stretch: Array | None = None
+    stretch_std: Array | None = None
+    difference_std: float = 0.0
+    misfit: float = 0.0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What should be corrected before anything is measured."""
+        return (self.fault,) if self.fault else tuple(self._warnings())
+
+    def _warnings(self) -> Iterator[str]:
+        target = self.target
+        if self.stretch is not None and self.stretch_std is not None:
+            x, y = self.stretch
+            stated = math.hypot(target.stretch, _RIGHT)
+            if abs(x - y) > _FAR * math.hypot(stated, self.difference_std):
+                yield (
+                    f"'{target.name}' is stretched by {100 * (x - y):+.2f} % more along x than along y: print it anew, or "
+                    "state stretch and caliper in its file"
+                )
+            if target.caliper is not None and abs(x) > _FAR * math.hypot(stated, self.stretch_std[0]):
+                yield f"'{target.name}' is stretched by {100 * x:+.2f} % along x: was it printed at 100 %?"
+        elif self.misfit > _FAR * target.slack:
+            yield (
+                f"markers of '{target.name}' miss the places in its file by {1e3 * self.misfit:.1f} mm rms: more than its "
+                f"tolerance ({1e3 * target.tolerance:g} mm); measure the layout anew"
+            )
+
+
+def check_sheets(image: Image, camera: Camera, targets: Sequence[Target]) -> list[SheetCheck]:
+    """Check the targets in one photograph.
+
+    Args:
+        image: (H, W) grey. camera: its lens. targets: that should be in it.
+
+    Raises:
+        InputError: an image of another size than the camera was calibrated for.
+    """
+    check_size(image, camera, "photograph")
+    detections = detect(image, camera)
+    return [_checked(image, camera, target, detections) for target in targets]
+
+
+def _checked(image: Image, camera: Camera, target: Target, detections: Sequence[Detection]) -> SheetCheck:
+    found = find_laid_target(detections, target.model_copy(update={"tolerance": FLOOR_TOLERANCE}), camera)
+    if found is None:
+        own = sum(detection.code in target.codes for detection in detections)
+        return SheetCheck(target, own, sheet_fault(detections, target, camera))
+    seen = seen_at(image, target, camera.values, found.rotation, found.position)
+    misfit = found.residual * float(found.position[2]) / camera.focal[0]
+    if len(target_pages(target)) > 1:
+        return SheetCheck(target, len(seen), misfit=misfit)
+    view = TargetView(seen, found.rotation, found.position, np.zeros(6))
+    printed = target.model_copy(update={"stretch": max(target.stretch, _STRETCH), "tolerance": min(target.tolerance, _PRINT)})
+    result = adjust(printed, [view], camera.height, 0.0)
+    # stretch is what the affine map from the drawn places to those found has on its diagonal
+    solve = np.linalg.pinv(np.column_stack([np.ones(len(target.markers)), target.positions[:, :2]]))[1:]
+    stretch = np.diag(solve @ result.target.positions[:, :2]) - 1
+    rows = np.zeros((2, len(target.markers), 3))
+    rows[0, :, 0], rows[1, :, 1] = solve
+    spread = rows.reshape(2, -1) @ result.covariance @ rows.reshape(2, -1).T
+    difference = math.sqrt(float(spread[0, 0] + spread[1, 1] - 2 * spread[0, 1]))
+    return SheetCheck(target, len(seen), "", stretch, np.sqrt(np.diag(spread)), difference, misfit)

@@ -24,8 +24,14 @@ from wlr_gym.data.body_pose import quaternion
 from wlr_gym.data.read import Run
 from wlr_gym.perception.vision.alignment import joint_signals, repeated
 from wlr_gym.perception.vision.imu_check import imu_compared
-from wlr_gym.perception.vision.legs import leg_findings, leg_readings
-from wlr_gym.perception.vision.motion import body_rates, imu_readings, smooth_motion, without_outliers
+from wlr_gym.perception.vision.motion import (
+    body_rates,
+    imu_readings,
+    leg_findings,
+    leg_readings,
+    smooth_motion,
+    without_outliers,
+)
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot

@@ -1,8 +1,9 @@
-"""Follow the robot's markers through a video: one sample per frame, flagged, with its covariance.
+"""Follow the robot's markers through a film or through frames as they come: one sample per frame, with its covariance.
 
-The floor's markers are located first, over some frames, and watched from then on: a camera that moves is noticed. The body's
-markers are searched in the whole image until they are found, then only where a constant velocity puts them; one of four may be
-hidden. A frame without a pose that passes every check gives a sample without a pose.
+The floor's markers carry the floor frame. They are located first, over some frames, and watched from then on: a camera that
+moves is noticed, and live the floor is then located anew. The body's markers are searched in the whole image until they are
+found, then only where a constant velocity puts them; one of four may be hidden. A frame without a pose that passes every check
+gives a sample without a pose, and live also why.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from wlr_gym.perception.markers.pose import (
     expected_ellipse,
     find_laid_target,
     find_target,
+    sheet_fault,
     solve_pose,
     solved_floor,
 )
-from wlr_gym.perception.markers.sheet_fault import sheet_fault
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import LONGEST_STEP, TargetView, at_frame_time, velocity_between
 
@@ -391,3 +392,100 @@ def mean_detection(found: Sequence[Detection]) -> Detection:
     spread = np.where(known[:, None, None], covariances.mean(axis=0) / len(found), np.nan)
     shape, ellipse = np.mean([d.shape for d in found], axis=0), np.mean([d.ellipse for d in found], axis=0)
     return replace(found[0], centres=mean, covariances=spread, shape=shape, ellipse=ellipse)
+
+
+# --- live frames ------------------------------------------------------------------------------------------------------
+
+
+# Status of a sample without a pose, besides those of :mod:`wlr_gym.perception.vision.tracking`.
+#: The floor markers are not found (yet).
+NO_FLOOR = "no floor"
+#: Too dark, or nothing to be seen: a covered lens, no light.
+DARK = "dark"
+#: Overexposed.
+GLARE = "glare"
+#: Exactly the picture before: the camera repeats itself.
+FROZEN = "frozen"
+#: What a status means, for people.
+MEANINGS = {
+    NO_FLOOR: "the floor markers are not found",
+    LOST: "the robot's markers are not found",
+    MOVED: "the camera was moved",
+    IMPOSSIBLE: "the pose is in the floor or upside down",
+    DARK: "the picture is dark or blank: lens covered?",
+    GLARE: "the picture is overexposed",
+    FROZEN: "the camera repeats the same picture",
+}
+#: Frames with floor markers that the floor is located from.
+LIVE_FLOOR_FRAMES = 10
+#: Frames between two tries to find the floor where it was not found.
+_EVERY = 5
+#: Every so many pixels are looked at, along both axes, to judge a picture as a whole.
+_SPARSE = 8
+#: Grey levels: spread (1 sigma) below which nothing is to be seen, and mean above which a picture is overexposed.
+_BLANK, _BRIGHT = 12.0, 240.0
+
+
+class PoseFinder:
+    """Turn frames of a live camera into samples, in the order in which they come.
+
+    Args:
+        camera: its lens. body, floor: targets.
+    """
+
+    def __init__(self, camera: Camera, body: Target, floor: Target) -> None:
+        self.camera, self.body, self.floor = camera, body, floor
+        self._tracker: Tracker | None = None
+        self._floor_frames: list[VideoFrame] = []
+        self._waited = 0
+        self._last: Image | None = None
+
+    def __call__(self, frame: VideoFrame) -> Sample:
+        """Process one frame.
+
+        Raises:
+            InputError: another size than the camera was calibrated for.
+        """
+        check_size(frame.image, self.camera, "camera")
+        last, self._last = self._last, frame.image
+        if last is not None and np.array_equal(last, frame.image):
+            return no_pose(frame, FROZEN, self.body)
+        if self._tracker is None:
+            self._look_for_floor(frame)
+            if self._tracker is None:
+                return no_pose(frame, _judged(frame.image) or NO_FLOOR, self.body)
+        sample = self._tracker(frame)
+        if sample.status == MOVED:
+            self._tracker = None  # located anew, from the frames that follow
+        if sample.status == LOST and (judged := _judged(frame.image)):
+            return no_pose(frame, judged, self.body)
+        return sample
+
+    def _look_for_floor(self, frame: VideoFrame) -> None:
+        """Collect frames that show floor markers, and locate the floor from them."""
+        self._waited += 1
+        if not self._floor_frames and self._waited < _EVERY and self._waited > 1:
+            return
+        found = sum(detection.code in self.floor.codes for detection in detect(frame.image, self.camera))
+        if found < 4:
+            self._floor_frames = []
+            self._waited = 1
+            return
+        self._floor_frames.append(frame)
+        if len(self._floor_frames) < LIVE_FLOOR_FRAMES:
+            return
+        try:
+            located = locate_floor(self._floor_frames, self.camera, self.floor)
+        except InputError:  # markers that do not fit together
+            located = None
+        self._floor_frames, self._waited = [], 0
+        if located is not None:
+            self._tracker = Tracker(self.camera, self.body, self.floor, *located)
+
+
+def _judged(image: Image) -> str:
+    """What is wrong with a picture as a whole; empty = nothing."""
+    sparse = image[::_SPARSE, ::_SPARSE]
+    if sparse.mean() > _BRIGHT:
+        return GLARE
+    return DARK if sparse.std() < _BLANK else ""
