@@ -19,7 +19,7 @@ from wlr_gym.base.errors import require_package
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.tasks.signals import yaw_of
 from wlr_gym.envs.tasks.task import scales_of, tracking_error
-from wlr_gym.hardware.camera.config import CameraFile, load_camera_file
+from wlr_gym.hardware.camera.reading import CameraFile, load_camera_file
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions

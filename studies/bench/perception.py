@@ -18,9 +18,8 @@ from studies.bench.bus import drive_in_real_time
 from studies.bench.measure import Measurement, Size
 from wlr_gym.base.errors import require_package
 from wlr_gym.base.provenance import write_yaml
-from wlr_gym.hardware.camera.config import CameraFile, load_camera_file
-from wlr_gym.hardware.camera.feed import RobotPose
-from wlr_gym.hardware.camera.rendered import RenderedCamera
+from wlr_gym.hardware.camera.reading import CameraFile, load_camera_file
+from wlr_gym.hardware.camera.rendered import RenderedCamera, RobotPose
 from wlr_gym.robot import Robot, load_robot
 
 #: Frames of the film: a circle, so that its end joins its beginning.

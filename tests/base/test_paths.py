@@ -6,7 +6,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import find_config
-from wlr_gym.hardware.camera.config import load_camera_file
+from wlr_gym.hardware.camera.reading import load_camera_file
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.robot import load_robot
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from robot_rig import HARDWARE, PERIOD, ROBOT
 
-from wlr_gym.hardware.camera.config import CameraFile, load_camera_file
+from wlr_gym.hardware.camera.reading import CameraFile, load_camera_file
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.camera import true_pose
 from wlr_gym.hardware.emulator.line import NO_TIME

@@ -14,10 +14,11 @@ import yaml
 
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware import loop as loop_module
-from wlr_gym.hardware.config import load_hardware, with_ports
+from wlr_gym.hardware.config import ImuPort, load_hardware, with_ports
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.emulator.link import emulated_link
+from wlr_gym.hardware.emulator.link import MemoryDevice, emulated_link
+from wlr_gym.hardware.imu import ImuStream
 from wlr_gym.hardware.loop import ControlLoop, Phase, StoppedError
 from wlr_gym.physics.plants.base import RobotOptions
 from wlr_gym.robot import JOINTS, load_robot
@@ -87,6 +88,11 @@ def machine_of(core: Any) -> Any:
     return core.plant.loop.clock.machine
 
 
+def emulated_imu(link: Any, port: ImuPort) -> ImuStream:
+    """The IMU of an emulated robot's link, read with other ranges or another calibration."""
+    return ImuStream(port, link.clock.now, lambda *_: MemoryDevice(link.clock, "imu"))
+
+
 class Rig:
     """A robot and its loop.
 
@@ -122,6 +128,6 @@ class Rig:
 
 
 __all__ = [
-    "DRIVE", "HARDWARE", "JOINTS", "PATIENT", "PERIOD", "ROBOT", "Phase", "Rig", "StoppedError", "hardware_file",
-    "hardware_with", "jabbering_port", "machine_of",
+    "DRIVE", "HARDWARE", "JOINTS", "PATIENT", "PERIOD", "ROBOT", "Phase", "Rig", "StoppedError", "emulated_imu",
+    "hardware_file", "hardware_with", "jabbering_port", "machine_of",
 ]  # fmt: skip

@@ -21,12 +21,15 @@ pytest.importorskip("termios")
 
 from robot_rig import jabbering_port  # noqa: E402
 
-from wlr_gym.hardware.dynamixel.bus import Block, BusGroup  # noqa: E402
-from wlr_gym.hardware.dynamixel.errors import BusGoneError, NoAnswerError, RefusedError, RestlessLineError  # noqa: E402
+from wlr_gym.hardware.dynamixel.bus import (  # noqa: E402
+    Block,
+    BusGroup,
+    TickClock,
+)
 from wlr_gym.hardware.dynamixel.port import DynamixelPort  # noqa: E402
-from wlr_gym.hardware.dynamixel.tick_clock import TickClock  # noqa: E402
-from wlr_gym.hardware.ports import PortInUseError  # noqa: E402
+from wlr_gym.hardware.dynamixel.protocol import BusGoneError, NoAnswerError, RefusedError, RestlessLineError  # noqa: E402
 from wlr_gym.hardware.safety import preflight  # noqa: E402
+from wlr_gym.hardware.serial_frames import PortInUseError, SerialDevice  # noqa: E402
 from wlr_gym.hardware.servos import Servos  # noqa: E402
 
 TABLE = load_table("XM540-W150-R")
@@ -262,7 +265,7 @@ def test_defect_7_a_port_in_use_is_refused_untouched_until_it_is_closed():
         with pytest.raises(PortInUseError, match="in use by another program"):
             second.openPort()
         assert termios.tcgetattr(theirs)[4] == termios.B1000000  # and who has it is not disturbed
-        assert os.read(first.ser.fileno(), 99) == b"answer"
+        assert os.read(first.ser.serial.fileno(), 99) == b"answer"
         first.closePort()
         second.openPort()
         os.write(ours, b"answer")
@@ -331,8 +334,8 @@ def test_torque_off_gets_through_heavy_loss(server):
 
 def test_a_packet_that_was_sent_in_part_does_not_count_as_sent(group, monkeypatch):
     """The adapter is stuck: nobody heard the goal, or the torque-off, that it cut short."""
-    write = DynamixelPort._write
-    monkeypatch.setattr(DynamixelPort, "_write", lambda self, data: write(self, data[:-1]))
+    write = SerialDevice.write
+    monkeypatch.setattr(SerialDevice, "write", lambda self, data: write(self, data[:-1]))
     for act in (
         lambda: group.write_all("torque_enable", {2: 0}),
         lambda: group.ask_all(FAST_BLOCK),

@@ -17,15 +17,17 @@ from wlr_gym.cli.results import only_results
 from wlr_gym.cli.robot_options import WiredRobotOption
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
-from wlr_gym.hardware.imu.reading import to_body
-from wlr_gym.hardware.servo_setup import FoundServo, check_new_servo
+from wlr_gym.hardware.imu import to_body
+from wlr_gym.hardware.servos import FoundServo, check_new_servo
 from wlr_gym.robot import JOINTS, LEGS, load_robot
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from robot_rig import emulated_imu
+
 from wlr_gym.hardware.dynamixel.bus import BusGroup
-from wlr_gym.hardware.dynamixel.errors import BusGoneError
+from wlr_gym.hardware.dynamixel.protocol import BusGoneError
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
@@ -246,11 +248,8 @@ def sensor(monkeypatch):
 
     def link(self, changed=None):
         made = emulated_link(machine)
-        from wlr_gym.hardware.emulator.memory import EmulatedWorld, memory_imu
-
-        assert isinstance(made.clock, EmulatedWorld)
         assert changed is not None
-        made.imu = memory_imu(made.clock, changed.imu)
+        made.imu = emulated_imu(made, changed.imu)
         return made
 
     monkeypatch.setattr(WiredRobotOption, "link", link)

@@ -20,13 +20,18 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli.robot_status import camera_line, camera_state
 from wlr_gym.data.read import read_run
 from wlr_gym.hardware.camera import process
-from wlr_gym.hardware.camera.config import UNKNOWN_READOUT, load_camera_file
-from wlr_gym.hardware.camera.feed import PoseFeed, RobotPose, scene_pose
-from wlr_gym.hardware.camera.live import LiveCamera
-from wlr_gym.hardware.camera.reading import SIZE, CameraReading, pack, unpack
-from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS
-from wlr_gym.hardware.camera.slot import Slot
-from wlr_gym.hardware.camera.stamps import StampClock
+from wlr_gym.hardware.camera.live import LiveCamera, Slot
+from wlr_gym.hardware.camera.reading import (
+    CAMERA_FAULTS,
+    SIZE,
+    UNKNOWN_READOUT,
+    CameraReading,
+    StampClock,
+    load_camera_file,
+    pack,
+    unpack,
+)
+from wlr_gym.hardware.camera.rendered import PoseFeed, RobotPose, scene_pose
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.camera import FeedWriter
 from wlr_gym.hardware.emulator.line import NO_TIME

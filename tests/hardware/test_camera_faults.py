@@ -7,7 +7,7 @@ pytest.importorskip("dynamixel_sdk")
 
 from camera_rig import FORWARD, STAND, TURN, CameraRig
 
-from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS
 from wlr_gym.hardware.emulator import FAULTS
 from wlr_gym.hardware.safety.camera import BACKWARD, CONTRADICTIONS, SETTLING, STALLED, TOO_OLD
 from wlr_gym.perception.vision.tracking import DARK, FROZEN, GLARE, IMPOSSIBLE, LOST, MEANINGS, MOVED, NO_FLOOR

@@ -18,15 +18,14 @@ from wlr_gym.cli.robot_options import HardwareOption
 from wlr_gym.data import read_dataset
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware import calibration as find
-from wlr_gym.hardware.config import Mounting, load_hardware
-from wlr_gym.hardware.measured import Measured
+from wlr_gym.hardware.config import Measured, Mounting, load_hardware
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
-from robot_rig import hardware_file
+from robot_rig import emulated_imu, hardware_file
 
 from wlr_gym.hardware.commissioning import runner
 from wlr_gym.hardware.commissioning.runner import Commissioning, EmulatedPerson, run_test
@@ -36,7 +35,7 @@ from wlr_gym.hardware.dynamixel import tables
 from wlr_gym.hardware.emulator import MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
-from wlr_gym.hardware.emulator.stand import EmulatedStand
+from wlr_gym.hardware.emulator.machine import EmulatedStand
 
 NOMINAL = load_hardware()
 ROBOT = load_robot(NOMINAL.robot or "nominal")
@@ -292,10 +291,7 @@ def test_an_imu_that_is_mounted_otherwise_is_found(tmp_path):
     turned = NOMINAL.imu.model_copy(
         update={"calibration": NOMINAL.imu.calibration.model_copy(update={"mounting": (0, 0, 1.57)})}
     )
-    from wlr_gym.hardware.emulator.memory import EmulatedWorld, memory_imu
-
-    assert isinstance(link.clock, EmulatedWorld)
-    link.imu = memory_imu(link.clock, turned)
+    link.imu = emulated_imu(link, turned)
     with Commissioning(ROBOT, NOMINAL, link, EmulatedPerson(emulated), tmp_path, RunMeta()) as commissioning:
         (result,) = commissioning.make(choose(["imu"]))
     wrong = {finding.quantity.name for finding in result.findings if not finding.is_expected}

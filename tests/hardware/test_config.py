@@ -5,8 +5,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import find_config
-from wlr_gym.hardware.config import load_hardware, require_leg_range, with_ports
-from wlr_gym.hardware.limits import SafetyLimits, unit_of
+from wlr_gym.hardware.config import SafetyLimits, load_hardware, require_leg_range, unit_of, with_ports
 from wlr_gym.robot import LEGS, WHEELS, load_robot
 
 

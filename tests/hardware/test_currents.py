@@ -7,10 +7,9 @@ import yaml
 
 import wlr_gym  # noqa: F401  registers the environments
 from wlr_gym.base.paths import find_config
-from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.config import SafetyLimits, load_hardware
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.safety import rules
 from wlr_gym.hardware.servos import JointMap
 from wlr_gym.robot import JOINTS, LEGS, load_robot

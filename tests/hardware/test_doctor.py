@@ -18,7 +18,7 @@ pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 pytest.importorskip("termios")
 
-from wlr_gym.hardware import servo_setup
+from wlr_gym.hardware import servos as servo_setup
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
@@ -196,7 +196,7 @@ def test_a_policy_trained_mostly_with_a_camera_is_warned_of(policy, ok):
 @pytest.mark.parametrize("emulated", [False, True])
 def test_an_absent_sdk_is_named_with_its_extra(monkeypatch, emulated):
     monkeypatch.setitem(sys.modules, "dynamixel_sdk", None)
-    for name in ("dynamixel.port", "emulator.memory", "emulator.link"):
+    for name in ("dynamixel.port", "emulator.link"):
         monkeypatch.delitem(sys.modules, f"wlr_gym.hardware.{name}", raising=False)
     with pytest.raises(MissingPackageError, match=r"dynamixel_sdk.*wlr-gym\[robot\]"):
         RobotOption(emulated=emulated).link()

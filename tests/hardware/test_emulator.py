@@ -12,9 +12,10 @@ from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.dynamixel import protocol
 from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status, word
 from wlr_gym.hardware.emulator import Machine, MachineOptions
-from wlr_gym.hardware.emulator.commands import run_command
 from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
-from wlr_gym.hardware.imu.frames import FrameParser, accel_per_count, from_counts
+from wlr_gym.hardware.emulator.machine import run_command
+from wlr_gym.hardware.imu import IMU_FRAMES, accel_per_count
+from wlr_gym.hardware.serial_frames import FrameParser
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.physics.servo import motor_constants
@@ -462,11 +463,11 @@ def test_torque_off_lets_a_wheel_run_down():
 def test_imu_streams_gravity_at_its_rate():
     machine = make()
     machine.advance(0.1)
-    parser = FrameParser()
+    parser = FrameParser(IMU_FRAMES)
     frames = [frame for emission in machine.take_output()["imu"] for frame in parser.feed(emission.data)]
-    assert [frame.sequence for frame in frames] == list(range(1, 21))
-    assert [b.microseconds - a.microseconds for a, b in pairwise(frames)] == [5000] * 19
-    gravity = from_counts(frames[-1].accelerometer, accel_per_count(4))
+    assert [frame[0] for frame in frames] == list(range(1, 21))
+    assert [b[1] - a[1] for a, b in pairwise(frames)] == [5000] * 19
+    gravity = accel_per_count(4) * np.array(frames[-1][2:5])
     assert np.linalg.norm(gravity) == pytest.approx(9.81, abs=0.35)  # the robot's constant bias stays
 
 

@@ -17,7 +17,7 @@ from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, ROBOT, Phase, Rig, Stoppe
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.read import read_run
-from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS
 from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import FAULTS, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME

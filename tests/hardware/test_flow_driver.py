@@ -10,19 +10,25 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hand_clock import HandClock
+from hand_clock import HandClock, HandDevice
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.config import FlowCalibration, FlowPort, Hardware, load_hardware, with_ports
-from wlr_gym.hardware.fit import check_fit
-from wlr_gym.hardware.flow import pmw3901
-from wlr_gym.hardware.flow.calibration import calibrate_flow
-from wlr_gym.hardware.flow.frames import SIZE, FlowFrame, FlowFrameParser, encode_frame
-from wlr_gym.hardware.flow.pmw3901 import ChipPoller, Pmw3901
-from wlr_gym.hardware.flow.reading import FROZEN, CountedMotion, FlowConversion, FlowReader
-from wlr_gym.hardware.flow.stream import FlowStream
+from wlr_gym.hardware import flow as pmw3901
+from wlr_gym.hardware.config import FlowCalibration, FlowPort, Hardware, check_fit, load_hardware, with_ports
+from wlr_gym.hardware.flow import (
+    FLOW_FRAMES,
+    FROZEN,
+    ChipPoller,
+    CountedMotion,
+    FlowConversion,
+    FlowReader,
+    FlowStream,
+    Pmw3901,
+)
+from wlr_gym.hardware.flow_comparison import calibrate_flow
+from wlr_gym.hardware.serial_frames import FrameParser
 from wlr_gym.robot import JOINTS, load_robot
 
 ROBOT = load_robot("flow")
@@ -217,55 +223,37 @@ def test_the_thread_polls_and_ends_with_the_sensor():
 
 
 def frame(sequence, x=5, y=-2, interval=8264, quality=88):
-    return FlowFrame(sequence, (sequence * 8264) % 2**32, interval, x, y, quality, 0x0400)
+    return (sequence, (sequence * 8264) % 2**32, interval, x, y, quality, 0x0400)
 
 
 def test_a_frame_is_twenty_bytes_and_reads_back():
-    raw = encode_frame(frame(7, x=-32768, y=32767))
-    assert len(raw) == SIZE == 20
+    raw = FLOW_FRAMES.encode(frame(7, x=-32768, y=32767))
+    assert len(raw) == FLOW_FRAMES.size == 20
     assert raw[:2] == b"\xa5\xf1"
-    assert FlowFrameParser().feed(raw) == [frame(7, x=-32768, y=32767)]
+    assert FrameParser(FLOW_FRAMES, repeats=False).feed(raw) == [frame(7, x=-32768, y=32767)]
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(st.binary(max_size=60), st.integers(0, 19), st.integers(0, 159), st.lists(st.integers(1, 9), max_size=8))
 def test_noise_costs_no_more_than_the_frames_it_hits(noise, cut, bit, sizes):
     good = [frame(k) for k in range(1, 7)]
-    raws = [encode_frame(one) for one in good]
+    raws = [FLOW_FRAMES.encode(one) for one in good]
     broken = bytearray(raws[2])
     broken[bit // 8] ^= 1 << bit % 8
     stream = noise + raws[0] + raws[1] + bytes(broken) + raws[3][:cut] + noise + raws[4] + raws[5]
-    parser, found = FlowFrameParser(), []
+    parser, found = FrameParser(FLOW_FRAMES, repeats=False), []
     for size in [*sizes, 7] * (len(stream) + 1):
         found += parser.feed(stream[:size])
         stream = stream[size:]
         if not stream:
             break
-    found += parser.feed(bytes(3 * SIZE))
-    assert {1, 2, 5, 6} <= {one.sequence for one in found} | {None} or b"\xa5\xf1" in noise
+    found += parser.feed(bytes(3 * FLOW_FRAMES.size))
+    assert {1, 2, 5, 6} <= {one[0] for one in found} | {None} or b"\xa5\xf1" in noise
     assert all(one in good for one in found)
 
 
-class Pipe:
-    def __init__(self):
-        self.data = b""
-        self.dead = False
-
-    def read(self, size):
-        if self.dead:
-            raise OSError("unplugged")
-        data, self.data = self.data, b""
-        return data
-
-    def reset_input_buffer(self):
-        self.data = b""
-
-    def close(self):
-        pass
-
-
 def stream_and_pipe():
-    clock, pipe = HandClock(100.0), Pipe()
+    clock, pipe = HandClock(100.0), HandDevice()
     stream = FlowStream(STREAM, SENSOR, clock, lambda *port: pipe)
     stream.open()
     return clock, pipe, stream
@@ -273,7 +261,7 @@ def stream_and_pipe():
 
 def test_stream_gives_the_mean_over_what_came_and_ages_between():
     clock, pipe, stream = stream_and_pipe()
-    pipe.data = encode_frame(frame(1, x=10)) + encode_frame(frame(2, x=20))
+    pipe.data = FLOW_FRAMES.encode(frame(1, x=10)) + FLOW_FRAMES.encode(frame(2, x=20))
     first = stream.read()
     np.testing.assert_allclose(first.flow, np.array([15, -2]) * SENSOR.count / 8264e-6)
     assert first.is_new
@@ -286,7 +274,7 @@ def test_stream_gives_the_mean_over_what_came_and_ages_between():
     np.testing.assert_array_equal(held.flow, first.flow)
     clock.now += 0.2
     assert stream.read().trouble == "silent: no frame for 0.2 s"
-    pipe.dead = True
+    pipe.gone = True
     gone = stream.read()
     assert gone.trouble.startswith("no port: /dev/ttyACM1 is gone")
     assert gone.quality == 0.0
@@ -295,7 +283,7 @@ def test_stream_gives_the_mean_over_what_came_and_ages_between():
 
 def test_stream_counts_lost_frames_once():
     _, pipe, stream = stream_and_pipe()
-    pipe.data = b"".join(encode_frame(frame(k)) for k in (1, 2, 2, 5))
+    pipe.data = b"".join(FLOW_FRAMES.encode(frame(k)) for k in (1, 2, 2, 5))
     assert stream.read().is_new
     assert stream.statistics.lost == 2
 

@@ -14,8 +14,8 @@ from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
 from wlr_gym.hardware.emulator.server import Server
-from wlr_gym.hardware.flow.stream import FlowStream
-from wlr_gym.hardware.flow.supervision import floor_velocity, lens_height
+from wlr_gym.hardware.flow import FlowStream
+from wlr_gym.hardware.flow_comparison import floor_velocity, lens_height
 from wlr_gym.hardware.loop import Phase
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.physics.plants.base import PlantOptions, RobotOptions

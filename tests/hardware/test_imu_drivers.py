@@ -7,19 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_clock import HandClock
+from hand_clock import HandClock, HandDevice
 from pydantic import ValidationError
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware import calibration as calibrate
 from wlr_gym.hardware.config import ImuCalibration, ImuPort, load_hardware, with_ports
-from wlr_gym.hardware.imu.driver import make_imu
-from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY, ImuFrame, accel_per_count, encode_frame, gyro_per_count, to_counts
-from wlr_gym.hardware.imu.mpu6050 import Mpu6050, open_bus
-from wlr_gym.hardware.imu.reading import Conversion, ImuGoneError
-from wlr_gym.hardware.imu.stream import ImuStream, StreamClock
-from wlr_gym.hardware.ports import PortInUseError
+from wlr_gym.hardware.imu import (
+    IMU_FRAMES,
+    STANDARD_GRAVITY,
+    Conversion,
+    ImuGoneError,
+    ImuStream,
+    Mpu6050,
+    accel_per_count,
+    gyro_per_count,
+    make_imu,
+    open_bus,
+    to_counts,
+)
 from wlr_gym.hardware.safety.preflight import check_imu, open_ports
+from wlr_gym.hardware.serial_frames import PortInUseError, StreamClock
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import load_robot
@@ -216,34 +224,13 @@ def test_rates_the_chip_cannot_do_are_refused(rate):
 # ---- the stream ----
 
 
-class Memory:
-    """A serial port in memory."""
-
-    def __init__(self):
-        self.data = b""
-        self.gone = False
-
-    def read(self, size):
-        if self.gone:
-            raise OSError(5, "Input/output error")
-        size = min(size, 4096)  # as systems do
-        data, self.data = self.data[:size], self.data[size:]
-        return data
-
-    def reset_input_buffer(self):
-        self.data = b""
-
-    def close(self):
-        pass
-
-
 def frame(stamp, sequence=0, gyro=(0, 0, 0)):
-    return encode_frame(ImuFrame(sequence, round(stamp * 1e6) % 2**32, (0, 0, 8192), -2220, gyro))
+    return IMU_FRAMES.encode((sequence, round(stamp * 1e6), 0, 0, 8192, -2220, *gyro))
 
 
 @pytest.fixture
 def memory():
-    return Memory()
+    return HandDevice()
 
 
 @pytest.fixture
@@ -497,7 +484,7 @@ def test_conversion_takes_the_errors_off_and_turns_into_the_body():
     force, rate = np.array([1.0, -2.0, 9.0]), np.array([0.3, 0.2, -0.4])
     counts = to_counts(measured(force), accel_per_count(4))
     gyro = to_counts(to_body().T @ rate + np.array(TRUE.gyro_bias), gyro_per_count(500))
-    reading = Conversion(port).reading(counts, 0, gyro, 0.0)
+    reading = Conversion(port).reading((*counts, 0, *gyro), 0.0)
     np.testing.assert_allclose(reading.accelerometer, force, atol=3e-3)
     np.testing.assert_allclose(reading.gyro, rate, atol=1e-3)
     assert Conversion(port).counts(force, rate) == (counts, gyro)

@@ -18,8 +18,8 @@ from studies.paper.experiments import PROFILE
 from wlr_gym.cli import FAILED, INTERRUPTED, OK, record, replay, run_command
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import RunMeta
+from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.deployment import deploy, drive_robot, loop_of
-from wlr_gym.hardware.limits import SafetyLimits
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.adaptation.robots import interrupted

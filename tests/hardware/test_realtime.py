@@ -7,7 +7,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import run_command
-from wlr_gym.hardware import realtime
+from wlr_gym.hardware import timing as realtime
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="Linux only")
 

@@ -9,7 +9,8 @@ import pytest
 from wlr_gym.cli import commission, emulate
 from wlr_gym.hardware.commissioning.stand_tests import TESTS
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.emulator import FAULTS, health
+from wlr_gym.hardware.emulator import FAULTS
+from wlr_gym.hardware.emulator import servo as health
 from wlr_gym.hardware.emulator.servo import BOOT_TIME, FIRMWARE
 from wlr_gym.robot import JOINTS, load_robot
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from wlr_gym.hardware.limits import SafetyLimits
+from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.safety import limiter, rules
 from wlr_gym.hardware.safety.rules import Level, Memory, RobotStatus
 from wlr_gym.robot import JOINTS, load_robot

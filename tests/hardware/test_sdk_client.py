@@ -9,7 +9,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
-from wlr_gym.hardware.imu.frames import SIZE, FrameParser
+from wlr_gym.hardware.imu import IMU_FRAMES
+from wlr_gym.hardware.serial_frames import FrameParser
 from wlr_gym.robot import load_robot
 
 sdk = pytest.importorskip("dynamixel_sdk")
@@ -165,8 +166,8 @@ def test_imu_stream(server):
 
     with serial.Serial(server.ports["imu"], 115200, timeout=0.2) as port:
         port.reset_input_buffer()
-        parser, frames = FrameParser(), []
-        until(lambda: frames.extend(parser.feed(port.read(20 * SIZE))) or len(frames) > 40)
+        parser, frames = FrameParser(IMU_FRAMES), []
+        until(lambda: frames.extend(parser.feed(port.read(20 * IMU_FRAMES.size))) or len(frames) > 40)
     assert parser.lost == 0
 
 

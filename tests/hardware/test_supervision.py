@@ -7,7 +7,7 @@ import pytest
 from test_rules import HOME, LIMITS, RATINGS, ROBOT, at, decide, noisy, status
 
 from wlr_gym.data.format import Profile
-from wlr_gym.hardware.limits import SafetyLimits
+from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.safety import rules
 from wlr_gym.hardware.safety.rules import Level, Memory, reach, unseen
 from wlr_gym.hardware.servos import ServoRegisters

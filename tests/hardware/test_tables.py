@@ -10,11 +10,10 @@ import pytest
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.config import check_fit, load_hardware
 from wlr_gym.hardware.dynamixel.protocol import Error
 from wlr_gym.hardware.dynamixel.tables import INPUT_VOLTAGE, TABLE_SIZE, load_table, shipped_tables
 from wlr_gym.hardware.emulator.servo import EmulatedServo
-from wlr_gym.hardware.fit import check_fit
 from wlr_gym.hardware.servos import JointMap
 from wlr_gym.robot import load_robot
 

@@ -48,7 +48,7 @@ def calibrate_flow(options: FlowOptions) -> int:
     from wlr_gym.data.read import read_run
     from wlr_gym.hardware.calibration import with_flow_calibration
     from wlr_gym.hardware.config import load_hardware
-    from wlr_gym.hardware.flow.calibration import calibrate_flow as find
+    from wlr_gym.hardware.flow_comparison import calibrate_flow as find
     from wlr_gym.robot import load_robot
 
     hardware = load_hardware(options.hardware)

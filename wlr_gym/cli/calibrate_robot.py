@@ -90,7 +90,7 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
         InputError: unknown joint, none or several servos, another model, a servo that does not take it.
     """
     from wlr_gym.hardware.dynamixel.tables import BAUD_RATES
-    from wlr_gym.hardware.servo_setup import FACTORY_RATE, check_new_servo, find_servos, set_up
+    from wlr_gym.hardware.servos import FACTORY_RATE, check_new_servo, find_servos, set_up
 
     if options.joint not in JOINTS:
         raise unknown_name("joint", options.joint, JOINTS)
@@ -235,7 +235,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
 
 def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
     from wlr_gym.hardware import calibration as find
-    from wlr_gym.hardware.imu.reading import to_body
+    from wlr_gym.hardware.imu import to_body
 
     level = "Block the body level (the legs hold nothing) and let go of it, then Enter."
     if options.poses == 6:
@@ -280,7 +280,7 @@ def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
 @contextlib.contextmanager
 def _dialogue() -> Iterator[None]:
     """Turn trouble with the hardware into an :class:`InputError`: nothing moves, so there is nothing to save."""
-    from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
+    from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
 
     try:
         yield

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.commissioning.runner import StandFinding, StandResult
     from wlr_gym.hardware.commissioning.stand import Person
     from wlr_gym.hardware.commissioning.stand_tests import StandTest
-    from wlr_gym.hardware.config import Hardware
+    from wlr_gym.hardware.config import Hardware, Measured
     from wlr_gym.hardware.link import Link
-    from wlr_gym.hardware.measured import Measured
     from wlr_gym.robot import Robot
 
 #: File in ``--out`` with all results.
@@ -172,7 +171,7 @@ def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Ca
     from wlr_gym.hardware.commissioning.runner import EmulatedPerson
     from wlr_gym.hardware.commissioning.stand import TerminalPerson
     from wlr_gym.hardware.emulator.link import emulated_link
-    from wlr_gym.hardware.emulator.stand import EmulatedStand
+    from wlr_gym.hardware.emulator.machine import EmulatedStand
 
     if not options.emulated:
         return options.link_to(robot, hardware, options.patch()), TerminalPerson(ask, not options.yes)

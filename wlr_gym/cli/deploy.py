@@ -46,8 +46,8 @@ def run(options: DeployOptions) -> int:
     """
     from wlr_gym.hardware.deployment import deploy, loop_of
     from wlr_gym.hardware.operator import HELP, Keys, stop_on_signals
-    from wlr_gym.hardware.realtime import real_time
     from wlr_gym.hardware.safety.preflight import require_ports
+    from wlr_gym.hardware.timing import real_time
     from wlr_gym.learning.evaluation import make_core
     from wlr_gym.policy import environment_for
 
@@ -215,7 +215,7 @@ def _report_stream(stream: McapStream, console: Console) -> None:
 
 def _machine_of(loop: ControlLoop) -> Machine:
     """Return the emulated robot that a loop drives."""
-    from wlr_gym.hardware.emulator.memory import EmulatedWorld
+    from wlr_gym.hardware.emulator.link import EmulatedWorld
 
     assert isinstance(loop.clock, EmulatedWorld)
     return loop.clock.machine

@@ -75,7 +75,7 @@ def run(options: DoctorOptions) -> int:
 
 def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions, console: Console) -> list[Check]:
     """Return all checks of ports, adapters, servos, buses, IMU and camera; mends and scans where that was asked for."""
-    from wlr_gym.hardware.dynamixel.errors import BusGoneError
+    from wlr_gym.hardware.dynamixel.protocol import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight
     from wlr_gym.hardware.safety.preflight import check_camera
@@ -153,8 +153,8 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
 
 def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:
     """Print who answers on the buses; raise ``BusGoneError`` where a port is gone."""
-    from wlr_gym.hardware.dynamixel.errors import BusGoneError
-    from wlr_gym.hardware.servo_setup import find_servos
+    from wlr_gym.hardware.dynamixel.protocol import BusGoneError
+    from wlr_gym.hardware.servos import find_servos
 
     for name in buses:
         link.servos.groups[name].close()

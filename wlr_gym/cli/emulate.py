@@ -96,7 +96,7 @@ def machine_of(options: EmulateOptions) -> Machine:
     from wlr_gym.hardware.emulator import Machine, MachineOptions
     from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
     from wlr_gym.hardware.emulator.link import with_flow_port
-    from wlr_gym.hardware.emulator.stand import EmulatedStand
+    from wlr_gym.hardware.emulator.machine import EmulatedStand
     from wlr_gym.physics.effects import apply_patch
     from wlr_gym.physics.plants import check_simulator
     from wlr_gym.robot import load_robot

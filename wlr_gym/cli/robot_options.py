@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data.excitations import Motion
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.camera.config import CameraFile
+    from wlr_gym.hardware.camera.reading import CameraFile
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.plant import RobotPlant
@@ -181,7 +181,7 @@ class CameraOption(RobotOption):
 
 def read_camera(source: str | None, is_emulated: bool) -> CameraFile | None:
     """Return the camera of ``--camera``; see :meth:`CameraOption.camera_file`."""
-    from wlr_gym.hardware.camera.config import load_camera_file
+    from wlr_gym.hardware.camera.reading import load_camera_file
 
     if source == "emulated" and not is_emulated:
         raise InputError(

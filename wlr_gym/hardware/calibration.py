@@ -17,7 +17,7 @@ from wlr_gym.base.files import replace_file
 from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.hardware.config import FlowCalibration, Hardware, ImuCalibration, Mounting
-from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
+from wlr_gym.hardware.imu import STANDARD_GRAVITY
 from wlr_gym.robot import JOINTS
 
 Array = NDArray[np.float64]

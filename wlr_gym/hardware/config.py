@@ -1,22 +1,212 @@
-"""How a robot is wired and mounted, loaded from ``configs/hardware/*.yaml``."""
+"""How a robot is wired and mounted, what it may do, and what was measured on it: ``configs/hardware/*.yaml``.
+
+:func:`check_fit` refuses a robot file and a hardware file that speak of other servos.
+"""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
-from wlr_gym.base.errors import InputError, nearest, unknown_name
+from wlr_gym.base.checks import check_name
+from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.paths import find_config, named_by, named_in
+from wlr_gym.base.refusals import expected
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config
-from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, load_table
-from wlr_gym.hardware.limits import SafetyLimits
-from wlr_gym.hardware.measured import Measured
+from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, ControlTable, load_table
+from wlr_gym.physics.servo import measures_current
 from wlr_gym.robot import JOINTS, LEGS, Robot, Vector3
 
+#: s: longest silence of the operator that may be allowed.
+LONGEST_DEADMAN = 10.0
 #: What the EEPROM of all servos must hold: directions and zeros stand in the hardware file, torque comes on when asked for.
 FIXED_REGISTERS = {"drive_mode": 0, "homing_offset": 0, "startup_configuration": 0}
+#: Relative difference of a count from its register's that is a rounding of the file.
+SAME = 1e-3
+#: Most servos on one shaft: a dual joint has two, of which one is on the bus, and its current is a share of the joint's.
+MOST_SERVOS = 4
+
+
+# ---- the safety limits ----
+
+
+def _limit(default: float | None, unit: str, *, le: float, **low: Any) -> Any:
+    """Return the field of a limit; ``le`` is far above what anyone sets on purpose: a value beyond it has another unit."""
+    return Field(default=default, le=le, json_schema_extra={"unit": unit}, **low)
+
+
+class SafetyLimits(SettingsModel):
+    """Limits of a robot, SI units; the reasons stand in ``configs/hardware/nominal.yaml``.
+
+    Attributes:
+        leg_margin, leg_taper: rad that leg setpoints stay inside the robot file's limits, and over which they slow down before.
+        leg_speed: rad/s that leg setpoints may change by.
+        leg_lead: rad that a leg's setpoint may be ahead of the leg.
+        wheel_speed, wheel_acceleration: rad/s and rad/s2 of wheel setpoints.
+        load, load_time: share of stall torque, and for how long (s) a motor may be above it.
+        current, current_time: A of all motors together, and for how long (s) they may be above it.
+        tilt, tilt_time, tilt_horizon: rad the body may lean, s it must last, s that the tilt is predicted ahead.
+        warm, hot: degC from which wheels are slowed down, and at which the robot stops.
+        low_voltage, low_voltage_time: V, and for how long (s) the supply may be below.
+        coast, silence: s without an answer for which old setpoints hold, and after which torque goes off.
+        imu_silence: s without a reading of the IMU.
+        imu_frozen: s that the IMU may repeat exactly the same values.
+        jump_speed, jump_noise: fastest believable speed of a joint, over its motor's no-load speed, and rad on top of it: a
+            reading beyond, confirmed by a second one, is a fault.
+        frozen_leg, frozen_wheel: rad a joint should have turned while its reading stayed exactly the same.
+        leg_error, leg_error_time: rad that a leg may be away from its setpoint without coming nearer, and for how long (s).
+        wheel_error, wheel_error_time: rad/s that a wheel may be off its speed, and for how long (s).
+        late, late_share: ticks in a row, and share of the last second's, that may start more than a period late.
+        deadman: s that the operator may be silent; None = no operator needed.
+        watchdog: s of silence on the line after which servos stop by themselves.
+        heartbeat: s between control steps after which the watchdog process kills this one and switches torque off.
+        patience: s an answer may take beyond its time on the wire.
+        read_time: s that 99 of 100 reads of all joints may take at the start.
+        start_speed: rad/s of the legs on the way to the start pose, on average.
+        start_error: rad that a leg may be away from the start pose when the way there is over.
+        stop_time: s from wheels ordered to stop until torque goes off.
+        off_time: s to go on trying to switch torque off where servos do not confirm it.
+    """
+
+    leg_margin: float = _limit(0.05, "rad", ge=0.0, le=0.5)
+    leg_taper: float = _limit(0.1, "rad", gt=0.0, le=1.0)
+    leg_speed: float = _limit(8.0, "rad/s", gt=0.0, le=20.0)
+    leg_lead: float = _limit(0.45, "rad", gt=0.0, le=1.6)
+    wheel_speed: float = _limit(6.4, "rad/s", gt=0.0, le=40.0)
+    wheel_acceleration: float = _limit(200.0, "rad/s2", gt=0.0, le=2000.0)
+    load: float = _limit(0.7, "of stall torque", gt=0.0, le=1.0)
+    load_time: float = _limit(1.0, "s", gt=0.0, le=5.0)
+    current: float = _limit(10.0, "A", gt=0.0, le=100.0)
+    current_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
+    tilt: float = _limit(0.7, "rad", gt=0.0, le=1.6)
+    tilt_time: float = _limit(0.1, "s", ge=0.0, le=2.0)
+    tilt_horizon: float = _limit(0.2, "s", ge=0.0, le=2.0)
+    warm: float = _limit(62.0, "degC", le=80.0)
+    hot: float = _limit(68.0, "degC", le=80.0)
+    low_voltage: float = _limit(10.2, "V", gt=0.0, le=30.0)
+    low_voltage_time: float = _limit(0.5, "s", ge=0.0, le=5.0)
+    coast: float = _limit(0.06, "s", ge=0.0, le=1.0)
+    silence: float = _limit(0.4, "s", gt=0.0, le=3.0)
+    imu_silence: float = _limit(0.1, "s", gt=0.0, le=3.0)
+    imu_frozen: float = _limit(0.1, "s", gt=0.0, le=3.0)
+    jump_speed: float = _limit(1.5, "of no-load speed", ge=1.0, le=10.0)
+    jump_noise: float = _limit(0.03, "rad", ge=0.0, le=0.5)
+    frozen_leg: float = _limit(0.03, "rad", gt=0.0, le=0.5)
+    frozen_wheel: float = _limit(0.5, "rad", gt=0.0, le=6.3)
+    leg_error: float = _limit(0.2, "rad", gt=0.0, le=1.6)
+    leg_error_time: float = _limit(0.3, "s", gt=0.0, le=5.0)
+    wheel_error: float = _limit(2.0, "rad/s", gt=0.0, le=10.0)
+    wheel_error_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
+    late: int = _limit(5, "ticks", ge=1, le=10_000)
+    late_share: float = _limit(0.1, "of the ticks", gt=0.0, le=1.0)
+    deadman: float | None = _limit(None, "s", gt=0.0, le=LONGEST_DEADMAN)
+    watchdog: float = _limit(0.2, "s", ge=0.02, le=2.54)
+    heartbeat: float = _limit(0.8, "s", gt=0.0, le=10.0)
+    patience: float = _limit(0.004, "s", gt=0.0, le=1.0)
+    read_time: float = _limit(0.014, "s", gt=0.0, le=1.0)
+    start_speed: float = _limit(1.0, "rad/s", gt=0.0, le=10.0)
+    start_error: float = _limit(0.3, "rad", gt=0.0, le=1.0)
+    stop_time: float = _limit(0.6, "s", ge=0.0, le=5.0)
+    off_time: float = _limit(2.0, "s", ge=0.0, le=10.0)
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _refusals_tell_the_unit(cls, value: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        try:
+            return check(value)
+        except ValidationError as error:
+            context = {"reason": expected(error.errors()[0]), "unit": unit_of(str(info.field_name))}
+            raise PydanticCustomError("limit", "{reason} ({unit})", context) from None
+
+    @model_validator(mode="after")
+    def _limits_are_in_order(self) -> SafetyLimits:
+        for low, high, why in (
+            ("coast", "silence", ""),
+            ("leg_error", "leg_lead", ", or it never shows"),
+            ("watchdog", "heartbeat", ""),
+            ("warm", "hot", ""),
+        ):
+            below, above = getattr(self, low), getattr(self, high)
+            if not below < above:
+                unit = unit_of(low)
+                raise InputError(f"safety.{low} = {below:g} {unit}: expected below {high} = {above:g} {unit}{why}")
+        return self
+
+
+def require_deadman(name: str, seconds: float) -> None:
+    """Raise :class:`InputError` where the silence that an operator is allowed is none, or so long that it has another unit."""
+    if not 0.0 < seconds <= LONGEST_DEADMAN:
+        raise InputError(f"{name} {seconds:g} s: expected more than 0 and at most {LONGEST_DEADMAN:g} s")
+
+
+def unit_of(limit: str) -> str:
+    """Return the unit of a limit."""
+    extra = SafetyLimits.model_fields[limit].json_schema_extra
+    return str(extra["unit"]) if isinstance(extra, dict) else ""
+
+
+# ---- what was measured ----
+
+
+class MeasuredValue(SettingsModel):
+    """One value that was measured on the robot.
+
+    Attributes:
+        value: in ``unit``.
+        unit: SI unit; ``-`` is a pure number.
+        date: day it was measured.
+    """
+
+    value: float
+    unit: str
+    date: str
+
+
+#: Joint or bus -> value.
+MeasuredValues = dict[str, MeasuredValue]
+
+
+class Measured(SettingsModel):
+    """What ``wlr commission`` measured on this robot, by joint or bus; docs/commissioning.md says how. For people and analyses.
+
+    Attributes:
+        adapter_latency, adapter_jitter: s of a ping beyond its bytes' time on the wire: median; 99th percentile beyond it.
+        answers_behind_ordinary, answers_behind_fast: part of the servos that answer behind a silent one, by kind of read.
+        wheel_follows_given, wheel_follows_kept: speed at torque-on, over a setpoint written before, and one left from before.
+        leg_follows_given, leg_follows_kept: way at torque-on, over the way to such setpoints.
+        watchdog_stop_time: s from the last packet until the Bus Watchdog has stopped a wheel: its way over its speed.
+        velocity_loop_time: s, time constant of a wheel's way to a new speed.
+        integral_cycle: s, control cycle of the wheel's servo that this means.
+        load_per_pwm: Present Load over PWM from speed to speed of a free wheel: 0 = it is torque, 1 = it is PWM.
+        running_load: load of a free wheel, or of a leg on its way, part of stall torque.
+        stall_load: load of a held wheel or leg over PWM and supply.
+        stall_current: A of a held wheel, at full voltage.
+        joint_zero: rad that a leg reads when it hangs straight down, less pi/2.
+    """
+
+    adapter_latency: MeasuredValues = Field(default_factory=dict)
+    adapter_jitter: MeasuredValues = Field(default_factory=dict)
+    answers_behind_ordinary: MeasuredValues = Field(default_factory=dict)
+    answers_behind_fast: MeasuredValues = Field(default_factory=dict)
+    wheel_follows_given: MeasuredValues = Field(default_factory=dict)
+    wheel_follows_kept: MeasuredValues = Field(default_factory=dict)
+    leg_follows_given: MeasuredValues = Field(default_factory=dict)
+    leg_follows_kept: MeasuredValues = Field(default_factory=dict)
+    watchdog_stop_time: MeasuredValues = Field(default_factory=dict)
+    velocity_loop_time: MeasuredValues = Field(default_factory=dict)
+    integral_cycle: MeasuredValues = Field(default_factory=dict)
+    load_per_pwm: MeasuredValues = Field(default_factory=dict)
+    running_load: MeasuredValues = Field(default_factory=dict)
+    stall_load: MeasuredValues = Field(default_factory=dict)
+    stall_current: MeasuredValues = Field(default_factory=dict)
+    joint_zero: MeasuredValues = Field(default_factory=dict)
+
+
+# ---- wiring and mounting ----
 
 
 class Bus(SettingsModel):
@@ -184,16 +374,15 @@ class Hardware(SettingsModel):
     def _what_was_measured_is_of_this_robot(self) -> Hardware:
         for name in Measured.model_fields:
             for place in getattr(self.measured, name):
-                if place not in (*JOINTS, *self.buses):
-                    raise unknown_name("joint or bus", place, (*JOINTS, *self.buses), f"measured.{name}")
+                check_name("joint or bus", place, (*JOINTS, *self.buses), f"measured.{name}")
         return self
 
     @model_validator(mode="after")
     def _every_joint_is_wired_once(self) -> Hardware:
         places = {f"buses.{name}.joints": bus.joints for name, bus in self.buses.items()} | {"joints": tuple(self.joints)}
-        for where, joint in ((where, joint) for where, joints in places.items() for joint in joints):
-            if joint not in JOINTS:
-                raise unknown_name("joint", joint, JOINTS, where)
+        for where, joints in places.items():
+            for joint in joints:
+                check_name("joint", joint, JOINTS, where)
         wired = [joint for bus in self.buses.values() for joint in bus.joints]
         for joint in JOINTS:
             if wired.count(joint) != 1 or joint not in self.joints:
@@ -208,10 +397,10 @@ class Hardware(SettingsModel):
             turn = table.counts.turn
             for joint in bus.joints:
                 mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE  # in another one, setpoints would be another quantity
-                for item, expected in {"operating_mode": mode, **FIXED_REGISTERS}.items():
-                    if (found := bus.eeprom.get(item, table[item].default)) != expected:
+                for item, fixed in {"operating_mode": mode, **FIXED_REGISTERS}.items():
+                    if (found := bus.eeprom.get(item, table[item].default)) != fixed:
                         where = f"buses.{name}.eeprom.{item}"
-                        raise ValueError(f"{where} is {found}, expected {expected}: {joint} is driven with that")
+                        raise ValueError(f"{where} is {found}, expected {fixed}: {joint} is driven with that")
                 if self.joints[joint].zero >= turn:
                     raise ValueError(f"joints.{joint}.zero = {self.joints[joint].zero}: expected 0 to {turn - 1}")
         return self
@@ -240,17 +429,6 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
     return hardware.model_copy(update={"robot": str(robot)})
 
 
-def require_leg_range(hardware: Hardware, robot: Robot, where: object) -> None:
-    """Raise :class:`InputError` where ``leg_margin`` at both ends leaves nothing of a robot's ``leg_limits``."""
-    low, high = robot.leg_limits
-    margin, largest = hardware.safety.leg_margin, (high - low) / 2.0
-    if not margin < largest:
-        raise InputError(
-            f"{where}: safety.leg_margin = {margin:g} rad: expected below {largest:g} rad: twice it must leave a range within "
-            f"leg_limits, {low:g} to {high:g} rad, of robot '{robot.name}'"
-        )
-
-
 def _with_servo_files(data: Any, where: str) -> Any:
     """Return a hardware file's content with servo models that are files named by their place."""
     if not isinstance(data, dict) or not isinstance(data.get("buses"), dict):
@@ -277,3 +455,67 @@ def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
     imu = hardware.imu.model_copy(update={"port": ports.get("imu", hardware.imu.port)})
     flow = None if hardware.flow is None else hardware.flow.model_copy(update={"port": ports.get("flow", hardware.flow.port)})
     return hardware.model_copy(update={"buses": buses, "imu": imu, "flow": flow})
+
+
+# ---- robot and wiring together ----
+
+
+def require_leg_range(hardware: Hardware, robot: Robot, where: object) -> None:
+    """Raise :class:`InputError` where ``leg_margin`` at both ends leaves nothing of a robot's ``leg_limits``."""
+    low, high = robot.leg_limits
+    margin, largest = hardware.safety.leg_margin, (high - low) / 2.0
+    if not margin < largest:
+        raise InputError(
+            f"{where}: safety.leg_margin = {margin:g} rad: expected below {largest:g} rad: twice it must leave a range within "
+            f"leg_limits, {low:g} to {high:g} rad, of robot '{robot.name}'"
+        )
+
+
+def check_fit(robot: Robot, hardware: Hardware) -> None:
+    """Refuse a robot whose servos' numbers are not those of the models that it is wired with.
+
+    Raises:
+        InputError: names the first difference: supply voltage, encoder counts, what the servo reports of its torque, or a
+            sensor that only one of them has.
+    """
+    if hardware.flow is not None and robot.sensors.flow is None:
+        raise InputError(
+            f"hardware '{hardware.name}' has an optical-flow sensor, robot '{robot.name}' has not: its file needs a section "
+            "sensors.flow, as in configs/robot/flow.yaml"
+        )
+    for name, bus in hardware.buses.items():
+        table = load_table(bus.model)
+        for joint in bus.joints:
+            problem = _problem(robot, table, joint)
+            if problem:
+                raise InputError(
+                    f"robot '{robot.name}' on hardware '{hardware.name}', bus '{name}', {joint}: {problem}: name the hardware "
+                    "file of this robot (--hardware), or mend one of the two"
+                )
+
+
+def _problem(robot: Robot, table: ControlTable, joint: str) -> str:
+    """Return what does not fit; empty where all does."""
+    is_leg = joint in LEGS
+    group, motor = ("leg", robot.servo.leg) if is_leg else ("wheel", robot.servo.wheel)
+    low, high = table.voltage_range()
+    if not low <= robot.servo.supply_voltage <= high:
+        return f"servo.supply_voltage is {robot.servo.supply_voltage:g} V, {table.model} takes {low:g} to {high:g} V"
+    encoder = robot.sensors.encoder
+    for key, stated, item in (
+        ("position", encoder.position, "present_position"),
+        ("velocity", encoder.velocity, "present_velocity"),
+    ):
+        count = table.per_count(item)
+        if stated > 0.0 and not math.isclose(stated, count, rel_tol=SAME):  # 0: an ideal one
+            return f"sensors.encoder.{key} is {stated:g}, a count of {table.model} is {count:g}"
+    has_current = measures_current(robot)[0 if is_leg else 1]
+    if has_current != (table.effort == "present_current"):
+        said, has = ("current_count", "no current") if has_current else ("load_count", "its current")
+        return f"servo.{group} reports counts of {said}, {table.model} measures {has}"
+    if motor.current_count is not None:
+        servos = motor.current_count / table.counts.current
+        if not (1 <= round(servos) <= MOST_SERVOS and math.isclose(servos, round(servos), rel_tol=SAME)):
+            here = f"a count of {table.model} is {table.counts.current:g} A"
+            return f"servo.{group}.current_count is {motor.current_count:g} A, {here}"
+    return ""

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from wlr_gym.hardware.camera.config import CameraFile
 from wlr_gym.hardware.camera.live import LiveCamera
-from wlr_gym.hardware.camera.reading import CameraReader
+from wlr_gym.hardware.camera.reading import CameraFile, CameraReader
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.flow.driver import Flow, make_flow
-from wlr_gym.hardware.imu.driver import Imu, make_imu
+from wlr_gym.hardware.flow import Flow, make_flow
+from wlr_gym.hardware.imu import Imu, make_imu
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.hardware.timing import Clock, MonotonicClock
 from wlr_gym.robot import Robot

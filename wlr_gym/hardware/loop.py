@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
+from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.log import RunRecorder, sensors_of
 from wlr_gym.hardware.operator import Operator

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.data.format import RunMeta
-from wlr_gym.hardware.camera.config import load_camera_file
-from wlr_gym.hardware.config import Hardware, load_hardware, require_leg_range, with_ports
-from wlr_gym.hardware.limits import require_deadman
+from wlr_gym.hardware.camera.reading import load_camera_file
+from wlr_gym.hardware.config import Hardware, load_hardware, require_deadman, require_leg_range, with_ports
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth

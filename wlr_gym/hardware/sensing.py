@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.flow.supervision import FlowSupervision
-from wlr_gym.hardware.imu.driver import ImuReading
-from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
-from wlr_gym.hardware.imu.reading import ImuGoneError
+from wlr_gym.hardware.flow_comparison import FlowSupervision
+from wlr_gym.hardware.imu import STANDARD_GRAVITY, ImuGoneError, ImuReading
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.safety.camera import CameraWatch, camera_statistics
 from wlr_gym.hardware.safety.limiter import CommandLimiter

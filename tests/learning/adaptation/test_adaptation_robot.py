@@ -12,7 +12,7 @@ pytest.importorskip("onnxruntime")
 
 from wlr_gym.cli import OK, run_command
 from wlr_gym.hardware.deployment import Deployment
-from wlr_gym.hardware.emulator.memory import EmulatedWorld
+from wlr_gym.hardware.emulator.link import EmulatedWorld
 from wlr_gym.learning.adaptation.driving import paired
 from wlr_gym.learning.adaptation.robots import EmulatedRobot, RealRobot
 from wlr_gym.learning.evaluation import robot_episodes

@@ -19,12 +19,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.hardware.camera.config import CameraFile
-from wlr_gym.hardware.camera.feed import PoseFeed
-from wlr_gym.hardware.camera.reading import SIZE, pack, reading_of
-from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS, RenderedCamera
-from wlr_gym.hardware.camera.slot import Slot
-from wlr_gym.hardware.camera.stamps import StampClock
+from wlr_gym.hardware.camera.live import Slot
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, SIZE, CameraFile, StampClock, pack, reading_of
+from wlr_gym.hardware.camera.rendered import PoseFeed, RenderedCamera
 from wlr_gym.perception.markers.detection import Image
 from wlr_gym.perception.vision.tracking import PoseFinder, VideoFrame
 from wlr_gym.perception.vision.video import grey, open_device

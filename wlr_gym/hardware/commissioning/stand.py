@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
-from wlr_gym.hardware.imu.reading import ImuGoneError
+from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
+from wlr_gym.hardware.imu import ImuGoneError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.safety.limiter import CALM_PATIENCE, WATCHDOG_UNIT, watchdog_count

@@ -13,7 +13,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.hardware.calibration import find_sign
 from wlr_gym.hardware.commissioning.stand import LARGEST_LEAN, LOW_PWM, PERIOD, Person, SlippedError, Stand, TroubleError
 from wlr_gym.hardware.dynamixel.bus import Block
-from wlr_gym.hardware.dynamixel.errors import RefusedError
+from wlr_gym.hardware.dynamixel.protocol import RefusedError
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS
 
 

@@ -1,12 +1,9 @@
-"""Servos on serial ports: reading and writing control table items by name, one bus group per port.
-
-One thread owns a group. Nothing here decides what is safe to send, and nothing retries but :meth:`BusGroup.torque_off`: that is
-the business of whoever uses it.
-"""
+"""Items of a control table that are read together: neighbours, or from anywhere through Indirect Data."""
 
 from __future__ import annotations
 
 import contextlib
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -15,14 +12,134 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.hardware.dynamixel import protocol
-from wlr_gym.hardware.dynamixel.blocks import Block, BlockReading, IndirectBlock
-from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
-from wlr_gym.hardware.dynamixel.protocol import Error, Status
-from wlr_gym.hardware.dynamixel.tables import ControlTable
-from wlr_gym.hardware.dynamixel.tick_clock import STALE, TickClock
+from wlr_gym.hardware.dynamixel.protocol import Error, NoAnswerError, RefusedError, RestlessLineError, Status
+from wlr_gym.hardware.dynamixel.tables import ControlTable, Item
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.dynamixel.port import DynamixelPort
+
+
+class Block:
+    """Neighbouring items of a control table that are read together.
+
+    Attributes:
+        address, length: of the block, bytes.
+        names: of its items.
+
+    Args:
+        table: of the servos.
+        first, last: names of the first and the last item.
+    """
+
+    def __init__(self, table: ControlTable, first: str, last: str) -> None:
+        self.address, self.length = table.block(first, last)
+        inside = [item for item in table.items.values() if self.address <= item.address < self.address + self.length]
+        self.names: tuple[str, ...] = tuple(item.name for item in inside)
+        pattern, place = "<", self.address
+        for item in inside:
+            pattern += f"{item.address - place}x" + _letter(item)
+            place = item.address + item.size
+        self._struct = struct.Struct(pattern)
+
+    def decode(self, data: bytes) -> dict[str, int]:
+        """Return item -> count."""
+        return dict(zip(self.names, self._struct.unpack(data), strict=True))
+
+
+class IndirectBlock(Block):
+    """Items from anywhere in a control table that are read together, through the Indirect Data that stand for them.
+
+    Args:
+        table: of the servos.
+        names: of the items; 28 bytes at most.
+
+    Attributes:
+        pointers: what the Indirect Addresses must hold, from the first on.
+    """
+
+    def __init__(self, table: ControlTable, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+        items = [table[name] for name in self.names]
+        self.address = table["indirect_data_1"].address
+        self.length = sum(item.size for item in items)
+        places = [item.address + k for item in items for k in range(item.size)]
+        self.pointers: bytes = struct.pack(f"<{len(places)}H", *places)
+        self._struct = struct.Struct("<" + "".join(_letter(item) for item in items))
+
+
+def _letter(item: Item) -> str:
+    letter = {1: "b", 2: "h", 4: "i"}[item.size]
+    return letter if item.signed else letter.upper()
+
+
+@dataclass(frozen=True)
+class BlockReading:
+    """What one servo answered to a block read.
+
+    Attributes:
+        counts: item -> count.
+        alert: it has a hardware error (the counts are valid all the same).
+        age: s since the servo took the reading, from its own clock; 0 where the block holds no clock.
+        restarted: its clock jumped: it was rebooted, or had no power.
+    """
+
+    counts: Mapping[str, int]
+    alert: bool
+    age: float = 0.0
+    restarted: bool = False
+
+
+# --- a servo's own clock against ours ---------------------------------------------------------------------------------
+
+
+#: Part by which a servo's clock may run slow.
+CLOCK_TOLERANCE = 0.02
+#: Age at which a reading is stale, s.
+STALE = 0.012
+#: Age beyond which a reading is not late, but the servo's clock restarted, s.
+LATEST = 1.0
+#: Realtime Tick wraps at this many ms.
+_TICKS = 32768
+
+
+class TickClock:
+    """Tells how old a reading is from the servo's Realtime Tick (ms, modulo 32768) and our clock.
+
+    The freshest reading seen so far sets the offset between the two clocks; the offset is allowed to drift by
+    ``CLOCK_TOLERANCE``, and may be short by what that reading waited for us. A late answer to an earlier request shows as age;
+    Protocol 2.0 has nothing else to tell it by. Any other jump is a servo that restarted.
+    """
+
+    def __init__(self) -> None:
+        self._offset: float | None = None
+        self._time = self._waited = 0.0
+
+    def age(self, tick: int, now: float, waited: float = 0.0) -> tuple[float, bool]:
+        """Return the age (s) of a reading, and whether the servo's clock was found restarted.
+
+        Args:
+            tick: of the reading.
+            now: s, when it was received.
+            waited: s since it was asked for; an answer may have lain there for so long, where this program was not given time.
+        """
+        sample = tick - now * 1e3
+        if self._offset is None:
+            self._offset, self._time, self._waited = sample, now, waited
+        ahead = (sample - self._offset + _TICKS / 2) % _TICKS - _TICKS / 2
+        drift = CLOCK_TOLERANCE * (now - self._time) * 1e3
+        age = max(0.0, -ahead - drift) * 1e-3
+        latest = max(LATEST, waited + STALE)
+        if STALE < age < latest:
+            return age, False
+        restarted = age >= latest or ahead > (STALE + self._waited) * 1e3 + drift
+        if restarted or ahead > -drift:
+            self._waited = waited
+        self._offset, self._time = self._offset + (ahead if restarted else max(ahead, -drift)), now
+        return (0.0 if restarted else age), restarted
+
+
+# --- servos on serial ports: reading and writing control table items by name, one bus group per port ------------------
+
 
 #: s an answer may take beyond its bytes' time on the wire: adapter's latency timer (1 ms) twice, and the scheduler.
 PATIENCE = 0.005

@@ -1,25 +1,22 @@
 """The serial port of one bus: dynamixel-sdk's port driver without its verified defects, and packets in and out of it.
 
-Version 4.1.0 was read and tried. Its defects are numbered below. A test in tests/hardware/test_bus.py shows each in the SDK and
-its absence here: an SDK that has mended one fails that test, and the guard can go. Import only behind ``require_package``: the
-SDK and pyserial are optional.
+Of the SDK, ``PortHandler`` is used and nothing else: the speeds it knows, and its book-keeping of time-outs. Version 4.1.0 was
+read and tried. Its defects are numbered below. A test in tests/hardware/test_bus.py shows each in the SDK and its absence here:
+an SDK that has mended one fails that test, and the guard can go. Import only behind ``require_package``: the SDK is optional.
 """
 
 from __future__ import annotations
 
-import os
-import select
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import dynamixel_sdk as sdk
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.dynamixel import protocol
-from wlr_gym.hardware.dynamixel.errors import BusGoneError
-from wlr_gym.hardware.dynamixel.protocol import Instruction, Packet, Parser, Status
-from wlr_gym.hardware.ports import FAILURES, open_serial
+from wlr_gym.hardware.dynamixel.protocol import BusGoneError, Instruction, Packet, Parser, Status
+from wlr_gym.hardware.serial_frames import Device, SerialDevice
 
 #: After an exchange was given up, the line is waited on to fall quiet before so many exchanges.
 _GIVEN_UP = 2
@@ -36,6 +33,8 @@ class DynamixelPort(sdk.PortHandler):
         path: device.
         baud_rate: bit/s.
         patience: s an answer may take beyond its bytes' time on the wire.
+        clock: s; what time-outs are told by.
+        make_device: opens the device; the emulator in memory puts its own here.
 
     Attributes:
         suspect: an exchange did not end well, and what still comes in may belong to it: so many good ones until it cannot.
@@ -44,7 +43,14 @@ class DynamixelPort(sdk.PortHandler):
         discarded: bytes thrown away because they belonged to an exchange that was given up.
     """
 
-    def __init__(self, path: str, baud_rate: int, patience: float) -> None:
+    def __init__(
+        self,
+        path: str,
+        baud_rate: int,
+        patience: float,
+        clock: Callable[[], float] = time.monotonic,
+        make_device: Callable[[str, int], Device] = SerialDevice,
+    ) -> None:
         super().__init__(path)
         self.baudrate = baud_rate
         self.patience = patience
@@ -54,10 +60,15 @@ class DynamixelPort(sdk.PortHandler):
         self.quiet = True
         self.gone = False
         self.discarded = 0
+        self._clock, self._make_device = clock, make_device
 
-    def _lost(self, error: Exception) -> BusGoneError:
-        self.gone = True
-        return BusGoneError(f"port {self.port_name} is gone: {error}")
+    def _do(self, act: Callable[[Any], Any]) -> Any:
+        """Do something with the device. Defect 4: an unplugged adapter shows as a time-out, then as one of three exceptions."""
+        try:
+            return act(self.ser)
+        except (OSError, AttributeError) as error:  # the last: a port that was never opened
+            self.gone = True
+            raise BusGoneError(f"port {self.port_name} is gone: {error}") from None
 
     def openPort(self) -> bool:  # noqa: N802
         """Open the device. Defect 5: a missing one raised whatever pyserial had; now an InputError that names it."""
@@ -69,7 +80,7 @@ class DynamixelPort(sdk.PortHandler):
     def setupPort(self, cflag_baud: int) -> Literal[True]:  # noqa: N802
         """Set up the device. Defect 7: the SDK sets speed and throws input away, whoever drives servos on the port."""
         self.closePort()
-        self.ser = open_serial(self.port_name, self.baudrate)
+        self.ser: Any = self._make_device(self.port_name, self.baudrate)
         self.is_open = True
         self.tx_time_per_byte = 10e3 / self.baudrate
         return True
@@ -84,16 +95,13 @@ class DynamixelPort(sdk.PortHandler):
         self.parser.clear()
         self.queue.clear()
         self.quiet = not self.suspect or self._falls_quiet()
-        try:
-            super().clearPort()
-        except (*FAILURES, AttributeError) as error:
-            raise self._lost(error) from None
+        self._do(lambda device: device.reset_input_buffer())
 
     def _falls_quiet(self) -> bool:
         """Let pass what still comes. An end is set to it: on a line that always talks, torque-off must go out all the same."""
         end = self.getCurrentTime() + (self.patience + min(_MORE_PATIENCE * self.patience, _MORE_TIME)) * 1e3
         while self.getCurrentTime() < end:
-            data = self._wait_and_read(4096, self.patience)
+            data = self._do(lambda device: device.wait(self.patience))
             if not data:
                 return True
             self.discarded += len(data)
@@ -101,37 +109,22 @@ class DynamixelPort(sdk.PortHandler):
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         """Return bytes as soon as there are some. Defect 2: the SDK spins at full load until they come."""
-        return self._wait_and_read(length, max(0.0, self.packet_timeout - self.getTimeSinceStart()) * 1e-3)
-
-    def _wait_and_read(self, length: int, seconds: float) -> bytes:
-        # Defect 4: an unplugged adapter shows as a time-out, then as one of three kinds of exception.
-        device: Any = self.ser
-        try:
-            number = device.fileno()
-            if not select.select([number], [], [], seconds)[0]:
-                return b""
-            if data := os.read(number, length):
-                return data
-            raise OSError("it is ready and has nothing: disconnected, or another program reads it")
-        except (*FAILURES, ValueError, TypeError, AttributeError) as error:  # pyserial's, on a port that closed meanwhile
-            raise self._lost(error) from None
+        seconds = max(0.0, self.packet_timeout - self.getTimeSinceStart()) * 1e-3
+        return self._do(lambda device: device.wait(seconds))
 
     def writePort(self, packet: bytes) -> int:  # noqa: N802
         """Send all bytes. Defect 6: pyserial then waits, without end, until the device would take more."""
-        try:
-            if (sent := self._write(packet)) < len(packet):
+
+        def send(device: Any) -> int:
+            if (sent := device.write(packet)) < len(packet):
                 raise OSError(f"it took {sent} of {len(packet)} bytes")
             return sent
-        except (*FAILURES, TypeError, AttributeError) as error:  # the last: a port that was never opened
-            raise self._lost(error) from None
 
-    def _write(self, data: bytes) -> int:
-        device: Any = self.ser
-        return os.write(device.fileno(), data)  # does not block: a full buffer is an OSError, a nearly full one takes a part
+        return self._do(send)
 
     def getCurrentTime(self) -> float:  # noqa: N802
         """Return ms. Defect 2: the SDK's time-outs followed the wall clock, which may be set."""
-        return time.monotonic() * 1e3
+        return self._clock() * 1e3
 
     def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
         """Start the time an answer may take. Defect 1: the SDK's floor is 34 ms, whatever its user asks for."""

@@ -1,4 +1,4 @@
-"""Dynamixel Protocol 2.0: packets to bytes and back. No input or output, no clock.
+"""Dynamixel Protocol 2.0: packets to bytes and back, and what can go wrong on a bus. No input or output, no clock.
 
 Packet: FF FF FD 00, id, length (2 bytes: instruction, parameters and CRC), instruction, parameters, CRC-16. Wherever
 instruction and parameters hold FF FF FD, a further FD is stuffed in on the line. Numbers are little-endian. Source: ROBOTIS
@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
 from typing import NamedTuple
+
+from wlr_gym.hardware.serial_frames import crc16
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -24,6 +26,22 @@ CLEAR_TURNS = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])
 
 _PATTERN = b"\xff\xff\xfd"
 _STUFFED = b"\xff\xff\xfd\xfd"
+
+
+class BusGoneError(ConnectionError):
+    """The port does not work any more: unplugged adapter, dead driver."""
+
+
+class NoAnswerError(TimeoutError):
+    """A servo did not answer."""
+
+
+class RestlessLineError(NoAnswerError):
+    """A servo did not answer, or was not heard: the line never falls quiet."""
+
+
+class RefusedError(RuntimeError):
+    """A servo refused an instruction."""
 
 
 class Instruction(IntEnum):
@@ -88,23 +106,6 @@ class Status(NamedTuple):
 # --- CRC and stuffing -------------------------------------------------------------------------------------------------
 
 
-def _crc_entry(byte: int) -> int:
-    value = byte << 8
-    for _ in range(8):
-        value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
-    return value & 0xFFFF
-
-
-_CRC_TABLE = tuple(_crc_entry(byte) for byte in range(256))
-
-
-def crc16(data: bytes, crc: int = 0) -> int:
-    """Return the CRC-16 of ``data`` (polynomial 8005, start value 0, not reflected), continuing from ``crc``."""
-    for byte in data:
-        crc = (crc << 8 & 0xFF00) ^ _CRC_TABLE[crc >> 8 ^ byte]
-    return crc
-
-
 def stuff(body: bytes) -> bytes:
     """Return instruction and parameters as they go over the line."""
     return body.replace(_PATTERN, _STUFFED)
@@ -113,9 +114,6 @@ def stuff(body: bytes) -> bytes:
 def unstuff(body: bytes) -> bytes:
     """Undo :func:`stuff`."""
     return body.replace(_STUFFED, _PATTERN)
-
-
-# --- encoding ---------------------------------------------------------------------------------------------------------
 
 
 def word(value: int) -> bytes:
@@ -187,7 +185,7 @@ def encode_fast_status(answers: Sequence[Status]) -> list[bytes]:
     return pieces
 
 
-# --- decoding ---------------------------------------------------------------------------------------------------------
+# ---- decoding ----
 
 
 def as_status(packet: Packet) -> Status | None:

@@ -8,11 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wlr_gym.hardware.camera.config import CameraFile
-from wlr_gym.hardware.camera.feed import PoseFeed, RobotPose
-from wlr_gym.hardware.camera.reading import CameraReading, reading_of
-from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS, Exposure, RenderedCamera
-from wlr_gym.hardware.camera.stamps import StampClock
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, CameraFile, CameraReading, StampClock, reading_of
+from wlr_gym.hardware.camera.rendered import Exposure, PoseFeed, RenderedCamera, RobotPose
 from wlr_gym.hardware.emulator.machine import Machine
 from wlr_gym.perception.vision.tracking import PoseFinder, VideoFrame
 from wlr_gym.robot import LEG_SLICE

@@ -28,8 +28,7 @@ from wlr_gym.hardware.dynamixel.tables import (
     PWM_MODE,
     VELOCITY_MODE,
 )
-from wlr_gym.hardware.emulator.motion import MotorDrive
-from wlr_gym.hardware.emulator.servo import EmulatedServo
+from wlr_gym.hardware.emulator.servo import EmulatedServo, MotorDrive
 from wlr_gym.physics import servo as law
 from wlr_gym.physics.plants.base import Plant, PlantState
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, Robot

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.hardware.camera.rendered import CAMERA_FAULTS
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS
 
 
 class FaultKind(NamedTuple):

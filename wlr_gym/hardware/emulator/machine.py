@@ -1,33 +1,57 @@
-"""The emulated robot: eight servos and sensors around any one-robot Plant, in emulated time. No ports, no clock of its own."""
+"""The emulated robot, in emulated time: eight servos and sensors around any one-robot plant. No ports, no clock of its own.
+
+:func:`run_command` takes lines of text (faults, ``clear``, ``faults``, ``status``, ``turn``, ``straighten``, ``help``).
+:class:`EmulatedStand` holds the robot by springs with its wheels off the ground, with the hands of whoever stands beside it.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, load_table
+from wlr_gym.hardware.config import FlowPort, Hardware, check_fit
+from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, error_names, load_table
 from wlr_gym.hardware.emulator.coupling import PlantCoupling
-from wlr_gym.hardware.emulator.faults import Fault, FaultBoard, parse_fault
-from wlr_gym.hardware.emulator.flow import EmulatedFlow
+from wlr_gym.hardware.emulator.faults import FAULTS, Fault, FaultBoard, parse_fault
 from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
 from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo
-from wlr_gym.hardware.fit import check_fit
-from wlr_gym.hardware.imu.frames import ImuFrame, encode_frame
-from wlr_gym.hardware.imu.reading import Conversion
+from wlr_gym.hardware.flow import FLOW_FRAMES, FULL_QUALITY, FlowConversion
+from wlr_gym.hardware.imu import IMU_FRAMES, Conversion
+from wlr_gym.physics.effects import apply_patch, load_patch
+from wlr_gym.physics.effects.patch import Source
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState
-from wlr_gym.physics.plants.forces import Force
-from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, standing_state
+from wlr_gym.physics.plants.forces import Force, force_values, make_force
+from wlr_gym.physics.plants.simulator import Simulator
+from wlr_gym.physics.servo import winding
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.sensors import FlowSensor
 
 #: Frames after which the last bit changes of a chip without noise.
 IMU_DITHER = 3
 #: 30 degC as the chip counts it.
 _IMU_TEMPERATURE = round((30.0 - 36.53) * 340)
+
+
+#: Shutter on a floor of good texture in a lit room, and at its longest.
+_SHUTTER, _LONGEST_SHUTTER = 0x0400, 0x1FFF
+#: Frames after which the last bit of the surface quality changes, of a plant without noise.
+_DITHER = 3
+
+
+#: m that the body hangs above the floor.
+HEIGHT = 0.5
+#: N m of a hand that holds a wheel or a leg.
+GRIP = 10.0
+#: Springs and dampers of the stand: stiff in place, and slow to follow a hand that tilts the body (0.5 s).
+_PLACE = {"k": 4000.0, "c": 250.0}
+_ATTITUDE = {"k": 40.0, "c": 20.0}
+_ANGLES = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
@@ -107,13 +131,15 @@ class Machine:
         self.ticks = 0
         self.faults: FaultBoard = FaultBoard(self.options.seed)
         self.watchers: list[Callable[[], None]] = []
-        self._flow = self._make_flow()
+        port, sensor = hardware.flow, robot.sensors.flow
+        has_flow = port is not None and sensor is not None
+        self._flow = EmulatedFlow(port, sensor, self.faults, self.options.tick) if has_flow else None
         self._output: dict[str, list[Emission]] = {name: [] for name in self.sensors}
         self._imu = Conversion(hardware.imu)
         self._frames = 0
         self._paused = 0.0
         self._imu_values = (0, 0, 0), (0, 0, 0)
-        self._imu_frame = ImuFrame(0, 0, (0, 0, 0), _IMU_TEMPERATURE, (0, 0, 0))
+        self._imu_frame = IMU_FRAMES.encode((0, 0, 0, 0, 0, _IMU_TEMPERATURE, 0, 0, 0))
         self.servos: dict[str, EmulatedServo] = {joint: self._make_servo(joint) for joint in JOINTS}
         servos = list(self.servos.values())
         self.coupling: PlantCoupling = PlantCoupling(robot, hardware, self.plant, servos, parameters, self.options.seed, state)
@@ -123,10 +149,6 @@ class Machine:
             name: BusLine(name, [self.servos[joint] for joint in bus.joints], self.faults, self.options.timing)
             for name, bus in hardware.buses.items()
         }
-
-    def _make_flow(self) -> EmulatedFlow | None:
-        port, sensor = self.hardware.flow, self.robot.sensors.flow
-        return None if port is None or sensor is None else EmulatedFlow(port, sensor, self.faults, self.options.tick)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -210,9 +232,8 @@ class Machine:
             self._imu_values = force, (x, y, z if self.options.sensor_noise else z + self._frames // IMU_DITHER % 2)
         force, rate = self._imu_values
         if not self.faults.active(self.time, "imu_stale", ["imu"]):
-            self._imu_frame = ImuFrame(self._frames % 65536, round(stamp * 1e6) % 2**32, force, _IMU_TEMPERATURE, rate)
-        frame = self._imu_frame
-        raw, delay = self.faults.mangle(self.time, encode_frame(frame), ["imu"])
+            self._imu_frame = IMU_FRAMES.encode((self._frames, round(stamp * 1e6), *force, _IMU_TEMPERATURE, *rate))
+        raw, delay = self.faults.mangle(self.time, self._imu_frame, ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
             self._output["imu"].append(Emission(self.time + delay, raw))
 
@@ -248,3 +269,199 @@ class Machine:
         self.coupling.supply = max(0.0, self.coupling.nominal_supply - (sag.value if sag else 0.0))
         for line in self.lines.values():
             line.apply_faults(self.time)
+
+
+class EmulatedFlow:
+    """Chip and microcontroller.
+
+    Args:
+        port: the chip's axes; of its calibration nothing: what is wrong with the sensor is the plant's.
+        sensor: of the robot's file.
+        faults: shared with the rest of the robot.
+        tick: s of emulated time.
+    """
+
+    def __init__(self, port: FlowPort, sensor: FlowSensor, faults: FaultBoard, tick: float) -> None:
+        self._convert = FlowConversion(port.model_copy(update={"calibration": type(port.calibration)()}), sensor)
+        self._sensor, self._faults, self._tick = sensor, faults, tick
+        self._frames = 0
+        self._sent_at = 0.0
+        self._last = (0, 0, 0, 0)  # counts along x and y, SQUAL, Shutter
+
+    def step(self, time: float, paused: float, sensors: Sensors) -> list[Emission]:
+        """Return what is sent at a tick, s: a frame for each of the chip's.
+
+        Args:
+            time: s of emulated time.
+            paused: s for which it stood still while quartzes went on.
+            sensors: of the plant at this tick.
+        """
+        is_valid = bool(sensors.flow_is_new[0])
+        if not is_valid and time - self._sent_at < 1.0 / self._sensor.rate + self._tick:
+            return []
+        self._sent_at = time
+        self._frames += 1
+        interval = 1.0 / self._sensor.rate
+        end = time - float(sensors.flow_age[0]) if is_valid else time
+        flow = sensors.flow[0] if is_valid else np.zeros(2)
+        quality = float(sensors.flow_quality[0]) if is_valid else 0.0
+        self._last = self._counted(time, flow, quality, interval)
+        stamp = round((end + paused) * 1e6)
+        frame = FLOW_FRAMES.encode((self._frames, stamp, round(interval * 1e6), *self._last))
+        raw, delay = self._faults.mangle(time, frame, ["flow"])
+        if not raw or self._faults.happens(time, "dead", ["flow"]):
+            return []
+        return [Emission(time + delay, raw)]
+
+    def _counted(self, time: float, flow: np.ndarray, quality: float, interval: float) -> tuple[int, int, int, int]:
+        """Return counts along x and y, SQUAL and Shutter, with what the faults make of them."""
+        active = self._faults.active
+        if active(time, "flow_frozen", ["flow"]) is not None:
+            return self._last
+        if (turned := active(time, "flow_turned", ["flow"])) is not None:
+            c, s = math.cos(turned.value), math.sin(turned.value)
+            flow = np.array([c * flow[0] + s * flow[1], c * flow[1] - s * flow[0]])
+        if (scale := active(time, "flow_scale", ["flow"])) is not None:
+            flow = scale.value * flow
+        x, y = self._convert.counts(flow, interval)
+        if (stuck := active(time, "flow_saturated", ["flow"])) is not None:
+            x = y = round(stuck.value)
+        squal, shutter = round(quality * FULL_QUALITY), _SHUTTER if quality > 0.0 else _LONGEST_SHUTTER
+        squal += self._frames // _DITHER % 2 if squal else 0
+        if (bare := active(time, "flow_texture", ["flow"])) is not None:
+            x, y, squal, shutter = 0, 0, round(bare.value), _LONGEST_SHUTTER
+        return x, y, min(squal, 255), shutter
+
+
+def run_command(machine: Machine, text: str) -> str:
+    """Carry out one line of text and return the answer.
+
+    Raises:
+        InputError: it cannot be understood.
+    """
+    word, *rest = text.split() or ["help"]
+    if word in FAULTS:
+        return f"{machine.time:.3f} s: {machine.inject(text)}"
+    if word == "clear":
+        if rest and rest[0] not in FAULTS:
+            raise unknown_name("fault", rest[0], FAULTS)
+        machine.clear(rest[0] if rest else None)
+        return "cleared"
+    if word == "turn":
+        return _turn(machine, text, rest)
+    if word == "straighten":
+        machine.straighten(" ".join(rest))
+        return f"{rest[0]} hangs straight down"
+    if word == "faults":
+        return "\n".join(machine.faults.listing(machine.time)) or "no faults"
+    if word == "status":
+        return _status(machine)
+    if word == "help":
+        return _help()
+    raise unknown_name("command", word, ["faults", "status", "help", "clear", "turn", "straighten", *FAULTS])
+
+
+def _turn(machine: Machine, text: str, words: list[str]) -> str:
+    try:
+        joint, degrees = words
+        angle = float(np.deg2rad(float(degrees)))
+    except ValueError:
+        raise InputError(f"'{text}': expected turn JOINT DEGREES") from None
+    machine.turn(joint, angle)
+    return f"{joint} turned by {degrees} deg"
+
+
+def _status(machine: Machine) -> str:
+    """One line per servo: torque, mode, position, velocity, supply, temperature, errors."""
+    lines = [f"{machine.time:.3f} s"]
+    for joint, servo in machine.servos.items():
+        errors = ", ".join(error_names(servo["hardware_error_status"])) or "no error"
+        power = "no power" if servo.dead else "torque on" if servo["torque_enable"] else "torque off"
+        lines.append(
+            f"{joint:9} id {servo['id']:3}  {power:10}  mode {servo['operating_mode']:2}"
+            f"  position {servo['present_position']:6}  velocity {servo['present_velocity']:4}"
+            f"  {servo['present_input_voltage'] / 10:4.1f} V  {servo['present_temperature']:3} degC  {errors}"
+        )
+    return "\n".join(lines)
+
+
+def _help() -> str:
+    lines = [
+        "status | faults | clear [KIND] | turn JOINT DEGREES | straighten LEG | help",
+        "KIND [WHERE ...] [probability=] [value=] [after=] [duration=]",
+    ]
+    for name, kind in FAULTS.items():
+        value = f" (value: {kind.unit}, default {kind.value:g})" if kind.unit else ""
+        lines.append(f"  {name:9} {kind.doc}{value}")
+    return "\n".join(lines)
+
+
+class EmulatedStand:
+    """An emulated robot on a stand.
+
+    Args:
+        robot, hardware: as for :class:`Machine`.
+        effects: what the robot has that its file does not say.
+        parameters: of the robot before the effects; None = nominal.
+        options: of the machine.
+
+    Attributes:
+        machine: the robot.
+        stall_current: A of a wheel's motor at stall.
+
+    Raises:
+        InputError: effects that cannot be read or that this robot cannot have.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        hardware: Hardware,
+        effects: Source = None,
+        parameters: Parameters | None = None,
+        options: MachineOptions | None = None,
+    ) -> None:
+        patch, options = load_patch(effects), options or MachineOptions()
+        changed = apply_patch(patch, parameters or Parameters.nominal(robot))
+        self._forces = patch.forces
+        plant = make_plant(options.backend, robot, 1, options.plant_options(), [*_stand_forces(), *patch.forces])
+        assert isinstance(plant, Simulator), "the emulator runs on simulators only"
+        self._plant: Simulator = plant
+        state = standing_state(robot, changed)
+        state.position[0, 2] = HEIGHT
+        self.machine: Machine = Machine(robot, hardware, options, plant=plant, parameters=changed, state=state)
+        self._friction = dict(zip(JOINTS, changed["servo.coulomb_friction"][0].tolist(), strict=True))
+        self.stall_current: float = robot.servo.supply_voltage / float(winding(robot)[1][-1])
+
+    def tilt(self, **angles: float) -> None:
+        """Begin to turn the body to ``roll``, ``pitch`` and ``yaw`` (rad; the others to 0); it gets there in about 2 s."""
+        self._plant.set_force_values(force_values([*_stand_forces(**angles), *self._forces])[None])
+
+    def brake(self, joint: str) -> None:
+        """Hold a wheel or a leg by hand."""
+        self.machine.coupling.set_friction(joint, GRIP)
+
+    def release(self, joint: str) -> None:
+        """Let go of it."""
+        self.machine.coupling.set_friction(joint, self._friction.get(joint, 0.0))
+
+    def wheel_current(self) -> float:
+        """Return what the wheels draw from the supply, A: motor currents times the part of the time they are switched on."""
+        shafts = [self.machine.servos[wheel].shaft for wheel in WHEELS]
+        return sum(abs(shaft.output()[1]) * abs(shaft.load) for shaft in shafts) * self.stall_current
+
+
+def _stand_forces(**angles: float) -> list[Force]:
+    """Return what holds the body in place, at ``roll``, ``pitch`` and ``yaw`` (rad); 0 where one is not named."""
+    units = {"k": "N/m", "c": "N s/m"}
+    height = "k * (height - position_z) - c * velocity_z"
+    forces = [
+        make_force(["floor_force_z"], height, {**_PLACE, "height": HEIGHT}, {**units, "height": "m"}),
+        make_force(["floor_force_x"], "-k * position_x - c * floor_velocity_x", _PLACE, units),
+        make_force(["floor_force_y"], "-k * position_y - c * floor_velocity_y", _PLACE, units),
+    ]
+    units = {"k": "N m/rad", "c": "N m s/rad", "tilt": "rad"}
+    for name in _ANGLES:
+        formula = f"k * (tilt - {name}) - c * {name}_rate"
+        forces.append(make_force([f"body_torque_{name}"], formula, {**_ATTITUDE, "tilt": angles.get(name, 0.0)}, units))
+    return forces

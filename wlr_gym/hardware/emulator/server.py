@@ -22,8 +22,7 @@ from pathlib import Path
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
-from wlr_gym.hardware.emulator.commands import run_command
-from wlr_gym.hardware.emulator.machine import Machine
+from wlr_gym.hardware.emulator.machine import Machine, run_command
 
 #: Emulated time may fall behind by this much (s); beyond, it slips. Short of what trips a Bus Watchdog: bytes wait meanwhile.
 LARGEST_LAG = 0.05

@@ -1,27 +1,387 @@
-"""One emulated servo: what its firmware does with instructions and time.
-
-:class:`Registers` is its control table, :class:`Health` what it watches about itself. No motion here:
-:meth:`EmulatedServo.drive` is what the firmware asks of the motor, and :class:`Shaft` what the physics made of it, both in the
-encoder's own frame. Source: ROBOTIS e-manual; where it is silent, docs/emulator.md lists what was chosen.
-"""
+"""Control table of one emulated servo as bytes, with its access rules and indirect addresses."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from wlr_gym.hardware.dynamixel.protocol import ALERT, CLEAR_TURNS, Error
 from wlr_gym.hardware.dynamixel.tables import (
     BAUD_RATES,
     CURRENT_MODE,
+    INPUT_VOLTAGE,
+    OVERHEATING,
+    OVERLOAD,
     POSITION_MODE,
     POSITION_MODES,
     PWM_MODE,
+    TABLE_SIZE,
     ControlTable,
     Item,
 )
-from wlr_gym.hardware.emulator.health import Health
-from wlr_gym.hardware.emulator.motion import TIME_BASED, EncoderFrame, MotorDrive, Shaft, ShaftEncoder, motor_drive
-from wlr_gym.hardware.emulator.registers import GOAL_REGISTERS, Registers
+
+GOAL_REGISTERS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+
+
+class Registers:
+    """Items of a control table.
+
+    Args:
+        table: of the servo's model.
+        present: item -> works out its count; done when the item is read.
+        changed: called with an item's name after its count was set.
+
+    Attributes:
+        memory: the bytes.
+        get: item -> the count it was set to last.
+    """
+
+    def __init__(self, table: ControlTable, present: Mapping[str, Callable[[], int]], changed: Callable[[str], None]) -> None:
+        self.table = table
+        self.memory: bytearray = bytearray(TABLE_SIZE)
+        self._present = present
+        self._changed = changed
+        items = table.items.values()
+        self._counts = dict.fromkeys(table.items, 0)  # of items that are set; set alone writes it
+        self.get: Callable[[str], int] = self._counts.__getitem__
+        self._at = {item.address + k: item for item in items for k in range(item.size)}
+        self._pointers = {
+            table[f"indirect_data_{k}"].address: table[f"indirect_address_{k}"]
+            for k in range(1, 1 + sum(item.name.startswith("indirect_data") for item in items))
+        }
+        self._plans: dict[tuple[int, int], tuple[list[Item], list[int]]] = {}  # while no pointer is written
+
+    # ---- by name ----
+
+    def __getitem__(self, name: str) -> int:
+        """Return the count an item holds now."""
+        item = self.table[name]
+        return self._refresh(item) if name in self._present else self.get(name)
+
+    def set(self, name: str, count: int) -> None:
+        """Put a count into an item past all access rules.
+
+        Raises:
+            InputError: unknown item, or a count that does not fit.
+        """
+        item = self.table[name]
+        self.memory[item.address : item.address + item.size] = item.encode(count)
+        self._counts[name] = int(count)
+        if name.startswith("indirect_address"):
+            self._plans.clear()
+        self._changed(name)
+
+    def load_defaults(self, in_eeprom: bool) -> None:
+        """Set the items of the EEPROM, or of the RAM, to their defaults."""
+        items = [item for item in self.table.items.values() if item.in_eeprom == in_eeprom]
+        for item in items:  # plain defaults first: the others copy them
+            self.set(item.name, item.default if isinstance(item.default, int) else 0)
+        for item in items:
+            if isinstance(item.default, str):
+                self.set(item.name, self.get(item.default))
+
+    # ---- by address ----
+
+    def read(self, address: int, length: int) -> tuple[Error, bytes]:
+        """Return ``length`` bytes from ``address``; gaps read as 0."""
+        if length == 0 or address + length > TABLE_SIZE:
+            return Error.ACCESS, b""
+        block = (address, length)
+        if block not in self._plans:
+            self._plans[block] = self._plan(*block)
+        kept_up, places = self._plans[block]
+        for item in kept_up:
+            self._refresh(item)
+        return Error.NONE, bytes([self.memory[place] for place in places])
+
+    def _plan(self, address: int, length: int) -> tuple[list[Item], list[int]]:
+        """Return the items to work out before a block is read, and the addresses of the bytes that it stands for."""
+        places = [self._resolve(place) for place in range(address, address + length)]
+        inside = [item for place in places if (item := self._at.get(place)) and item.name in self._present]
+        return list(dict.fromkeys(inside)), places
+
+    def _refresh(self, item: Item) -> int:
+        """Work an item out that the servo keeps up to date; return its count."""
+        count = self._present[item.name]()
+        self.memory[item.address : item.address + item.size] = item.encode(count)
+        return count
+
+    def _resolve(self, address: int) -> int:
+        """Follow an Indirect Data byte to the byte it stands for."""
+        pointer = self._pointers.get(address)
+        return address if pointer is None else self.get(pointer.name)
+
+    def check_write(self, address: int, data: bytes) -> tuple[Error, list[tuple[Item, int]]]:
+        """Split a write into items with their new counts, and check each; nothing is written."""
+        changes: list[tuple[Item, int]] = []
+        place = 0
+        while place < len(data):
+            item = self._at.get(self._resolve(address + place)) if address + place < TABLE_SIZE else None
+            if item is None:
+                return Error.ACCESS, []
+            targets = [self._resolve(address + place + k) for k in range(min(item.size, len(data) - place))]
+            if targets != list(range(item.address, item.address + item.size)):
+                return Error.DATA_LENGTH, []
+            count = item.decode(data[place:])
+            error = self._check(item, count)
+            if error != Error.NONE:
+                return error, []
+            changes.append((item, count))
+            place += item.size
+        return (Error.NONE, changes) if data else (Error.DATA_LENGTH, [])
+
+    def _check(self, item: Item, count: int) -> Error:
+        if not item.writable or (item.in_eeprom and self.get("torque_enable")):
+            return Error.ACCESS
+        latched = self.get("bus_watchdog") < 0
+        if latched and (item.name in GOAL_REGISTERS or (item.name == "bus_watchdog" and count != 0)):
+            return Error.DATA_RANGE
+        if item.name == "operating_mode":
+            return Error.NONE if count in self.table.operating_modes else Error.DATA_RANGE
+        if item.name == "goal_position" and self.get("operating_mode") != POSITION_MODE:
+            return Error.NONE if abs(count) <= self.table.extended_range else Error.DATA_RANGE
+        if not self._bound(item.low) <= count <= self._bound(item.high):
+            return Error.DATA_LIMIT if isinstance(item.high, str) else Error.DATA_RANGE
+        return Error.NONE
+
+    def _bound(self, bound: int | str | None) -> int:
+        if isinstance(bound, str):
+            return -self.get(bound[1:]) if bound.startswith("-") else self.get(bound)
+        assert bound is not None, "every writable item has bounds"
+        return bound
+
+
+# --- what an emulated servo's firmware asks of the motor, and what the physics hands back -----------------------------
+
+
+#: Part of a turn by which Homing Offset acts in position mode.
+HOMING_IN_POSITION_MODE = 0.25
+#: Bit of Drive Mode: profiles say how long a way takes, not how fast it is.
+TIME_BASED = 4
+
+
+@dataclass
+class Shaft:
+    """What the physics hands to a servo each tick.
+
+    Attributes:
+        position, velocity: rad from encoder count 0, rad/s, as the encoder says.
+        true_position, true_velocity: as it is.
+        load: motor torque over stall torque, 0 to about 1.
+        voltage: V at the servo.
+        output: asks for the counts of Present Current or Present Load, and for the part of the supply on the motor, -1 to 1.
+        reference: asks where the profile generator stands: rad and rad/s.
+    """
+
+    position: float = 0.0
+    velocity: float = 0.0
+    true_position: float = 0.0
+    true_velocity: float = 0.0
+    load: float = 0.0
+    voltage: float = 12.0
+    output: Callable[[], tuple[int, float]] = lambda: (0, 0.0)
+    reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
+
+
+class ShaftEncoder:
+    """What a servo's encoder says of its shaft.
+
+    Attributes:
+        offset: rad that it is off. is_frozen: it repeats its reading.
+    """
+
+    def __init__(self) -> None:
+        self.offset = 0.0
+        self.is_frozen = False
+        self._position = 0.0
+
+    @property
+    def is_true(self) -> bool:
+        """Whether it says what is."""
+        return self.offset == 0.0 and not self.is_frozen
+
+    def read(self, position: float, velocity: float) -> tuple[float, float]:
+        """Return position (rad) and velocity (rad/s) as the firmware sees them."""
+        if self.is_frozen:
+            return self._position, 0.0
+        self._position = position + self.offset
+        return self._position, velocity
+
+
+@dataclass(frozen=True)
+class MotorDrive:
+    """What the firmware asks of the motor: SI units, encoder frame.
+
+    Attributes:
+        on: torque.
+        mode: Operating Mode.
+        goal_position, goal_velocity: rad, rad/s.
+        goal_current: A; limit of the current in current-based position mode.
+        goal_pwm: part of the supply; limit of the output in every mode but PWM mode.
+        position_gain: V/rad on the position error.
+        velocity_gain, velocity_integral_gain: V s/rad on the velocity error, V/rad on its integral.
+        profile_velocity, profile_acceleration: rad/s, rad/s2; 0 = none.
+    """
+
+    on: bool
+    mode: int
+    goal_position: float
+    goal_velocity: float
+    goal_current: float
+    goal_pwm: float
+    position_gain: float
+    velocity_gain: float
+    velocity_integral_gain: float
+    profile_velocity: float
+    profile_acceleration: float
+
+
+class EncoderFrame:
+    """From the encoder's frame to Present Position: direction, turns counted, Homing Offset.
+
+    Args:
+        table: of the servo.
+
+    Attributes:
+        direction: 1, or -1 where Drive Mode reverses it.
+    """
+
+    #: Items that decide what Present Position counts from, and which way.
+    ITEMS = ("drive_mode", "operating_mode", "homing_offset")
+
+    def __init__(self, table: ControlTable) -> None:
+        self.direction = 1
+        self._unit, self._turn = table.per_count("present_position"), table.counts.turn
+        self._homing_limits = round(HOMING_IN_POSITION_MODE * self._turn), table.extended_range
+        self._homing = 0
+        self._turns = 0
+
+    def update(self, registers: Registers) -> None:
+        """Take direction and offset from :attr:`ITEMS`."""
+        in_position_mode = registers.get("operating_mode") == POSITION_MODE
+        limit = self._homing_limits[0 if in_position_mode else 1]
+        self.direction = -1 if registers.get("drive_mode") & 1 else 1
+        self._homing = max(-limit, min(limit, registers.get("homing_offset")))
+
+    def start_turn_count(self, position: float) -> None:
+        """Present Position becomes the absolute angle within one turn (plus Homing Offset)."""
+        self._turns = self._raw_count(position) // self._turn
+
+    def count(self, position: float) -> int:
+        """Return Present Position at a position (rad)."""
+        return self._raw_count(position) - self._turn * self._turns + self._homing
+
+    def position(self, count: int) -> float:
+        """Return the position (rad) of a Goal Position."""
+        return self.direction * (count - self._homing + self._turn * self._turns) * self._unit
+
+    def _raw_count(self, position: float) -> int:
+        return self.direction * round(position / self._unit)
+
+
+def motor_drive(registers: Registers, frame: EncoderFrame, profile_start: float, is_powered: bool) -> MotorDrive:
+    """Return what the firmware asks of the motor.
+
+    Args:
+        registers: of the servo.
+        frame: of its encoder.
+        profile_start: rad, where the way to the goal began.
+        is_powered: the electronics work.
+    """
+    si, get = registers.table.per_count, registers.get
+    sign = frame.direction
+    goal = frame.position(get("goal_position"))
+    velocity, acceleration = _profile(registers, abs(goal - profile_start))
+    mode = get("operating_mode")
+    pwm = get("goal_pwm") / registers.table.counts.full_pwm
+    has_current = "goal_current" in registers.table.items
+    return MotorDrive(
+        on=bool(get("torque_enable")) and is_powered,
+        mode=mode,
+        goal_position=goal,
+        goal_velocity=sign * get("goal_velocity") * si("goal_velocity"),
+        goal_current=sign * get("goal_current") * si("goal_current") if has_current else math.inf,
+        goal_pwm=sign * pwm if mode == PWM_MODE else abs(pwm),
+        position_gain=get("position_p_gain") * si("position_p_gain"),
+        velocity_gain=get("velocity_p_gain") * si("velocity_p_gain"),
+        velocity_integral_gain=get("velocity_i_gain") * si("velocity_i_gain"),
+        profile_velocity=velocity,
+        profile_acceleration=acceleration,
+    )
+
+
+def _profile(registers: Registers, way: float) -> tuple[float, float]:
+    """Profile velocity and acceleration in SI units; time-based profiles for the ``way`` (rad) to the goal."""
+    velocity, acceleration = registers.get("profile_velocity"), registers.get("profile_acceleration")
+    if not registers.get("drive_mode") & TIME_BASED:
+        si = registers.table.per_count
+        return velocity * si("profile_velocity"), acceleration * si("profile_acceleration")
+    duration, ramp = velocity * 1e-3, min(acceleration, velocity / 2) * 1e-3
+    if duration == 0.0 or way == 0.0:
+        return 0.0, 0.0
+    speed = way / (duration - ramp)
+    return speed, speed / ramp if ramp > 0.0 else 0.0
+
+
+# --- what an emulated servo watches about itself: supply, temperature, load. The numbers are chosen: the e-manual has n
+
+
+#: Temperature of a servo that does nothing, degC.
+AMBIENT = 25.0
+#: Temperature above ambient in a lasting stall, degC.
+HEATING = 150.0
+#: Time constant of the temperature, s.
+THERMAL_TIME = 120.0
+#: Part of the stall torque that trips the servo ...
+LARGEST_LOAD = 0.8
+#: ... after this time, s.
+OVERLOAD_TIME = 2.0
+
+
+class Health:
+    """Temperature and overload of one servo.
+
+    Attributes:
+        temperature: degC; a reboot does not cool the motor.
+        heating_rate: degC/s that a fault adds. strength: part of the supply that reaches the motor.
+    """
+
+    def __init__(self) -> None:
+        self.temperature = AMBIENT
+        self.heating_rate: float = 0.0
+        self.strength: float = 1.0
+        self._overload_time = 0.0
+
+    def reboot(self) -> None:
+        """Forget how long the overload has lasted."""
+        self._overload_time = 0.0
+
+    def advance(self, step: float, shaft: Shaft, limit: Callable[[str], int], volt: float) -> int:
+        """Let ``step`` seconds pass; return the bits of Hardware Error Status that hold now.
+
+        Args:
+            step: s.
+            shaft: load and supply.
+            limit: item name -> count.
+            volt: V per count of the supply.
+        """
+        load = abs(shaft.load)
+        equilibrium = AMBIENT + HEATING * load * load
+        self.temperature += step * ((equilibrium - self.temperature) / THERMAL_TIME + self.heating_rate)
+        self._overload_time = self._overload_time + step if load > LARGEST_LOAD else 0.0
+        error = 0
+        if not limit("min_voltage_limit") <= round(shaft.voltage / volt) <= limit("max_voltage_limit"):
+            error |= INPUT_VOLTAGE
+        if self.temperature > limit("temperature_limit"):
+            error |= OVERHEATING
+        if self._overload_time > OVERLOAD_TIME:
+            error |= OVERLOAD
+        return error
+
+
+# --- one emulated servo: what its firmware does with instructions and time --------------------------------------------
+
 
 # Not in the e-manual: chosen.
 #: Version the servos report.

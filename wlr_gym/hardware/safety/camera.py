@@ -84,7 +84,7 @@ class CameraWatch:
     """Judges the camera's readings, control step by control step, and shows poses in the frame of the run.
 
     Args:
-        robot: its geometry. doubt: of the camera, see :class:`wlr_gym.hardware.camera.config.CameraFile`.
+        robot: its geometry. doubt: of the camera, see :class:`wlr_gym.hardware.camera.reading.CameraFile`.
 
     Attributes:
         status: what is known now.

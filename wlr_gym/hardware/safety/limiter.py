@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import Hardware
-from wlr_gym.hardware.dynamixel.errors import NoAnswerError
+from wlr_gym.hardware.dynamixel.protocol import NoAnswerError
 from wlr_gym.hardware.safety import preflight, rules
 from wlr_gym.hardware.safety.preflight import Check, NotReadyError
 from wlr_gym.hardware.safety.rules import Decision, Level, Memory, RobotStatus

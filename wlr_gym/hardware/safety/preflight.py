@@ -20,17 +20,14 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
-from wlr_gym.hardware.camera.config import CameraFile
-from wlr_gym.hardware.camera.reading import CameraReader, CameraReading
+from wlr_gym.hardware.camera.reading import CameraFile, CameraReader, CameraReading
 from wlr_gym.hardware.config import FIXED_REGISTERS, Bus, FlowPort, Hardware, ImuPort
-from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError, RestlessLineError
+from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import error_names, load_table
-from wlr_gym.hardware.flow.driver import Flow
-from wlr_gym.hardware.imu.driver import Imu
-from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
-from wlr_gym.hardware.imu.reading import ImuGoneError
-from wlr_gym.hardware.ports import PortInUseError, is_pseudo_terminal
+from wlr_gym.hardware.flow import Flow
+from wlr_gym.hardware.imu import STANDARD_GRAVITY, Imu, ImuGoneError
 from wlr_gym.hardware.safety.camera import LARGEST_AGE, LARGEST_SIGMA
+from wlr_gym.hardware.serial_frames import PortInUseError, is_pseudo_terminal
 from wlr_gym.hardware.servos import JointMap, Servos
 from wlr_gym.hardware.timing import Clock, processor_share
 from wlr_gym.perception.vision.tracking import MEANINGS, NO_FLOOR

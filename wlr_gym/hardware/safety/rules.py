@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.format import Profile
+from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.dynamixel.tables import error_names
-from wlr_gym.hardware.flow.reading import FlowReading
-from wlr_gym.hardware.imu.frames import STANDARD_GRAVITY
-from wlr_gym.hardware.limits import SafetyLimits
+from wlr_gym.hardware.flow import FlowReading
+from wlr_gym.hardware.imu import STANDARD_GRAVITY
 from wlr_gym.hardware.servos import UNREAD, ServoRegisters
 from wlr_gym.physics.servo import CurrentLaw, current_law
 from wlr_gym.robot import JOINTS, LEGS, Robot

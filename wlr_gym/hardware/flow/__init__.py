@@ -1,1 +1,0 @@
-"""The optical-flow sensor: its chip, frames of a microcontroller that reads it, one interface over both, supervision."""

@@ -1,1 +1,0 @@
-"""The IMU: its frames, its drivers, and one interface over both."""

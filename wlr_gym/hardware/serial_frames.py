@@ -1,0 +1,381 @@
+"""Serial devices: bytes in and out, and the numbered frames in which a microcontroller sends what its sensor read.
+
+Servo buses, IMU and optical-flow sensor stand on :class:`SerialDevice`: one program has it at a time, every failure is an
+``OSError``, and no call waits longer than it is told. Sensors send frames of fixed size (:class:`FrameFormat`): two bytes of
+sync, sequence number (u16), microseconds since the microcontroller's boot (u32), content, CRC-16 of all before it (polynomial
+8005, as the servos use); little-endian, numbers wrap. :class:`FrameStream` reads them and tells when each was taken.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from wlr_gym.base.errors import InputError, require_package
+
+try:
+    import fcntl
+    import termios
+
+    _FAILURES: tuple[type[Exception], ...] = (OSError, termios.error)
+except ImportError:  # not on Windows
+    fcntl = None
+    _FAILURES = (OSError,)
+
+#: What a lock that is taken says, and a device that another program has opened for itself alone.
+_TAKEN = (errno.EWOULDBLOCK, errno.EBUSY)
+#: Bytes taken at once, as systems give them; reads until a port must be empty (256 kB).
+_CHUNK, _LARGEST_BACKLOG = 4096, 64
+#: s since the port was last empty, up to which frames are hardly older than that: they relate the clocks.
+_RECENT = 0.1
+_CRC_SIZE = 2
+
+
+class PortInUseError(InputError):
+    """Another program has the port."""
+
+    def __init__(self, path: str, name: str) -> None:
+        super().__init__(f"{name} {path} is in use by another program: two readers would steal each other's answers")
+
+
+def lock(descriptor: int, path: str, name: str = "port") -> None:
+    """Keep other programs of this library off a device until it is closed or its process ends (not on Windows).
+
+    Raises:
+        PortInUseError: another program has it.
+    """
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in _TAKEN:
+            raise PortInUseError(path, name) from None
+
+
+def is_pseudo_terminal(path: str) -> bool:
+    """Return whether a device is a terminal that a program serves, such as an emulated robot's (Linux, macOS)."""
+    return str(Path(path).resolve()).startswith(("/dev/pts/", "/dev/ttys0"))
+
+
+class Device(Protocol):
+    """An open serial device, real or emulated. Failures are ``OSError``."""
+
+    def received(self) -> bytes:
+        """Return all bytes that have come; does not wait."""
+        ...
+
+    def wait(self, seconds: float) -> bytes:
+        """Return bytes as soon as there are some; none when the time is over."""
+        ...
+
+    def write(self, data: bytes) -> int:
+        """Send bytes; return how many the device took. Does not wait until it would take more."""
+        ...
+
+    def reset_input_buffer(self) -> None:
+        """Throw away what has come."""
+        ...
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+class SerialDevice:
+    """A serial port of this computer, for this program alone; locked before its speed is set and its input thrown away.
+
+    Args:
+        path: device.
+        baud_rate: bit/s.
+        name: for messages.
+
+    Attributes:
+        serial: pyserial's port.
+
+    Raises:
+        PortInUseError: another program has it.
+        InputError: it is not there, or cannot be opened.
+        MissingPackageError: pyserial is not installed.
+    """
+
+    def __init__(self, path: str, baud_rate: int, name: str = "port") -> None:
+        require_package("serial", "robot")
+        import serial
+
+        try:
+            self.serial: serial.Serial = serial.Serial(path, baud_rate, timeout=0, exclusive=True)
+        except _FAILURES as error:
+            number = getattr(error, "errno", None)
+            if number in _TAKEN:
+                raise PortInUseError(path, name) from None
+            reason = os.strerror(number) if number else str(error)  # pyserial says it twice, and the path with it
+            hint = "" if Path(path).exists() else "; see wlr doctor"
+            raise InputError(f"{name} {path}: cannot be opened: {reason}{hint}") from None
+
+    def received(self) -> bytes:
+        """Return all bytes that have come; see :class:`Device`."""
+        data = b""
+        for _ in range(_LARGEST_BACKLOG):
+            part = self.wait(0.0)
+            data += part
+            if not part:
+                break
+        return data
+
+    def wait(self, seconds: float) -> bytes:
+        """Return bytes as soon as there are some; see :class:`Device`."""
+        number = self._number()
+        if not select.select([number], [], [], seconds)[0]:
+            return b""
+        if data := os.read(number, _CHUNK):
+            return data
+        raise OSError("it is ready and has nothing: disconnected, or another program reads it")
+
+    def write(self, data: bytes) -> int:
+        """Send bytes; a full buffer is an ``OSError``, a nearly full one takes a part. See :class:`Device`."""
+        return os.write(self._number(), data)
+
+    def reset_input_buffer(self) -> None:
+        """Throw away what has come."""
+        try:
+            self.serial.reset_input_buffer()
+        except _FAILURES as error:  # what termios raises is no OSError
+            raise OSError(str(error)) from None
+
+    def close(self) -> None:
+        """Close it."""
+        self.serial.close()
+
+    def _number(self) -> int:
+        if not self.serial.is_open:
+            raise OSError("it was closed")
+        return self.serial.fileno()
+
+
+# ---- frames ----
+
+
+def _crc_entry(byte: int) -> int:
+    value = byte << 8
+    for _ in range(8):
+        value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
+    return value & 0xFFFF
+
+
+_CRC_TABLE = tuple(_crc_entry(byte) for byte in range(256))
+
+
+def crc16(data: bytes, crc: int = 0) -> int:
+    """Return the CRC-16 of ``data`` (polynomial 8005, start value 0, not reflected), continuing from ``crc``."""
+    for byte in data:
+        crc = (crc << 8 & 0xFF00) ^ _CRC_TABLE[crc >> 8 ^ byte]
+    return crc
+
+
+class FrameFormat:
+    """How the frames of one kind of sensor look.
+
+    Args:
+        sync: how a frame begins, two bytes.
+        content: of what comes after sequence number and microseconds, as ``struct`` writes it.
+
+    Attributes:
+        size: bytes of a frame.
+    """
+
+    def __init__(self, sync: bytes, content: str) -> None:
+        self.sync = sync
+        self._layout = struct.Struct(f"<2sHI{content}")
+        self.size: int = self._layout.size + _CRC_SIZE
+
+    def encode(self, numbers: tuple[int, ...]) -> bytes:
+        """Return a frame as bytes: its sequence number and microseconds, wrapped, and its content."""
+        sequence, microseconds, *content = numbers
+        body = self._layout.pack(self.sync, sequence % 2**16, microseconds % 2**32, *content)
+        return body + crc16(body).to_bytes(_CRC_SIZE, "little")
+
+    def decode(self, raw: bytes) -> tuple[int, ...] | None:
+        """Return sequence number, microseconds and content of a frame; None where its CRC is wrong."""
+        body, crc = raw[:-_CRC_SIZE], raw[-_CRC_SIZE:]
+        return self._layout.unpack(body)[1:] if crc16(body) == int.from_bytes(crc, "little") else None
+
+
+class FrameParser:
+    """Finds whole frames in a stream, and counts by their sequence numbers (modulo 65536) what is missing.
+
+    Noise costs no more than the frames it hits.
+
+    Args:
+        format: of the frames.
+        repeats: hand on a frame that is the last one again.
+
+    Attributes:
+        lost: frames missing between the received ones.
+        crc_errors: frames dropped because their CRC was wrong.
+    """
+
+    def __init__(self, format: FrameFormat, *, repeats: bool = True) -> None:
+        self._format, self._repeats = format, repeats
+        self._buffer = bytearray()
+        self._last: int | None = None
+        self.lost = self.crc_errors = 0
+
+    def feed(self, data: bytes) -> list[tuple[int, ...]]:
+        """Take bytes; return the frames they complete: sequence number, microseconds, content."""
+        buffer, size, frames = self._buffer, self._format.size, []
+        buffer += data
+        while (place := buffer.find(self._format.sync)) >= 0 and len(buffer) >= place + size:
+            frame = self._format.decode(bytes(buffer[place : place + size]))
+            if frame is None:
+                self.crc_errors += 1
+                del buffer[: place + 1]
+                continue
+            del buffer[: place + size]
+            sequence, last, self._last = frame[0], self._last, frame[0]
+            if sequence != last:
+                self.lost += 0 if last is None else (sequence - last - 1) % 65536
+            if sequence != last or self._repeats:
+                frames.append(frame)
+        del buffer[: max(0, len(buffer) - 2 * size)]  # noise without a start never piles up
+        return frames
+
+
+class StreamClock:
+    """Tells how old a frame is from the microcontroller's microseconds (modulo 2^32) and our clock.
+
+    The frame that came soonest after its stamp sets the offset between the clocks, so ages are short by at most what that one
+    took: at a poll, up to one frame period. The microcontroller's clock may be wrong by ``drift`` (a ceramic resonator is by
+    0.5 %, an RC oscillator by 2 %). A clock that goes back, or that is ahead of ours by more than ``jump``, restarted.
+    """
+
+    drift: float = 0.02  #: part by which the microcontroller's clock may be wrong
+    jump: float = 0.1  #: s
+    _turn = 2**32 * 1e-6  #: s after which the clock wraps
+
+    def __init__(self) -> None:
+        self._offset: float | None = None
+        self._time = 0.0
+        self._last = 0
+
+    def age(self, microseconds: int, now: float, *, is_recent: bool = True) -> tuple[float | None, bool]:
+        """Return the age (s) of a frame that is here at ``now`` (s), and whether the microcontroller restarted.
+
+        Args:
+            microseconds: the frame's stamp.
+            now: s.
+            is_recent: the port was empty a moment ago, so the frame is hardly older. Only such a frame can relate the clocks:
+                in a backlog nobody knows how old the newest is. The age is None while they are not related.
+        """
+        sample = microseconds * 1e-6 - now
+        if self._offset is None:
+            return self._relate(microseconds, now, is_recent), False
+        ahead = (sample - self._offset + self._turn / 2) % self._turn - self._turn / 2
+        drift = self.drift * (now - self._time)
+        is_back = (microseconds - self._last) % 2**32 > 2**31
+        if is_back or ahead > self.jump + drift:
+            return self._relate(microseconds, now, is_recent), True
+        self._last = microseconds
+        if ahead > -drift:
+            self._offset, self._time = self._offset + ahead, now
+        return max(0.0, -ahead - drift), False
+
+    def _relate(self, microseconds: int, now: float, is_recent: bool) -> float | None:
+        self._last, self._time = microseconds, now
+        self._offset = microseconds * 1e-6 - now if is_recent else None
+        return 0.0 if is_recent else None
+
+
+class TimedFrame(NamedTuple):
+    """A frame's numbers, and when it was taken, s of our clock; None = nobody knows."""
+
+    numbers: tuple[int, ...]
+    time: float | None
+
+
+class FrameStream:
+    """The frames of a microcontroller on a serial port. One thread owns it.
+
+    Args:
+        format: of its frames.
+        path, baud_rate: of the port.
+        name: of the port, for messages.
+        clock: s; what ages are told by.
+        make_device: opens the port; the emulator in memory puts its own here.
+        repeats: see :class:`FrameParser`.
+
+    Attributes:
+        parser: counts what is lost and broken.
+        restarts: times the microcontroller's clock began anew.
+    """
+
+    def __init__(
+        self,
+        format: FrameFormat,
+        path: str,
+        baud_rate: int,
+        name: str,
+        clock: Callable[[], float] = time.monotonic,
+        make_device: Callable[[str, int, str], Device] = SerialDevice,
+        *,
+        repeats: bool = True,
+    ) -> None:
+        self._port = (path, baud_rate, name)
+        self._clock, self._make_device = clock, make_device
+        self._make_parser: Callable[[], FrameParser] = lambda: FrameParser(format, repeats=repeats)
+        self._device: Any = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self.parser: FrameParser = self._make_parser()
+        self._stream_clock = StreamClock()
+        self.restarts = 0
+        self._emptied_at = self._clock()
+
+    def open(self) -> None:
+        """Open the port and throw away what piled up in it; counts begin anew.
+
+        Raises:
+            InputError: it is not there, cannot be opened, or another program has it.
+        """
+        self._device = self._make_device(*self._port)
+        self._device.reset_input_buffer()
+        self._begin()
+
+    def close(self) -> None:
+        """Close the port."""
+        if self._device is not None:
+            self._device.close()
+            self._device = None
+
+    def read(self) -> list[TimedFrame]:
+        """Return the frames that have come since the last call; does not wait.
+
+        Raises:
+            ConnectionError: the port is not open, or is gone.
+        """
+        frames = self.parser.feed(self._received())
+        now = self._clock()
+        is_recent, self._emptied_at = now - self._emptied_at <= _RECENT, now
+        if not frames:
+            return []
+        last = frames[-1][1]
+        age, restarted = self._stream_clock.age(last, now, is_recent=is_recent)
+        self.restarts += restarted
+        if age is None:  # a backlog: nobody knows how old it is
+            return [TimedFrame(frame, None) for frame in frames]
+        return [TimedFrame(frame, now - age - ((last - frame[1]) % 2**32) * 1e-6) for frame in frames]
+
+    def _received(self) -> bytes:
+        if self._device is None:
+            raise ConnectionError("not open")
+        try:
+            return self._device.received()
+        except OSError as error:
+            raise ConnectionError(f"gone: {error}") from None
