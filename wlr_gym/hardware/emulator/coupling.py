@@ -123,7 +123,7 @@ class PlantCoupling:
     def _command_plant(self) -> None:
         retune = self.supply != self._plant_supply[0]
         for k, servo in enumerate(self._servos):
-            drive, is_well = servo.drive(), servo.encoder.is_true and servo.health.strength == 1.0
+            drive, is_well = servo.drive(), servo.shaft.is_well
             if drive is self._settled[k] and is_well:
                 continue
             native = drive.mode in _NATIVE_MODES[bool(_IS_LEG[k])] and drive.goal_pwm >= 1.0 and is_well
@@ -160,7 +160,7 @@ class PlantCoupling:
 
     def _voltage(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> float:
         """Return the voltage (V, encoder frame) of a law the plant has not got, and move its profile on by a tick."""
-        shaft, supply, step = servo.shaft, servo.health.strength * self.supply, self.plant.options.control_period
+        shaft, supply, step = servo.shaft, servo.shaft.strength * self.supply, self.plant.options.control_period
         if not self._own_law[k]:
             self._reference[:, k] = shaft.reference()
             self._own_law[k] = True
@@ -209,8 +209,7 @@ class PlantCoupling:
         for servo, p, v, strain in columns:
             shaft = servo.shaft
             shaft.load, shaft.voltage = strain, volt
-            shaft.true_position, shaft.true_velocity = p, v
-            shaft.position, shaft.velocity = servo.encoder.read(p, v)
+            shaft.move(p, v)
 
     def _output_of(self, k: int) -> tuple[int, float]:
         """Return counts of current or load, and part of the supply, of motor ``k``; worked out when a register is read."""

@@ -131,7 +131,7 @@ class BusLine:
             if servo.dead and not unpowered:
                 servo.boot()
             servo.set_power(not unpowered)
-            servo.health.heating_rate = values.get("overheat", 0.0)
+            servo.heating_rate = values.get("overheat", 0.0)
             if unpowered:
                 continue
             if "overload" in values:
@@ -142,9 +142,9 @@ class BusLine:
                 servo.write(servo.table["torque_enable"].address, b"\0")
             if "limit_changed" in values:
                 servo.set("goal_pwm", round(values["limit_changed"]))
-            servo.health.strength = values.get("slow_servo", 1.0)
-            servo.encoder.offset = values.get("encoder_jump", 0.0)
-            servo.encoder.is_frozen = "encoder_frozen" in values
+            servo.shaft.strength = values.get("slow_servo", 1.0)
+            servo.shaft.offset = values.get("encoder_jump", 0.0)
+            servo.shaft.is_frozen = "encoder_frozen" in values
 
     # ---- who answers ----
 

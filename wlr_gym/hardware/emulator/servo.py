@@ -1,4 +1,10 @@
-"""Control table of one emulated servo as bytes, with its access rules and indirect addresses."""
+"""One emulated servo: its control table, what its firmware does with instructions and time, what it asks of the motor.
+
+No motion here: :class:`MotorDrive` is what the firmware asks of the motor, and :class:`Shaft` what the physics made of it. Both
+are in the encoder's own frame: radians from count 0, positive as the encoder counts, before Drive Mode, turn counting and
+Homing Offset; :class:`EncoderFrame` turns that into Present Position. Source: ROBOTIS e-manual; where it is silent,
+docs/emulator.md lists what was chosen.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +27,29 @@ from wlr_gym.hardware.dynamixel.tables import (
     Item,
 )
 
+# Not in the e-manual: chosen.
+#: Version the servos report.
+FIRMWARE = 45
+#: Time during which a rebooting servo does not answer, s.
+BOOT_TIME = 0.3
+#: Distance from Goal Position that counts as arrived, counts.
+IN_POSITION = 16
+#: Part of a turn by which Homing Offset acts in position mode.
+HOMING_IN_POSITION_MODE = 0.25
+#: Temperature of a servo that does nothing, and above that in a lasting stall, degC; time constant, s.
+AMBIENT, HEATING, THERMAL_TIME = 25.0, 150.0, 120.0
+#: Part of the stall torque that trips the servo, and after what time, s.
+LARGEST_LOAD, OVERLOAD_TIME = 0.8, 2.0
+
 GOAL_REGISTERS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+#: Bit of Drive Mode: profiles say how long a way takes, not how fast it is.
+TIME_BASED = 4
+#: Highest temperature that its register holds, degC.
+HOTTEST = 255
+#: One count of Bus Watchdog, s.
+_WATCHDOG_UNIT = 0.02
+#: Parameter of a factory reset -> what it keeps.
+_KEPT = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}
 
 
 class Registers:
@@ -152,15 +180,6 @@ class Registers:
         return bound
 
 
-# --- what an emulated servo's firmware asks of the motor, and what the physics hands back -----------------------------
-
-
-#: Part of a turn by which Homing Offset acts in position mode.
-HOMING_IN_POSITION_MODE = 0.25
-#: Bit of Drive Mode: profiles say how long a way takes, not how fast it is.
-TIME_BASED = 4
-
-
 @dataclass
 class Shaft:
     """What the physics hands to a servo each tick.
@@ -172,6 +191,8 @@ class Shaft:
         voltage: V at the servo.
         output: asks for the counts of Present Current or Present Load, and for the part of the supply on the motor, -1 to 1.
         reference: asks where the profile generator stands: rad and rad/s.
+        offset, is_frozen: faults of the encoder: rad that it is off; it repeats its reading.
+        strength: part of the supply that reaches the motor.
     """
 
     position: float = 0.0
@@ -182,31 +203,22 @@ class Shaft:
     voltage: float = 12.0
     output: Callable[[], tuple[int, float]] = lambda: (0, 0.0)
     reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
-
-
-class ShaftEncoder:
-    """What a servo's encoder says of its shaft.
-
-    Attributes:
-        offset: rad that it is off. is_frozen: it repeats its reading.
-    """
-
-    def __init__(self) -> None:
-        self.offset = 0.0
-        self.is_frozen = False
-        self._position = 0.0
+    offset: float = 0.0
+    is_frozen: bool = False
+    strength: float = 1.0
 
     @property
-    def is_true(self) -> bool:
-        """Whether it says what is."""
-        return self.offset == 0.0 and not self.is_frozen
+    def is_well(self) -> bool:
+        """Whether the encoder says what is, and the motor gets what it should."""
+        return self.offset == 0.0 and not self.is_frozen and self.strength == 1.0
 
-    def read(self, position: float, velocity: float) -> tuple[float, float]:
-        """Return position (rad) and velocity (rad/s) as the firmware sees them."""
+    def move(self, position: float, velocity: float) -> None:
+        """Take what the physics made of the shaft, rad and rad/s."""
+        self.true_position, self.true_velocity = position, velocity
         if self.is_frozen:
-            return self._position, 0.0
-        self._position = position + self.offset
-        return self._position, velocity
+            self.velocity = 0.0
+        else:
+            self.position, self.velocity = position + self.offset, velocity
 
 
 @dataclass(frozen=True)
@@ -280,124 +292,6 @@ class EncoderFrame:
         return self.direction * round(position / self._unit)
 
 
-def motor_drive(registers: Registers, frame: EncoderFrame, profile_start: float, is_powered: bool) -> MotorDrive:
-    """Return what the firmware asks of the motor.
-
-    Args:
-        registers: of the servo.
-        frame: of its encoder.
-        profile_start: rad, where the way to the goal began.
-        is_powered: the electronics work.
-    """
-    si, get = registers.table.per_count, registers.get
-    sign = frame.direction
-    goal = frame.position(get("goal_position"))
-    velocity, acceleration = _profile(registers, abs(goal - profile_start))
-    mode = get("operating_mode")
-    pwm = get("goal_pwm") / registers.table.counts.full_pwm
-    has_current = "goal_current" in registers.table.items
-    return MotorDrive(
-        on=bool(get("torque_enable")) and is_powered,
-        mode=mode,
-        goal_position=goal,
-        goal_velocity=sign * get("goal_velocity") * si("goal_velocity"),
-        goal_current=sign * get("goal_current") * si("goal_current") if has_current else math.inf,
-        goal_pwm=sign * pwm if mode == PWM_MODE else abs(pwm),
-        position_gain=get("position_p_gain") * si("position_p_gain"),
-        velocity_gain=get("velocity_p_gain") * si("velocity_p_gain"),
-        velocity_integral_gain=get("velocity_i_gain") * si("velocity_i_gain"),
-        profile_velocity=velocity,
-        profile_acceleration=acceleration,
-    )
-
-
-def _profile(registers: Registers, way: float) -> tuple[float, float]:
-    """Profile velocity and acceleration in SI units; time-based profiles for the ``way`` (rad) to the goal."""
-    velocity, acceleration = registers.get("profile_velocity"), registers.get("profile_acceleration")
-    if not registers.get("drive_mode") & TIME_BASED:
-        si = registers.table.per_count
-        return velocity * si("profile_velocity"), acceleration * si("profile_acceleration")
-    duration, ramp = velocity * 1e-3, min(acceleration, velocity / 2) * 1e-3
-    if duration == 0.0 or way == 0.0:
-        return 0.0, 0.0
-    speed = way / (duration - ramp)
-    return speed, speed / ramp if ramp > 0.0 else 0.0
-
-
-# --- what an emulated servo watches about itself: supply, temperature, load. The numbers are chosen: the e-manual has n
-
-
-#: Temperature of a servo that does nothing, degC.
-AMBIENT = 25.0
-#: Temperature above ambient in a lasting stall, degC.
-HEATING = 150.0
-#: Time constant of the temperature, s.
-THERMAL_TIME = 120.0
-#: Part of the stall torque that trips the servo ...
-LARGEST_LOAD = 0.8
-#: ... after this time, s.
-OVERLOAD_TIME = 2.0
-
-
-class Health:
-    """Temperature and overload of one servo.
-
-    Attributes:
-        temperature: degC; a reboot does not cool the motor.
-        heating_rate: degC/s that a fault adds. strength: part of the supply that reaches the motor.
-    """
-
-    def __init__(self) -> None:
-        self.temperature = AMBIENT
-        self.heating_rate: float = 0.0
-        self.strength: float = 1.0
-        self._overload_time = 0.0
-
-    def reboot(self) -> None:
-        """Forget how long the overload has lasted."""
-        self._overload_time = 0.0
-
-    def advance(self, step: float, shaft: Shaft, limit: Callable[[str], int], volt: float) -> int:
-        """Let ``step`` seconds pass; return the bits of Hardware Error Status that hold now.
-
-        Args:
-            step: s.
-            shaft: load and supply.
-            limit: item name -> count.
-            volt: V per count of the supply.
-        """
-        load = abs(shaft.load)
-        equilibrium = AMBIENT + HEATING * load * load
-        self.temperature += step * ((equilibrium - self.temperature) / THERMAL_TIME + self.heating_rate)
-        self._overload_time = self._overload_time + step if load > LARGEST_LOAD else 0.0
-        error = 0
-        if not limit("min_voltage_limit") <= round(shaft.voltage / volt) <= limit("max_voltage_limit"):
-            error |= INPUT_VOLTAGE
-        if self.temperature > limit("temperature_limit"):
-            error |= OVERHEATING
-        if self._overload_time > OVERLOAD_TIME:
-            error |= OVERLOAD
-        return error
-
-
-# --- one emulated servo: what its firmware does with instructions and time --------------------------------------------
-
-
-# Not in the e-manual: chosen.
-#: Version the servos report.
-FIRMWARE = 45
-#: Time during which a rebooting servo does not answer, s.
-BOOT_TIME = 0.3
-#: Distance from Goal Position that counts as arrived, counts.
-IN_POSITION = 16
-
-#: Highest temperature that its register holds, degC.
-HOTTEST = 255
-#: One count of Bus Watchdog, s.
-_WATCHDOG_UNIT = 0.02
-_KEPT = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}
-
-
 class EmulatedServo:
     """One servo.
 
@@ -410,8 +304,7 @@ class EmulatedServo:
     Attributes:
         registers: its control table's content.
         shaft: written by the physics before :meth:`advance`.
-        encoder: what it sees of the shaft.
-        health: temperature and load.
+        temperature: degC; a reboot does not cool the motor. heating_rate: degC/s that a fault adds.
         dead: no power at the electronics: silent, motor off.
         set, read: see :class:`Registers`.
     """
@@ -421,8 +314,8 @@ class EmulatedServo:
         self.table = table
         self.firmware = firmware
         self.shaft: Shaft = Shaft(voltage=table.supply)
-        self.encoder: ShaftEncoder = ShaftEncoder()
-        self.health: Health = Health()
+        self.temperature, self.heating_rate = AMBIENT, 0.0
+        self._overload_time = 0.0
         self.dead = False
         self._drive: MotorDrive | None = None
         self._frame = EncoderFrame(table)
@@ -458,7 +351,7 @@ class EmulatedServo:
             keep_clock: Realtime Tick goes on.
         """
         self.registers.load_defaults(in_eeprom=False)
-        self.health.reboot()
+        self._overload_time = 0.0
         self._registered = None
         self._clock = self._clock if keep_clock else 0.0
         self._silence = silence
@@ -624,9 +517,37 @@ class EmulatedServo:
     def drive(self) -> MotorDrive:
         """Return what the firmware asks of the motor."""
         if self._drive is None:
-            powered = not self.dead and self._silence <= 0.0
-            self._drive = motor_drive(self.registers, self._frame, self._profile_start, powered)
+            si, get, sign = self.table.per_count, self._get, self._frame.direction
+            mode, goal = get("operating_mode"), self._frame.position(get("goal_position"))
+            pwm = get("goal_pwm") / self.table.counts.full_pwm
+            has_current = "goal_current" in self.table.items
+            velocity, acceleration = self._profile(abs(goal - self._profile_start))
+            self._drive = MotorDrive(
+                on=bool(get("torque_enable")) and not self.dead and self._silence <= 0.0,
+                mode=mode,
+                goal_position=goal,
+                goal_velocity=sign * get("goal_velocity") * si("goal_velocity"),
+                goal_current=sign * get("goal_current") * si("goal_current") if has_current else math.inf,
+                goal_pwm=sign * pwm if mode == PWM_MODE else abs(pwm),
+                position_gain=get("position_p_gain") * si("position_p_gain"),
+                velocity_gain=get("velocity_p_gain") * si("velocity_p_gain"),
+                velocity_integral_gain=get("velocity_i_gain") * si("velocity_i_gain"),
+                profile_velocity=velocity,
+                profile_acceleration=acceleration,
+            )
         return self._drive
+
+    def _profile(self, way: float) -> tuple[float, float]:
+        """Profile velocity and acceleration in SI units; time-based profiles for the ``way`` (rad) to the goal."""
+        velocity, acceleration = self._get("profile_velocity"), self._get("profile_acceleration")
+        if not self._get("drive_mode") & TIME_BASED:
+            si = self.table.per_count
+            return velocity * si("profile_velocity"), acceleration * si("profile_acceleration")
+        duration, ramp = velocity * 1e-3, min(acceleration, velocity / 2) * 1e-3
+        if duration == 0.0 or way == 0.0:
+            return 0.0, 0.0
+        speed = way / (duration - ramp)
+        return speed, speed / ramp if ramp > 0.0 else 0.0
 
     def advance(self, step: float) -> None:
         """Let ``step`` seconds pass: clock, watchdog, temperature, hardware errors."""
@@ -641,8 +562,23 @@ class EmulatedServo:
         limit = self._get("bus_watchdog")
         if limit > 0 and self._get("torque_enable") and self._since_packet > limit * _WATCHDOG_UNIT:
             self._watchdog_stop()
-        if error := self.health.advance(step, self.shaft, self._get, self.table.counts.voltage):
+        if error := self._watch_itself(step):
             self.raise_error(error)
+
+    def _watch_itself(self, step: float) -> int:
+        """Let temperature and overload go on by ``step`` s; return the bits of Hardware Error Status that hold now."""
+        load = abs(self.shaft.load)
+        equilibrium = AMBIENT + HEATING * load * load
+        self.temperature += step * ((equilibrium - self.temperature) / THERMAL_TIME + self.heating_rate)
+        self._overload_time = self._overload_time + step if load > LARGEST_LOAD else 0.0
+        error, supply = 0, round(self.shaft.voltage / self.table.counts.voltage)
+        if not self._get("min_voltage_limit") <= supply <= self._get("max_voltage_limit"):
+            error |= INPUT_VOLTAGE
+        if self.temperature > self._get("temperature_limit"):
+            error |= OVERHEATING
+        if self._overload_time > OVERLOAD_TIME:
+            error |= OVERLOAD
+        return error
 
     def pause(self, duration: float) -> None:
         """Let the clock alone go on, by ``duration`` s."""
@@ -684,7 +620,7 @@ class EmulatedServo:
             "velocity_trajectory": lambda: self._frame.direction * round(shaft.reference()[1] / speed),
             "position_trajectory": lambda: self._frame.count(shaft.reference()[0]),
             "present_input_voltage": lambda: max(0, round(shaft.voltage / volt)),
-            "present_temperature": lambda: min(round(self.health.temperature), HOTTEST),
+            "present_temperature": lambda: min(round(self.temperature), HOTTEST),
             "moving": lambda: int(abs(round(shaft.velocity / speed)) > self._get("moving_threshold")),
             "moving_status": self._moving_status,
             "led": lambda: int(self._clock) % 2 if self._shut_down else self._get("led"),
