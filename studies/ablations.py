@@ -17,7 +17,7 @@ from wlr_gym.base.plots import BLUE, GREEN, ORANGE, WINE, legend_below, new_figu
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.learning.evaluation.scoring import evaluate
-from wlr_gym.learning.evaluation.training_seeds import expand
+from wlr_gym.learning.evaluation.subjects import expand
 
 ROOT = Path(__file__).resolve().parents[1]
 SWEEP = ROOT / "examples" / "ablations.yaml"

@@ -17,8 +17,8 @@ from typing import Any
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.learning.evaluation.card import Card
+from wlr_gym.learning.evaluation.metrics import Estimate
 from wlr_gym.learning.evaluation.scoring import evaluate
-from wlr_gym.learning.evaluation.statistics import Estimate
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 
 ROOT = Path(__file__).resolve().parents[1]

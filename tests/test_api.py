@@ -59,7 +59,7 @@ def test_a_training_does_not_write_into_a_used_folder(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(InputError, match=r"did you mean 'WLR-Velocity-v0'"):
         wlr_gym.train("WLR-Velocty-v0", tmp_path / "new")
-    with pytest.raises(InputError, match="max_seconds = 0: expected a time above 0 s"):
+    with pytest.raises(InputError, match="max_seconds = 0: expected more than 0 s"):
         wlr_gym.train("WLR-Velocity-v0", tmp_path / "new", max_seconds=0)
     with pytest.raises(InputError, match="not a run folder"):
         wlr_gym.resume_training(tmp_path)

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from wlr_gym.base.plots import BLUE, legend_below, new_figure, save, tidy
 from wlr_gym.envs.tasks import load_randomization
 from wlr_gym.envs.tasks.signals import path_point
+from wlr_gym.learning.evaluation.conditions import SHAPES, SWEEPS
 from wlr_gym.learning.evaluation.film import Journey, commands, drive, present_time
-from wlr_gym.learning.evaluation.floor_plots import draw_floors
+from wlr_gym.learning.evaluation.plots import draw_floors
 from wlr_gym.learning.evaluation.rollout import roll_out, start_episodes
 from wlr_gym.learning.evaluation.subjects import make_player
-from wlr_gym.learning.evaluation.sweeps import SHAPES, SWEEPS
 from wlr_gym.render.teleop import Script
 from wlr_gym.render.view import View
 from wlr_gym.robot import load_robot

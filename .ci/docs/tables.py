@@ -40,7 +40,7 @@ from wlr_gym.envs.tasks.describe import (
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task import ObservationColumn, Task, scales_of
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
-from wlr_gym.learning.evaluation.acceptance import acceptance_rows, read_acceptance
+from wlr_gym.learning.evaluation.scoring import acceptance_rows, read_acceptance
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.physics.effects.library import coordinates, parameter_text, places
 from wlr_gym.physics.plants.forces import FEATURES

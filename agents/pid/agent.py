@@ -1,7 +1,7 @@
 """Feedback on the gyroscope, with gains found by search: the tuned controller of a robot that cannot see its slip.
 
 The law is in ``wlr_gym/policy/control.py``. ``wlr train ENV --agent pid`` searches the
-gains (``wlr_gym/learning/evaluation/tuning.py``).
+gains (``wlr_gym/learning/tuning.py``).
 """
 
 from __future__ import annotations
@@ -31,6 +31,6 @@ def load_policy(folder: Path, contract: Mapping[str, Any]) -> Pid:
 
 def train(training: Training) -> Path:
     """Search the gains, and return the folder of the best."""
-    from wlr_gym.learning.evaluation.tuning import tune
+    from wlr_gym.learning.tuning import tune
 
     return tune(training, "pid", make_policy, PidConfig)

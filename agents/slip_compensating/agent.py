@@ -1,4 +1,4 @@
-"""The feedback of ``pid`` with what the slip observer knows; the law is :mod:`wlr_gym.policy.slip_compensating`."""
+"""The feedback of ``pid`` with what the slip observer knows; the law is :mod:`wlr_gym.policy.control`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.policy import Training
-from wlr_gym.policy.control import task_settings
-from wlr_gym.policy.slip_compensating import SlipCompensating, SlipCompensatingConfig
+from wlr_gym.policy.control import SlipCompensating, SlipCompensatingConfig, task_settings
 
 
 def check_settings(config: Mapping[str, Any]) -> None:
@@ -28,6 +27,6 @@ def load_policy(folder: Path, contract: Mapping[str, Any]) -> SlipCompensating:
 
 def train(training: Training) -> Path:
     """Search the settings, and return the folder of the best."""
-    from wlr_gym.learning.evaluation.tuning import tune
+    from wlr_gym.learning.tuning import tune
 
     return tune(training, "slip_compensating", make_policy, SlipCompensatingConfig)

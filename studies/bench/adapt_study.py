@@ -30,12 +30,10 @@ from wlr_gym.gap.estimation.uncertainty import half_widths
 from wlr_gym.gap.report.entries import Result
 from wlr_gym.gap.robot.open import open_robot
 from wlr_gym.gap.workflow import SCATTER
-from wlr_gym.learning.adaptation.adapt import find_uncertainty
-from wlr_gym.learning.adaptation.driving import episodes_of, errors_of
-from wlr_gym.learning.adaptation.identification import task_randomization
-from wlr_gym.learning.adaptation.plan import Asked, Progress, open_folder
+from wlr_gym.learning.adaptation.adapt import find_uncertainty, task_randomization
+from wlr_gym.learning.adaptation.driving import EmulatedRobot, episodes_of, errors_of
 from wlr_gym.learning.adaptation.retraining import accept_policy, train_in, train_supervised
-from wlr_gym.learning.adaptation.robots import EmulatedRobot
+from wlr_gym.learning.adaptation.state import Asked, Progress, open_folder
 from wlr_gym.learning.adaptation.uncertainty import Family, Uncertainty, uncertainty_of
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 from wlr_gym.physics.effects import Patch, load_patch

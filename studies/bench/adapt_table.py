@@ -13,7 +13,7 @@ from scipy.stats import quantile_test
 from studies.bench.adapt_study import CONTENDERS, HELPS
 from wlr_gym.base.text import tally
 from wlr_gym.learning.adaptation.driving import paired, share_regained
-from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
+from wlr_gym.learning.evaluation.metrics import Bootstrap, Estimate
 
 Array = NDArray[np.float64]
 Line = Mapping[str, Any]

@@ -304,7 +304,7 @@ def _spreading(
     if ray is None:
         yield lambda jobs: spread(jobs, plan.processes)
         return
-    from wlr_gym.learning.sweep.ray_cluster import LOCAL, connected, fit_nodes, spread_on_ray
+    from wlr_gym.learning.sweep.ray import LOCAL, connected, fit_nodes, spread_on_ray
 
     with connected(ray, plan.processes if ray == LOCAL else None):
         check = Job("check", _MODULE, {"check": analyser}, str((plan.out / "work" / "check.log").resolve()))

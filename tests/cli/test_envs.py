@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS
 from wlr_gym.envs.tasks import load_randomization, load_task
-from wlr_gym.learning.evaluation.floor_plots import draw_floors
+from wlr_gym.learning.evaluation.plots import draw_floors
 from wlr_gym.robot import load_robot
 
 

@@ -353,8 +353,8 @@ def test_hardware_file_names_the_sensor_and_the_robot_must_have_one():
 
 
 def test_the_pages_hardware_files_are_read():
-    page = (Path(__file__).parents[2] / "docs" / "optical_flow.md").read_text(encoding="utf-8")
-    lines = re.findall("```yaml\n(.*?)```", page, re.S)[1].splitlines()
+    page = (Path(__file__).parents[2] / "docs" / "camera.md").read_text(encoding="utf-8")
+    lines = re.findall("```yaml\n(.*?)```", page, re.S)[2].splitlines()
     stream, chip = (hardware_with(**yaml.safe_load(line)["flow"]).flow for line in lines)
     assert stream is not None
     assert chip is not None

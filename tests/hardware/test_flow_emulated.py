@@ -1,4 +1,4 @@
-"""The optical-flow sensor of the emulated robot: plant to control loop, faults; the commands of docs/optical_flow.md."""
+"""The optical-flow sensor of the emulated robot: plant to control loop, faults; the commands of docs/camera.md."""
 
 import json
 from typing import Any

@@ -1,7 +1,7 @@
 """Both simulators, same setpoints and parameters: where the robots are after ten seconds, and what their motors did.
 
 Excitations as in the measured data, without and with every named effect at its default severity. Bounds are those of the
-project: base pose within 2 % of the travel and 2 degrees of yaw, motor torques within 5 % rms; docs/cross_plant.md has the
+project: base pose within 2 % of the travel and 2 degrees of yaw, motor torques within 5 % rms; docs/compare.md has the
 numbers.
 """
 

@@ -159,7 +159,7 @@ def test_twice_the_cycle_is_half_the_integral_gain():
 
 @pytest.mark.parametrize("cycle", [0.5e-3, 1e-3, 2e-3])
 def test_what_is_left_of_a_speed_step_decays_as_the_page_says(cycle):
-    """docs/commissioning.md: rate = gain/(kd + K), of a free wheel; from it the cycle is measured."""
+    """docs/robot.md: rate = gain/(kd + K), of a free wheel; from it the cycle is measured."""
 
     def edit(parameters):
         float_in_space(parameters)

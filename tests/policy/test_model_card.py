@@ -12,13 +12,12 @@ from wlr_gym.policy import (
     contract_of,
     find_policy,
     make_policy,
-    model_card,
     policy_environment,
     shipped_names,
     trained_environment,
     write_model_card,
 )
-from wlr_gym.policy.model_card import file_hash
+from wlr_gym.policy.export import _summary, file_hash
 from wlr_gym.policy.onnx_file import open_policy, seal
 
 SCORES = """# Score card: velocity_blind
@@ -162,4 +161,4 @@ def test_the_first_lines_of_shipped_cards_are_those_of_their_contracts():
     """What a policy sees follows from its contract: a card of an older version may say otherwise."""
     for name in shipped_names():
         path = find_policy(name)
-        assert model_card._summary(open_policy(path)[1]) in path.with_suffix(".md").read_text()
+        assert _summary(open_policy(path)[1]) in path.with_suffix(".md").read_text()

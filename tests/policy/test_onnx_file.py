@@ -200,7 +200,7 @@ def test_a_graph_that_answers_differently_is_not_written(trained, environment, t
     import torch
 
     load_agent("ppo")
-    module = importlib.import_module("wlr_gym.learning.ppo.export")
+    module = importlib.import_module("wlr_gym.learning.ppo.policy")
     to_onnx = module.to_onnx
     monkeypatch.setattr(module, "to_onnx", lambda actor, width: to_onnx(torch.nn.Sequential(actor, torch.nn.Tanh()), width))
     (tmp_path / "p.onnx").write_bytes(b"old")

@@ -16,7 +16,7 @@ from wlr_gym.learning.sweep.plan import SweepPlan, resolve
 from wlr_gym.learning.training import with_robot
 from wlr_gym.policy import environment_for, load_policy, make_policy, policy_environment, write_contract
 from wlr_gym.policy.control import PidConfig, known_robot
-from wlr_gym.policy.reseal import reseal
+from wlr_gym.policy.export import reseal
 from wlr_gym.robot import load_robot, robot_content, robot_hash
 
 NOMINAL = load_robot()

@@ -15,8 +15,8 @@ import onnx
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.learning.evaluation import make_core
-from wlr_gym.policy import contract_of, find_policy, make_policy, policy_environment, reseal
-from wlr_gym.policy.model_card import file_hash
+from wlr_gym.policy import contract_of, find_policy, make_policy, policy_environment
+from wlr_gym.policy.export import file_hash, reseal
 from wlr_gym.policy.onnx_file import seal
 
 #: Fingerprints of the nominal robot as contracts had them at first.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.learning.adaptation import Adapted
-    from wlr_gym.learning.adaptation.robots import RealRobot
+    from wlr_gym.learning.adaptation.driving import RealRobot
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def run(options: AdaptOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.learning.adaptation import adapt
-    from wlr_gym.learning.adaptation.page import NUMBERS_FILE
+    from wlr_gym.learning.adaptation.state import NUMBERS_FILE
 
     _check(options)
     console = Console(soft_wrap=True, highlight=False, file=sys.stderr if options.json else None)
@@ -157,7 +157,7 @@ def _real(options: AdaptOptions, console: Console) -> RealRobot:
 def _print(found: Adapted, content: dict[str, Any], console: Console) -> None:
     from wlr_gym.base.text import duration
     from wlr_gym.cli.tables import print_table
-    from wlr_gym.learning.adaptation.page import headline
+    from wlr_gym.learning.adaptation.state import headline
 
     rows = [
         (name, duration(one.driving), duration(one.computing), one.said[0] if one.said else "")

@@ -107,7 +107,7 @@ def _content(env_id: str, task: Task, randomization: Randomization) -> dict[str,
 
 
 def _draw(path: Path, randomization: Randomization, force: bool) -> None:
-    from wlr_gym.learning.evaluation.floor_plots import draw_floors
+    from wlr_gym.learning.evaluation.plots import draw_floors
 
     require_ending(path, PICTURES, "--picture")
     refuse_existing(path, force, "--picture")

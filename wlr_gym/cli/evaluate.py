@@ -38,7 +38,6 @@ from wlr_gym.learning.evaluation import (
     Condition,
     Rollout,
     Subject,
-    acceptance,
     common_robot,
     comparison_rows,
     make_player,
@@ -53,15 +52,20 @@ from wlr_gym.learning.evaluation import (
     write_episodes,
     write_samples,
 )
-from wlr_gym.learning.evaluation.acceptance import ACCEPTANCE_FILE, accept, acceptance_rows, write_acceptance
-from wlr_gym.learning.evaluation.card_report import content
+from wlr_gym.learning.evaluation.card import content
 from wlr_gym.learning.evaluation.scoring import (
+    ACCEPTANCE_BLOCKS,
+    ACCEPTANCE_EPISODES,
+    ACCEPTANCE_FILE,
     BACKENDS,
     BASELINES,
     OTHER_EPISODES,
     SWEEP_EPISODES,
+    accept,
+    acceptance_rows,
     evaluate,
     fitting_baselines,
+    write_acceptance,
 )
 from wlr_gym.physics.effects import Patch
 from wlr_gym.policy import shipped_names, trained_environment
@@ -182,8 +186,8 @@ def _accept(options: EvaluateOptions) -> int:
             options.env,
             references=options.baselines,
             floors=None if options.randomization is None else (options.randomization,),
-            episodes=acceptance.EPISODES if options.episodes is None else options.episodes,
-            blocks=acceptance.BLOCKS if options.blocks is None else options.blocks,
+            episodes=ACCEPTANCE_EPISODES if options.episodes is None else options.episodes,
+            blocks=ACCEPTANCE_BLOCKS if options.blocks is None else options.blocks,
             sensors=options.present(),
             robot=options.robot,
             effects=options.patch(),
@@ -295,7 +299,7 @@ def _progress(shown: bool) -> Iterator[Callable[[str, float], None]]:
 
 
 def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
-    from wlr_gym.learning.evaluation.card_plots import draw_card
+    from wlr_gym.learning.evaluation.plots import draw_card
 
     pictures = draw_card(folder, card)
     write_card(folder, card, pictures)

@@ -128,7 +128,8 @@ def _check_targets(paths: Sequence[Path], targets: Sequence[Path], force: bool) 
 
 
 def _reseal(options: ExportOptions) -> dict[str, list[str]]:
-    from wlr_gym.policy import find_policy, reseal
+    from wlr_gym.policy import find_policy
+    from wlr_gym.policy.export import reseal
 
     if options.out is not None or options.card is not None:
         raise InputError("--reseal rewrites policies where they are: neither --out nor --card goes with it")

@@ -72,7 +72,7 @@ def import_policy(
         MissingPackageError: a package is not installed.
     """
     require_package("onnxscript", "export")
-    from wlr_gym.learning.ppo.export import to_onnx
+    from wlr_gym.learning.ppo.policy import to_onnx
 
     bare = getattr(env, "unwrapped", env)
     if not hasattr(bare, "contract") or not hasattr(bare, "core"):

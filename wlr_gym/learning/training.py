@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from wlr_gym.base.checks import check_number
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.files import require_empty
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
@@ -167,9 +168,8 @@ def run_training(agent: str, training: Training) -> Path:
     Raises:
         InputError: the agent has nothing to learn, or a time limit that is none.
     """
-    limit = training.max_seconds
-    if limit is not None and (not isinstance(limit, int | float) or not limit > 0):
-        raise InputError(f"max_seconds = {limit!r}: expected a time above 0 s")
+    if training.max_seconds is not None:
+        check_number("max_seconds", training.max_seconds, "s", above=0)
     check_environment_settings(training.config)
     return agent_function(agent, "train")(replace(training, config=with_robot(training.config)))
 

@@ -1,10 +1,8 @@
 """Policies and agents: how they are called, loaded by name, saved with their contract, and refused where they do not fit."""
 
 from wlr_gym.policy.agents import Agent, Policy, Training, TrainingProgress, agent_names, load_agent, load_agent_config
-from wlr_gym.policy.export import Parity, export_policy, exportable
+from wlr_gym.policy.export import Parity, export_policy, exportable, reseal, write_model_card
 from wlr_gym.policy.file import camera_share, check_contract, misses_camera, needs_camera, read_contract, write_contract
-from wlr_gym.policy.model_card import write_model_card
-from wlr_gym.policy.reseal import reseal
 from wlr_gym.policy.sources import (
     contract_of,
     environment_for,

@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from wlr_gym.base.checks import check_name
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.paths import config_names, data_directory, named_in
 from wlr_gym.base.settings import merge_changes, parse_yaml, read_layers
@@ -126,8 +127,7 @@ def load_agent(name: str) -> Agent:
     Raises:
         InputError: no such agent; the message lists those there are.
     """
-    if name not in agent_names():
-        raise unknown_name("agent", name, agent_names())
+    check_name("agent", name, agent_names())
     package = f"wlr_gym_agents_{name}"  # made for its folder, so that it can import its neighbours relatively
     if package not in sys.modules:
         module = types.ModuleType(package)

@@ -1,7 +1,12 @@
-"""Make a policy file from a trained policy, and prove that both answer alike before it is there."""
+"""Policy files: made from trained policies, which must answer alike; their contracts in a newer form; their model cards."""
 
 from __future__ import annotations
 
+import copy
+import hashlib
+import json
+import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,14 +14,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.files import replace_file
+from wlr_gym.base.files import replace_file, write_json, write_text
 from wlr_gym.base.provenance import versions
+from wlr_gym.base.settings import overlay, read_layers
+from wlr_gym.base.text import tally
 from wlr_gym.policy.agents import Contract, Policy, agent_function
-from wlr_gym.policy.file import read_contract
+from wlr_gym.policy.file import CONTRACT_FILE, differences, needs_camera, read_contract, with_defaults
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy, seal
-from wlr_gym.policy.sources import find_policy
+from wlr_gym.policy.sources import contract_of, find_policy, robot_of_contract
+from wlr_gym.robot import Robot, load_robot, robot_hash, servo_hash
 
 #: Random observations that are compared.
 RANDOM = 1000
@@ -123,3 +132,184 @@ def compare(policy: Policy, exported: Policy, environment: Contract, observation
     if not largest <= TOLERANCE:
         raise InputError(f"the exported graph answers differently: by up to {largest:.2g}, allowed are {TOLERANCE:g}")
     return Parity(*differences, observations=RANDOM + len(observations))
+
+
+# ---- contracts in a newer form: what the policy computes stays -------------------------------------------------------
+
+
+def reseal(path: Path, robot: str | None = None) -> list[str]:
+    """Rewrite the contract of a policy; of a policy file also its fingerprint, and its SHA-256 in the model cards beside it.
+
+    The graph stays byte for byte.
+
+    Args:
+        path: of the policy file or folder.
+        robot: name or path of the robot that it was trained with; default: what its contract says.
+
+    Returns:
+        What changed: ``key: before -> now``.
+
+    Raises:
+        InputError: a broken policy, or a robot whose numbers are not those of the training.
+        MissingPackageError: a policy file, and onnx is not installed.
+    """
+    content = contract_of(path)
+    before, resealed = content["environment"], copy.deepcopy(content)
+    source = robot or robot_of_contract(content) or "nominal"
+    trained = load_robot(source)
+    stated, fingerprint = (before.get("robot") or {}).get("hash"), robot_hash(trained)
+    if stated != fingerprint and (isinstance(source, Mapping) or stated != _first_form(source, trained)):
+        raise InputError(
+            f"{path}: robot.hash is {stated!r}, that of robot '{robot or trained.name}' is {fingerprint!r}: not the robot of "
+            "its training"
+        )
+    now = with_defaults(resealed["environment"])
+    now["robot"] |= {"hash": fingerprint, "servo": servo_hash(trained)}
+    resealed["environment"] = now
+    changes = [f"environment.{name}: {_text(old)} -> {_text(new)}" for name, old, new in differences("", before, now)]
+    if path.is_dir():
+        write_json(path / CONTRACT_FILE, resealed)
+        return changes
+    require_package("onnx", "export")
+    sha = file_hash(path)
+    replace_file(path, lambda temporary: temporary.write_bytes(seal(path.read_bytes(), resealed)))
+    open_policy(path)
+    return [*changes, *_cards(path, sha)]
+
+
+#: Keys of ``servo`` that robot files got after the first form.
+LATER: Any = {
+    "integral_cycle": True,
+    "leg": {"stall_current", "no_load_current", "current_count", "load_count"},
+    "wheel": {"stall_current", "no_load_current", "current_count", "load_count"},
+}
+
+
+def _first_form(source: str, robot: Robot) -> str:
+    """Return the hash of a robot as contracts had it at first: of everything in its file, tolerances as they are written."""
+    tolerances: Any = {}
+    for data, _ in read_layers("robot", source):
+        tolerances = overlay(tolerances, data.get("tolerances") or {})
+    adapter = TypeAdapter(dict[str, float | str])
+    numbers = robot.model_dump_json(exclude={"tolerances": True, "individual": True, "servo": LATER, "sensors": {"volt_count"}})
+    text = f'{numbers[:-1]},"tolerances":{adapter.dump_json(adapter.validate_python(tolerances)).decode()}}}'
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _cards(path: Path, before: str) -> list[str]:
+    """Write a policy file's new SHA-256 into the cards beside it that name the old one: its own, and those of comparisons."""
+    now = file_hash(path)
+    named = [card for card in sorted(path.parent.glob(f"*{CARD_SUFFIX}")) if before in card.read_text(encoding="utf-8")]
+    for card in named if now != before else ():
+        write_text(card, card.read_text(encoding="utf-8").replace(before, now))
+    return [f"{card.name}: SHA-256 {before} -> {now}" for card in named if now != before]
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value) if isinstance(value, Mapping | list) else repr(value)
+
+
+# ---- model cards: what a file is, how it came about and how well it drives, as Markdown beside it --------------------
+
+CARD_SUFFIX = ".md"
+#: Observations that come from the pose that the slip observer has.
+_FROM_POSE = ("path_error", "course_error")
+
+
+def write_model_card(policy: Path, evaluation: str) -> Path:
+    """Write the model card of a policy file beside it, and return its path.
+
+    Args:
+        policy: the file.
+        evaluation: score card as Markdown, as ``wlr evaluate --out`` writes it.
+
+    Raises:
+        InputError: no policy file, a broken one, or scores that do not name it and its fingerprint.
+    """
+    _, content = open_policy(policy)
+    if policy.stem not in evaluation:
+        raise InputError(f"the score card is about other policies than '{policy.stem}'")
+    if file_hash(policy) not in evaluation:
+        raise InputError(
+            f"the score card is about another '{policy.stem}': SHA-256 {file_hash(policy)} is not in it; evaluate anew"
+        )
+    card = policy.with_suffix(CARD_SUFFIX)
+    facts = "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in _facts(policy, content).items())])
+    write_text(card, "\n\n".join([f"# {policy.stem}", _summary(content), facts, _below(evaluation)]) + "\n")
+    return card
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file, as ``sha256sum`` prints it."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _summary(content: Mapping[str, Any]) -> str:
+    environment, training = content["environment"], content.get("training", {})
+    sources = {column["source"] for column in environment["observation"]}
+    camera = "with" if needs_camera(environment) else "without"
+    if 0.0 < (environment.get("sensors") or {}).get("camera", 0.0) < 1.0:
+        camera = "with or without"
+    if "truth" in sources:
+        sees = "It sees what no robot can measure, friction for example: an upper bound, for simulators only."
+    elif "estimate" in sources:
+        sees = f"It sees the estimates of the slip observer, {camera} a camera."
+    elif _term_counts(environment["observation"]).keys() & set(_FROM_POSE):
+        sees = f"It sees no estimate of slip, but errors of its way from the slip observer's pose, {camera} a camera."
+    else:
+        sees = "It is blind to slip: it sees neither estimates of it nor a camera."
+    return (
+        f"A policy for `{training.get('environment', environment['task'])}`. {sees} Trained and evaluated in simulation; no "
+        "real robot was driven. `wlr play`, `wlr evaluate` and `wlr deploy` take it by name or path."
+    )
+
+
+def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
+    environment, training, config = content["environment"], content.get("training", {}), content["config"]
+    facts = {
+        "file": f"`{policy.name}`, {policy.stat().st_size / 1000:.0f} kB",
+        "SHA-256": f"`{file_hash(policy)}`",
+        "robot": f"{environment['robot']['name']}, at {1.0 / environment['control_period']:g} Hz",
+        "observation": f"{len(environment['observation'])} numbers: {tally(_term_counts(environment['observation']))}",
+        "action": f"{len(environment['action'])} setpoints of joints",
+        "randomisation": environment.get("randomization", {}).get("name") or "as in the contract",
+    }
+    if "command" in training:
+        facts["trained with"] = f"`{training['command']}`"
+    facts["training"] = ", ".join(_training(content["agent"], training, config))
+    facts["versions"] = tally(content.get("versions", {}))
+    if "exported" in content:
+        parity = content["exported"]["parity"]
+        largest = max(parity["random"], parity["real"])
+        facts["same as the trained network"] = f"within {largest:.1e} on {parity['observations']} observations"
+    return facts
+
+
+def _term_counts(columns: list[Mapping[str, Any]]) -> Counter[str]:
+    return Counter(column["name"].partition("[")[0] for column in columns)
+
+
+def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
+    found = [agent]
+    if "steps" in training:
+        found.append(f"{training['steps']:,} environment steps")
+    if "seconds" in training:
+        found.append(f"{training['seconds'] / 60.0:.1f} min with {config.get('torch_threads', 1)} thread(s)")
+    if "seed" in training:
+        found.append(f"seed {training['seed']}")
+    if training.get("git_commit"):
+        found.append(f"commit {_short(training['git_commit'])}")
+    return found
+
+
+def _short(commit: str) -> str:
+    """Abbreviate the hash; ``-dirty`` stays."""
+    name, _, state = commit.partition("-")
+    return f"{name[:7]}-{state}" if state else name[:7]
+
+
+def _below(evaluation: str) -> str:
+    """Return a score card as part of another document: headings a level deeper, without pictures, which stay where they are."""
+    words = re.sub(r"^#.*\n+(?:!\[.*\n*)+(?=#|\Z)", "", evaluation, flags=re.MULTILINE)  # sections that only show one
+    lines = [line for line in words.strip().splitlines() if not line.startswith("![")]
+    return re.sub(r"\n{3,}", "\n\n", "\n".join(f"#{line}" if line.startswith("#") else line for line in lines))

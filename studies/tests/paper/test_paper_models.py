@@ -51,7 +51,7 @@ def records(pairs):
 
 @pytest.mark.slow
 def test_models_agree_within_the_bounds_of_the_plants(records):
-    """2 % of the travel, 2 degrees of yaw, 5 % of the torques (docs/cross_plant.md); in fact ten times better."""
+    """2 % of the travel, 2 degrees of yaw, 5 % of the torques (docs/compare.md); in fact ten times better."""
     for model, tests in report.agreement(records).items():
         for name, found in tests.items():
             assert found["position"] < 0.002, (model, name)

@@ -13,10 +13,8 @@ pytest.importorskip("onnxruntime")
 from wlr_gym.cli import OK, run_command
 from wlr_gym.hardware.deployment import Deployment
 from wlr_gym.hardware.emulator.link import EmulatedWorld
-from wlr_gym.learning.adaptation.driving import paired
-from wlr_gym.learning.adaptation.robots import EmulatedRobot, RealRobot
-from wlr_gym.learning.evaluation import robot_episodes
-from wlr_gym.learning.evaluation.robot_episodes import drive_episode
+from wlr_gym.learning.adaptation import driving
+from wlr_gym.learning.adaptation.driving import EmulatedRobot, RealRobot, drive_episode, paired
 from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import load_robot
@@ -48,8 +46,8 @@ class Watched(EmulatedRobot):
 @pytest.mark.parametrize("backend", ["gibbs_appell", "mujoco"])
 def test_an_episode_is_scored_by_the_true_motion(backend, monkeypatch):
     commands = []
-    take = robot_episodes._Score.take
-    monkeypatch.setattr(robot_episodes._Score, "take", lambda self, command: commands.append(command[0]) or take(self, command))
+    take = driving._Score.take
+    monkeypatch.setattr(driving._Score, "take", lambda self, command: commands.append(command[0]) or take(self, command))
     episode = drive_episode(ENVIRONMENT, POLICY, Watched(load_robot(), backend=backend, physics_step=0.002), 5, 1.0)
     speed, turn = (np.array(Watched.seen) - np.array(commands)).T
     assert episode.whole
@@ -64,7 +62,7 @@ def test_a_real_robot_is_scored_by_the_pose_of_its_observer_too():
     core = make_core("WLR-Posture-v0", 1, {"randomization": "none", "episode_length": 4.0})
     core.seed(0, 0)
     core.begin_episodes(core.everyone, {})
-    estimated, true = (robot_episodes._Score(core.task, core, truth) for truth in (None, core.plant))
+    estimated, true = (driving._Score(core.task, core, truth) for truth in (None, core.plant))
     for score in (estimated, true):
         score.begin()
     action = np.zeros((1, 8), np.float32)

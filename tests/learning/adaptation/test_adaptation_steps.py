@@ -20,11 +20,12 @@ from wlr_gym.data.record import record_simulation
 from wlr_gym.envs.tasks import load_randomization
 from wlr_gym.gap.decision import HISTORY_FILE, Decided, History, Recorded
 from wlr_gym.gap.report.entries import Result
-from wlr_gym.learning.adaptation import driving, identification, retraining, uncertainty
-from wlr_gym.learning.adaptation.plan import STEPS, AdaptStep, Asked, Progress, open_folder
-from wlr_gym.learning.adaptation.robots import EmulatedRobot
-from wlr_gym.learning.adaptation.supervised import may_stop_more, stopped_episodes
-from wlr_gym.learning.evaluation.acceptance import Acceptance, Loss
+from wlr_gym.learning.adaptation import driving, retraining, uncertainty
+from wlr_gym.learning.adaptation.adapt import state_uncertainty
+from wlr_gym.learning.adaptation.driving import EmulatedRobot
+from wlr_gym.learning.adaptation.retraining import may_stop_more, stopped_episodes
+from wlr_gym.learning.adaptation.state import STEPS, AdaptStep, Asked, Progress, open_folder
+from wlr_gym.learning.evaluation.scoring import Acceptance, Loss
 from wlr_gym.physics.effects import Patch, load_patch
 from wlr_gym.robot import load_robot
 
@@ -123,7 +124,7 @@ def test_a_formula_acts_as_an_effect_and_a_name_still_in_play_is_a_family(tmp_pa
 def test_without_numbers_the_old_policy_is_kept(tmp_path):
     history = History(data="", robot=None, backend="", known=[])
     decided = Decided(history, result(calibration={}, verdict="bad_data"), tmp_path)
-    record, found = identification.state_uncertainty(Progress(tmp_path, asked()), decided, ROBOT)
+    record, found = state_uncertainty(Progress(tmp_path, asked()), decided, ROBOT)
     assert (record.outcome, found) == ("left out", None)
 
 
@@ -394,7 +395,7 @@ def test_measured_runs_alone_drive_nothing(tmp_path, monkeypatch):
         (out / HISTORY_FILE).write_text(history.model_dump_json())
         return Decided(history, None, out)
 
-    monkeypatch.setattr(identification, "decide", decide)
+    monkeypatch.setattr("wlr_gym.learning.adaptation.adapt.decide", decide)
     first, found = (wlr_gym.adapt("velocity_slip_aware", tmp_path / "out", robot_runs=tmp_path / "data") for _ in range(2))
     assert (first.policy, first.is_new) == ("velocity_slip_aware", False)
     assert found == first  # from its files

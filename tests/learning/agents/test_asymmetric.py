@@ -38,7 +38,7 @@ def core():
 
 def test_actor_sees_the_policy_group_only_and_the_critic_both(core):
     load_agent("ppo")
-    from wlr_gym.learning.ppo.asymmetric import AsymmetricPolicy
+    from wlr_gym.learning.ppo.networks import AsymmetricPolicy
 
     network = AsymmetricPolicy(core.observation_space, core.action_space, lambda _: 1e-3, net_arch=[16])
     generator = torch.Generator().manual_seed(0)

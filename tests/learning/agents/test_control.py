@@ -8,8 +8,9 @@ import pytest
 from studies.paper import corrected
 from studies.paper.quantities import PaperConstants, State
 from wlr_gym.base.errors import InputError
-from wlr_gym.learning.evaluation import make_core, roll_out, score, tuning
-from wlr_gym.learning.evaluation.tuning import tracking_score
+from wlr_gym.learning import tuning
+from wlr_gym.learning.evaluation import make_core, roll_out, score
+from wlr_gym.learning.tuning import tracking_score
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 from wlr_gym.policy.control import PidConfig, task_settings
 from wlr_gym.robot import load_robot

@@ -154,7 +154,7 @@ def test_resumes_bit_for_bit(run, tmp_path):
 def test_mirror_image_is_what_a_mirrored_robot_sees():
     """Two robots of one batch, one the other's mirror image in state, command and action: seen, after each step, the same."""
     from wlr_gym.envs.tasks.describe import column_name
-    from wlr_gym.learning.ppo.mirror import mirror_of
+    from wlr_gym.learning.ppo.networks import mirror_of
 
     level = {"randomization": {"name": "none", "base": "none", "sensor_noise": False}, "observation": "dict"}
     core = make_core(ENVIRONMENT, 2, {"task": TASK, **level})
@@ -206,7 +206,7 @@ def test_every_other_sample_is_mirrored(core):
 
 
 def test_unknown_mirror_image_is_refused():
-    from wlr_gym.learning.ppo.mirror import mirror_of
+    from wlr_gym.learning.ppo.networks import mirror_of
 
     with pytest.raises(InputError, match=r"mirror image of observation 'my_term\[north\]'"):
         mirror_of(["gyro[x]", "my_term[north]"])

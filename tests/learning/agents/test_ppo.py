@@ -18,8 +18,7 @@ from wlr_gym.cli import main
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.ppo.policy import parse_settings
-from wlr_gym.learning.ppo.training import begin_episodes, make_model
-from wlr_gym.learning.ppo.training_log import TrainingLog
+from wlr_gym.learning.ppo.training import TrainingLog, begin_episodes, make_model
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 
@@ -316,7 +315,7 @@ def test_a_start_from_a_controller_drives_like_it_and_is_reproducible(tmp_path):
 
 def test_the_learning_rate_falls_as_it_is_told_to():
     training = importlib.import_module("wlr_gym.learning.ppo.training")
-    config = importlib.import_module("wlr_gym.learning.ppo.config").PpoConfig(learning_rate=4e-3, final_learning_rate=1e-3)
+    config = importlib.import_module("wlr_gym.learning.ppo.policy").PpoConfig(learning_rate=4e-3, final_learning_rate=1e-3)
     linearly = training.learning_rate(config)
     exponentially = training.learning_rate(config.model_copy(update={"learning_rate_falls": "exponentially"}))
     np.testing.assert_allclose([linearly(share) for share in (1.0, 0.5, 0.0)], [4e-3, 2.5e-3, 1e-3])

@@ -33,7 +33,7 @@ def run(tmp_path_factory):
 
 def test_scores_are_those_of_an_evaluation_of_the_same_episodes(run):
     """``wlr evaluate`` of the final policy on the held-out seeds: another core, another loading of the weights."""
-    from wlr_gym.learning.ppo.held_out import FIRST_SEED
+    from wlr_gym.learning.ppo.training import FIRST_SEED
 
     rows = read_curve(run / "held_out.csv")
     assert [row["steps"] for row in rows] == [0, 128, 256, 384]
@@ -102,9 +102,8 @@ def test_evaluation_touches_no_global_state(run):
 def test_scoring_while_training_touches_no_global_state():
     """Nor is the network left in another mode."""
     from wlr_gym.envs import Sb3VecEnv
-    from wlr_gym.learning.ppo.held_out import HeldOutEpisodes
     from wlr_gym.learning.ppo.policy import parse_settings
-    from wlr_gym.learning.ppo.training import make_model
+    from wlr_gym.learning.ppo.training import HeldOutEpisodes, make_model
 
     config = parse_settings(SETTINGS | SCORED)
     env = Sb3VecEnv(ENVIRONMENT, config.num_envs, **config.environment)
@@ -199,8 +198,8 @@ def test_a_finished_run_can_be_extended(run, tmp_path):
 
 def test_a_core_for_scores_is_the_task_as_it_is_scored():
     """Training's own randomisation and episode length do not reach it."""
-    from wlr_gym.learning.ppo.config import PpoConfig
-    from wlr_gym.learning.ppo.held_out import HeldOutEpisodes
+    from wlr_gym.learning.ppo.policy import PpoConfig
+    from wlr_gym.learning.ppo.training import HeldOutEpisodes
 
     fields = {"environment": {"randomization": "none", "episode_length": 0.2, "precision": "float32"}, "evaluation_episodes": 2}
     episodes = HeldOutEpisodes(ENVIRONMENT, PpoConfig.model_validate(fields))

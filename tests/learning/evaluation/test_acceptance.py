@@ -12,7 +12,7 @@ from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS, register_task
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.task import having
-from wlr_gym.learning.evaluation.acceptance import (
+from wlr_gym.learning.evaluation.scoring import (
     ACCEPTANCE_FILE,
     FAMILIES,
     LARGEST_LOSS,

@@ -23,11 +23,10 @@ from wlr_gym.learning.evaluation import (
     write_card,
     write_episodes,
 )
-from wlr_gym.learning.evaluation.card_plots import draw_card, improvements, pareto
-from wlr_gym.learning.evaluation.card_report import cell
-from wlr_gym.learning.evaluation.plots import commanded_path
+from wlr_gym.learning.evaluation.card import cell
+from wlr_gym.learning.evaluation.conditions import SWEEPS
+from wlr_gym.learning.evaluation.plots import commanded_path, draw_card, improvements, pareto
 from wlr_gym.learning.evaluation.rollout import saturated, yaw_of
-from wlr_gym.learning.evaluation.sweeps import SWEEPS
 from wlr_gym.policy import make_policy
 
 ONE = np.ones((TICKS, EPISODES))

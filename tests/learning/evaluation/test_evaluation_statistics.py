@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wlr_gym.learning.evaluation.statistics import Bootstrap
+from wlr_gym.learning.evaluation.metrics import Bootstrap
 
 
 def pairs(values):

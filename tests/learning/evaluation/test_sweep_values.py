@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wlr_gym.learning.evaluation import Rollout, play, read_subjects
-from wlr_gym.learning.evaluation.sweeps import LEFT_FRICTION, SLOPE_FRICTION, SWEEPS
+from wlr_gym.learning.evaluation.conditions import LEFT_FRICTION, SLOPE_FRICTION, SWEEPS
 from wlr_gym.robot.parameter_table import ELEMENTS
 
 IDLE = read_subjects(["do_nothing"])

@@ -21,10 +21,10 @@ HOLD = Path(os.environ.get("SWEEP_HOLD", "no such file"))
 
 
 def wait_at_checkpoints() -> None:
-    from wlr_gym.learning.ppo import training, training_log
+    from wlr_gym.learning.ppo import training
 
     asked: list[int] = []
-    take, save = training.StopRequest._take, training_log.TrainingLog.save_checkpoint
+    take, save = training.StopRequest._take, training.TrainingLog.save_checkpoint
 
     def take_and_note(self, number, frame):
         asked.append(number)
@@ -36,7 +36,7 @@ def wait_at_checkpoints() -> None:
             time.sleep(0.02)
         return place
 
-    training.StopRequest._take, training_log.TrainingLog.save_checkpoint = take_and_note, save_and_wait
+    training.StopRequest._take, training.TrainingLog.save_checkpoint = take_and_note, save_and_wait
 
 
 GibbsAppellPlant._choose_kernel = choose_shared

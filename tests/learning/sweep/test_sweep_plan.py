@@ -124,7 +124,10 @@ def test_long_names_stay_different():
         ({"variants": {"one": {}, "two": {"gama": 0.9}}, "search": {"trials": 1}}, "did you mean 'gamma'"),
         ({"space": {"gamma": [0.9, 0.9]}}, "two trials are called 'gamma=0.9,seed=0': the same value is given twice"),
         ({"seeds": [1, 1]}, "two trials are called 'seed=1'"),
-        ({"seeds": [1, 1], "space": {"gamma": [0.9]}, "search": {"method": "optuna"}}, "two trials are called 'seed=1'"),
+        (
+            {"seeds": [1, 1], "space": {"gamma": [0.9]}, "search": {"method": "optuna"}},
+            "two trials are called 'gamma=0.9,seed=1'",
+        ),
         ({"space": {"gamma": [0.9, 1.5]}, "search": {"trials": 9}}, "gamma=1.5,seed=0.*gamma"),
         ({"space": {"environment.task": ["a/b", "a_b"]}}, "two trials are called"),
         ({"space": {"batch_size": [512, 500]}}, "batch_size 500 does not divide"),

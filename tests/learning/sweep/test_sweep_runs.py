@@ -1,4 +1,4 @@
-"""Sweeps that are run (docs/sweep.md): results as of the same trainings alone, failures, interruptions, table and page."""
+"""Sweeps that are run (docs/learning.md): results as of the same trainings alone, failures, interruptions, table and page."""
 
 import os
 import signal
@@ -20,15 +20,15 @@ pytest.importorskip("torch")
 #: Imported by every trial: the disk is full for one of them, as long as a file says so.
 FULL_DISK = """
 import errno, os, pathlib
-from wlr_gym.learning.ppo import checkpoint
-save = checkpoint.save
+from wlr_gym.learning.ppo import training
+save = training.write_policy
 
 def save_on_full_disk(folder, *arguments, **keywords):
     if "gamma=0.9," in str(folder) and pathlib.Path(__file__).with_suffix(".full").exists():
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     return save(folder, *arguments, **keywords)
 
-checkpoint.save = save_on_full_disk
+training.write_policy = save_on_full_disk
 """
 
 

@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from wlr_gym.base.checks import check_folder
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import alone_in
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.settings import parse_config, parse_options, read_yaml
 from wlr_gym.data.excitations import excite
+from wlr_gym.data.read import run_files
 from wlr_gym.data.record import same_profile
-from wlr_gym.envs.registry import task_name_of
-from wlr_gym.gap.decision import Decided
-from wlr_gym.learning.adaptation.driving import check_runs, drive_after, drive_before, record_runs
-from wlr_gym.learning.adaptation.identification import find_gap, state_uncertainty
-from wlr_gym.learning.adaptation.page import write_page
-from wlr_gym.learning.adaptation.plan import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder
+from wlr_gym.envs.registry import task_name_of, task_source_of
+from wlr_gym.envs.tasks.task import read_task
+from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
+from wlr_gym.gap.decision import Budget, Decided, Recorded, decide
+from wlr_gym.gap.report.result import PATCH_FILE
+from wlr_gym.learning.adaptation.driving import (
+    AdaptedRobot,
+    EmulatedRobot,
+    RealRobot,
+    check_runs,
+    drive_after,
+    drive_before,
+    excite_robot,
+    record_runs,
+)
 from wlr_gym.learning.adaptation.retraining import accept_policy, train_supervised
-from wlr_gym.learning.adaptation.robots import AdaptedRobot, EmulatedRobot, RealRobot
-from wlr_gym.learning.adaptation.uncertainty import Uncertainty
+from wlr_gym.learning.adaptation.state import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder, write_page
+from wlr_gym.learning.adaptation.uncertainty import Uncertainty, uncertainty_of
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 from wlr_gym.physics.effects import Source, load_patch, save_patch
 from wlr_gym.physics.plants import check_simulator
@@ -126,8 +139,7 @@ def adapt(
     }
     asked = parse_options(Asked, given)
     if robot_runs is not None:
-        if not Path(robot_runs).is_dir():
-            raise InputError(f"--robot-runs {robot_runs}: no such folder; expected measured runs")
+        check_folder(Path(robot_runs), "--robot-runs")
         check_runs(Path(robot_runs), own)  # before anything is written
     progress = open_folder(Path(out), asked, tell, threads)
     with alone_in(progress.out):
@@ -201,3 +213,57 @@ def _decided(progress: Progress) -> Decided:
     folder = Path(progress.steps["gap"].numbers["folder"])
     result = read_result(folder / RESULT_FILE) if (folder / RESULT_FILE).is_file() else None
     return Decided(parse_config(History, read_yaml(path), str(path)), result, folder)
+
+
+# ---- steps that find out: the gap workflow, and what its result states -----------------------------------------------
+
+
+def find_gap(progress: Progress, robot: AdaptedRobot | None) -> AdaptStep:
+    """Find what the model lacks, with further runs where there is a robot to drive."""
+    asked = progress.asked
+    data = Path(asked.robot_runs) if asked.robot_runs is not None else progress.out / "runs"
+    runs = asked.budget_runs if robot is not None else 0
+    budget = Budget(runs, math.inf if asked.budget_seconds is None else asked.budget_seconds)
+
+    def record(motion: Any, folder: Path) -> Recorded:
+        assert robot is not None
+        return excite_robot(robot, motion, folder, asked.seed + 100 + len(run_files(folder)))
+
+    decided = decide(data, progress.out / "gap", record, budget, threads=progress.threads, tell=progress.tell)
+    history, result = decided.history, decided.result
+    said = [f"Ended: {history.ended}, after {len(history.driven)} further runs."]
+    if result is None:
+        said.append("There are too few usable runs for an analysis.")
+    else:
+        said.insert(0, result.summary or result.verdict)
+    names = [one.name for one in result.effects] if result is not None else []
+    return AdaptStep(
+        said=tuple(said),
+        driving=history.seconds,
+        command=f"wlr gap {data} --out {progress.out / 'gap'} --until-decided --budget-runs {runs}"
+        + (f" --record emulated --hidden {progress.out / 'hidden.yaml'}" if asked.driven == "emulated" else ""),
+        numbers={
+            "verdict": "" if result is None else result.verdict,
+            "effects": names,
+            "ended": history.ended,
+            "folder": str(decided.folder),
+        },
+    )
+
+
+def state_uncertainty(progress: Progress, decided: Decided, own: Robot) -> tuple[AdaptStep, Uncertainty | None]:
+    """Return what the result states, as patch and randomisation; None where it states nothing."""
+    folder, result = progress.folder("model"), decided.result
+    if result is None or result.verdict in (BAD_DATA, NOT_EXCITED) or not (result.calibration or result.effects):
+        why = "There is no result." if result is None else f"The verdict is '{result.verdict}': there are no numbers to take."
+        return AdaptStep(outcome="left out", said=(why, "The old policy is kept.")), None
+    patch = load_patch(decided.folder / PATCH_FILE)
+    found = uncertainty_of(result, patch, task_randomization(progress.asked.environment), own, folder)
+    command = f"wlr envs {progress.asked.environment} --randomization {folder / 'randomization.yaml'}"
+    numbers = {"effects": patch.content()["effects"], "families": [one.name for one in found.families]}
+    return AdaptStep(said=found.said, command=command, numbers=numbers), found
+
+
+def task_randomization(environment: str) -> str | Mapping[str, Any]:
+    """Return the randomisation of a task's own."""
+    return read_task(task_source_of(environment)).randomization

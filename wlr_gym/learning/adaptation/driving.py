@@ -1,29 +1,274 @@
-"""Steps in which the robot drives: the task before, the excitations, and the task again, old policy beside new."""
+"""The robot that a policy is adapted to, emulated or real; episodes that it drives; and the steps in which it does."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
-from wlr_gym.data.excitations import excite
+from wlr_gym.base.random import generator
+from wlr_gym.data.excitations import Motion, excite
+from wlr_gym.data.format import RunMeta
 from wlr_gym.data.read import Run, read_dataset, read_run, run_files
+from wlr_gym.data.record import meta_of
 from wlr_gym.data.replay import robot_of
-from wlr_gym.learning.adaptation.plan import AdaptStep, Asked, Progress
-from wlr_gym.learning.adaptation.robots import AdaptedRobot, excite_robot, interrupted
-from wlr_gym.learning.evaluation.robot_episodes import RobotEpisode, drive_episode
+from wlr_gym.envs.core import make_task, measured_truth
+from wlr_gym.envs.registry import task_source_of
+from wlr_gym.envs.settings import read_settings
+from wlr_gym.envs.tasks.compiled_terms import Scores, compile_scores
+from wlr_gym.envs.tasks.signals import yaw_of
+from wlr_gym.envs.tasks.task import scales_of, tracking_error
+from wlr_gym.gap.decision import Recorded
+from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.deployment import Deployment, deploy, drive_robot, refuse_deadman
+from wlr_gym.hardware.emulator.line import NO_TIME
+from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
+from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
+from wlr_gym.hardware.operator import STOP_KEYS, STOP_SIGNALS, stop_on_request
+from wlr_gym.hardware.plant import RobotPlant
+from wlr_gym.learning.adaptation.state import AdaptStep, Asked, Progress
+from wlr_gym.learning.evaluation.metrics import Bootstrap, Estimate
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.learning.evaluation.scoring import evaluate
-from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
+from wlr_gym.perception.observer import ESTIMATE_LAYOUT
+from wlr_gym.physics.effects import Patch, apply_patch
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantOptions, RobotOptions, standing_state
+from wlr_gym.policy import environment_for, make_policy
 from wlr_gym.robot import Robot, robot_hash
+from wlr_gym.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+    from wlr_gym.envs.tasks.task import Task
+
+#: s of emulated time per tick of an emulated robot.
+TICK = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class EmulatedRobot:
+    """An emulated robot, servos and command limiter included, on a simulator that need not be the one of the training.
+
+    Attributes:
+        robot: its file. hidden: what it has that the file does not say.
+        backend, physics_step: simulator behind it, and its step (s).
+        copy: parameters of the copy before what is hidden is added; None = nominal.
+    """
+
+    robot: Robot
+    hidden: Patch = field(default_factory=Patch)
+    backend: str = "gibbs_appell"
+    physics_step: float = 0.001
+    copy: Parameters | None = None
+
+    def start(self, log: Path | None, seed: int, meta: RunMeta | None = None) -> tuple[RobotPlant, Any]:
+        """Return the robot standing with a heading that the seed draws, torque off, and the simulator behind it."""
+        own = self.copy.copy() if self.copy is not None else Parameters.nominal(self.robot)
+        parameters = apply_patch(self.hidden, own)
+        state = standing_state(self.robot, parameters)
+        yaw = generator(seed, "adaptation", "heading").uniform(-np.pi, np.pi)
+        state.quaternion[0] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+        hardware = with_flow_port(self.robot, load_hardware("nominal"))
+        options = PlantOptions(control_period=TICK, physics_step=self.physics_step)
+        plant = make_plant(self.backend, self.robot, 1, options, self.hidden.forces)
+        machine = Machine(
+            self.robot,
+            hardware,
+            MachineOptions(timing=NO_TIME, tick=TICK, seed=seed),
+            plant=plant,
+            parameters=parameters,
+            state=state,
+        )
+        driven = RobotPlant(self.robot, 1, PlantOptions(), RobotOptions(log=log), link=emulated_link(machine), meta=meta)
+        return driven, machine.plant
+
+
+@dataclass(frozen=True, eq=False)
+class RealRobot:
+    """A robot on its ports.
+
+    Attributes:
+        robot: its file. hardware: wiring and mounting. ports: other ones than the file's.
+        ask: called with what the robot is about to do, before every drive; raises where it may not.
+    """
+
+    robot: Robot
+    hardware: str = "nominal"
+    ports: Mapping[str, str] = field(default_factory=dict)
+    ask: Callable[[str], None] = lambda text: None
+
+    def start(self, log: Path | None, seed: int, meta: RunMeta | None = None) -> tuple[RobotPlant, Any]:
+        """Ask, and return the robot, torque off; it has no truth."""
+        self.ask("The robot will stand up and drive.")
+        options = RobotOptions(hardware=self.hardware, ports=self.ports, log=log)
+        return RobotPlant(self.robot, 1, PlantOptions(), options, meta=meta), None
+
+
+AdaptedRobot = EmulatedRobot | RealRobot
+
+
+def excite_robot(robot: AdaptedRobot, motion: Motion, data: Path, seed: int = 0) -> Recorded:
+    """Drive a motion and leave its run in ``data``.
+
+    Raises:
+        KeyboardInterrupt: somebody stopped the drive; its run is removed.
+    """
+    with closing(robot.start(data, seed, meta_of(motion, robot.robot))[0]) as plant:
+        drive = drive_robot(plant, motion)
+    if interrupted(drive.reason):
+        if drive.run is not None:
+            drive.run.unlink(missing_ok=True)
+        raise KeyboardInterrupt(drive.reason)
+    return Recorded(drive.run, drive.reason)
+
+
+def interrupted(reason: str) -> bool:
+    """Whether a drive ended because a signal or a key asked for it."""
+    return any(name in reason for name in (*STOP_SIGNALS, *STOP_KEYS))
+
+
+# ---- an episode, scored by the measures that its task has in simulation ----------------------------------------------
+
 
 Array = NDArray[np.float64]
+
+#: Why an episode ended that was driven to its end.
+WHOLE = "time is over"
+#: The same of one in which it fell.
+FELL = "it fell"
+
+
+class EpisodeRobot(Protocol):
+    """A robot that policies can drive."""
+
+    def start(self, log: Path | None, seed: int) -> tuple[RobotPlant, Any]:
+        """Return the robot as a plant, torque off, and the simulator behind an emulated one; None = it is a real one."""
+        ...
+
+
+@dataclass(frozen=True)
+class RobotEpisode:
+    """How an episode went.
+
+    Attributes:
+        seed: of its commands.
+        tracking_error: as in evaluations; a fall or a stop by the supervision adds 10.
+        measures: rms of each measure, SI units.
+        seconds: driven.
+        reason: why it ended.
+        run: path of its log; empty = none was written.
+    """
+
+    seed: int
+    tracking_error: float
+    measures: Mapping[str, float]
+    seconds: float
+    reason: str
+    run: str = ""
+
+    @property
+    def whole(self) -> bool:
+        """Whether it was driven to its end."""
+        return self.reason == WHOLE
+
+
+def drive_episode(
+    environment: str, policy: str, robot: EpisodeRobot, seed: int, seconds: float, log: Path | None = None
+) -> RobotEpisode:
+    """Drive one episode; torque is off afterwards. Commands are those of a simulated episode of the same seed.
+
+    An emulated robot is scored by its true motion, a real one by what the slip observer and the gyro say of it.
+
+    Args:
+        environment: id. policy: its source. robot: what is driven.
+        seed: of the commands. seconds: of the episode.
+        log: folder for the run; None = none is written.
+
+    Raises:
+        InputError: a policy that does not fit, or without a slip observer on a real robot; ports that cannot be opened.
+    """
+    keywords = {"backend": "dynamixel", "hardware": RobotOptions(emulated=True), "episode_length": seconds}
+    core = make_core(environment, 1, environment_for(policy, keywords))
+    core.plant.close()
+    plant, truth = robot.start(log, seed)
+    core.plant = plant
+    try:
+        refuse_deadman(plant)
+        if truth is None and core.observer is None:
+            raise InputError(f"policy '{policy}': it has no slip observer, which is what tells how a real robot moves")
+        whole = make_task(task_source_of(environment), read_settings(environment_for(policy, {})))  # with all measures
+        score = _Score(whole, core, truth)
+        with stop_on_request(plant.loop.operator):
+            driven = deploy(core, make_policy(policy, core.contract()), seed, watcher=score)
+    finally:
+        core.close()
+    return score.episode(seed, driven)
+
+
+class _Score:
+    """The measures of an episode on a robot, by the kernel that scores simulated ones."""
+
+    def __init__(self, task: Task, core: Core, truth: Any) -> None:
+        self._task, self._core, self._true = task, core, truth
+        self._kernel = compile_scores(task)
+        self._scores = Scores.zeros(task, 1)
+        self._start = np.zeros_like(core.start)
+        self._ticks = 0
+
+    def begin(self) -> None:
+        """Note where the episode starts."""
+        now = self._truth()
+        self._start[0, :2] = TRUTH_LAYOUT.view(now, "position")[0, :2]
+        self._start[0, 2] = yaw_of(*TRUTH_LAYOUT.view(now, "quaternion").T)[0]
+
+    def take(self, command: Array) -> str:
+        """Score a control step; say so where a termination of the task ends the episode."""
+        core, task = self._core, self._task
+        estimate = np.zeros((1, ESTIMATE_LAYOUT.width)) if core.observer is None else core.observer.values
+        clock = np.array([[(self._ticks + 1) * task.config.control_period]])
+        signals = (
+            core.sensors.values, estimate, self._truth(), command, core.action, core.actions.previous, self._start, clock,
+            core.presence, core.computed,
+        )  # fmt: skip
+        self._kernel.run(core.everyone, signals, self._kernel.numbers, tuple(self._scores))
+        self._ticks += 1
+        return FELL if (self._scores.over > 0.0).any() else ""
+
+    def _truth(self) -> Array:
+        if self._true is not None:
+            return self._true.truth().values.copy()
+        observer = self._core.observer
+        assert observer is not None
+        found = measured_truth(self._core.sensors)
+        for channel in ("position", "linear_velocity_in_body"):
+            found[:, TRUTH_LAYOUT.slices[channel]][:, :2] = ESTIMATE_LAYOUT.view(observer.values, channel)
+        half = 0.5 * ESTIMATE_LAYOUT.view(observer.values, "yaw")
+        TRUTH_LAYOUT.view(found, "quaternion")[:, [0, 3]] = np.stack([np.cos(half), np.sin(half)], axis=-1)
+        return np.nan_to_num(found)
+
+    def episode(self, seed: int, driven: Deployment) -> RobotEpisode:
+        """Return how it went."""
+        reason, run = driven.reason, "" if driven.run is None else str(driven.run)
+        task, ticks = self._task, max(1, self._ticks)
+        rms = np.sqrt(self._scores.squares[0] / ticks)
+        measures = {name: float(value) for name, value in zip(task.measures, rms, strict=True)}
+        largest = dict(zip(task.measures, self._scores.largest[0], strict=True))
+        scales = scales_of(task.config)
+        errors = {(name, kind): np.array([measures[name] if kind == "rms" else largest[name]]) for name, kind in scales}
+        error = float(tracking_error(scales, errors, np.array([reason != WHOLE]))[0])
+        return RobotEpisode(seed, error, measures, ticks * task.config.control_period, reason, run)
+
+
+# ---- steps: the task before, the excitations, and the task again, old policy beside new ------------------------------
 
 #: Seeds of the episodes before and after: no episode is driven twice, and none is met in training or acceptance.
 BEFORE, AFTER = 300_000, 400_000
@@ -132,7 +377,7 @@ def _seconds(run: Run) -> float:
     return float(run["t"][-1] - run["t"][0])
 
 
-# ---- episodes --------------------------------------------------------------------------------------------------------
+# ---- episodes of a step ----------------------------------------------------------------------------------------------
 
 
 def seeds_of(first: int, asked: Asked) -> list[int]:

@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
+from wlr_gym.envs.core import Core
 from wlr_gym.envs.tasks.task import having
-from wlr_gym.learning.adaptation.plan import AdaptStep, Progress
-from wlr_gym.learning.adaptation.supervised import may_stop_more, stopped_episodes
+from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware.safety.rules import JointMemory, RobotStatus, is_frozen, is_lost, ratings_of, remember_joints
+from wlr_gym.hardware.servos import UNREAD
+from wlr_gym.learning.adaptation.state import AdaptStep, Progress
 from wlr_gym.learning.adaptation.uncertainty import STATED, TRAINED_SHARE, Family, Uncertainty
-from wlr_gym.learning.evaluation.acceptance import (
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED
+from wlr_gym.learning.evaluation.rollout import make_core, roll_out, seen_observations
+from wlr_gym.learning.evaluation.scoring import (
     LARGEST_LOSS,
     Acceptance,
     accept,
@@ -25,12 +30,11 @@ from wlr_gym.learning.evaluation.acceptance import (
     read_acceptance,
     write_acceptance,
 )
-from wlr_gym.learning.evaluation.conditions import FIRST_SEED
-from wlr_gym.learning.evaluation.rollout import make_core, seen_observations
+from wlr_gym.learning.evaluation.subjects import make_player
 from wlr_gym.learning.training import resume_training, train
 from wlr_gym.policy import export_policy, make_policy, policy_environment
 from wlr_gym.policy.agents import TrainingProgress, agent_function
-from wlr_gym.robot import Robot
+from wlr_gym.robot import JOINTS, Robot
 
 #: Share of the learning rate that is left at the end of the training.
 FALLS_TO = 0.2
@@ -249,3 +253,72 @@ def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threa
         effects=list(family.effects) or None,
         threads=threads,
     )
+
+
+# ---- would the supervision stop the robot? its rules on simulated episodes; the simulator drives on ------------------
+
+#: Share of episodes by which a new policy may be stopped more often than the old one.
+LARGEST_RISE = 0.02
+
+
+def stopped_episodes(policy: str, environment: str, keywords: Mapping[str, Any], episodes: int, seed: int) -> NDArray[np.bool_]:
+    """Return in which episodes (N,) the supervision would stop a robot that a policy drives.
+
+    Args:
+        policy, environment: who drives, and what. keywords: of the environment.
+        episodes: N. seed: of the first one; the others count up from it.
+    """
+    core, player = make_player(environment, policy, episodes, keywords)
+    with closing(core):
+        watched = _Watched(core)
+        roll_out(core, player, seed, on_tick=watched.look)
+        return watched.stopped
+
+
+def may_stop_more(new: NDArray[np.bool_], old: NDArray[np.bool_]) -> bool:
+    """Whether it is not shown that the first is stopped in at most 2 % more of the same episodes (N,) than the second.
+
+    The upper end of the 95 % interval of the difference of two paired shares (Bonett and Price 2012) is compared.
+    """
+    more, less, count = int((new & ~old).sum()) + 1, int((old & ~new).sum()) + 1, len(new) + 2
+    rise = (more - less) / count
+    return rise + 1.96 * np.sqrt((more + less - count * rise**2) / count**2) > LARGEST_RISE
+
+
+class _Watched:
+    """The supervision's rules on what joints do, on all robots of a batch; it has others for registers, sensors and bus."""
+
+    def __init__(self, core: Core) -> None:
+        free = core.actions.torque_on  # of tasks whose wheels have no torque
+        self._core, self._on = core, np.ones((core.count, len(JOINTS)), bool) if free is None else free
+        self._limits = load_hardware("nominal").safety
+        self._ratings = ratings_of(core.task.robot, core.task.config.control_period)
+        self._memory = JointMemory()
+        self.stopped: NDArray[np.bool_] = np.zeros(core.count, bool)
+
+    def look(self) -> None:
+        """Judge the robots whose episodes go on."""
+        core, limits, ratings = self._core, self._limits, self._ratings
+        self._memory = remember_joints(limits, ratings, self._status(), self._memory, core.actions.setpoints.copy(), self._on)
+        bad = is_frozen(limits, self._memory) | is_lost(limits, ratings, self._memory)
+        self.stopped |= bad.any(axis=1) & ~(core.terminated | core.truncated)
+
+    def _status(self) -> RobotStatus:
+        """What the servos say, copied, since sensors are read in place; that legs' motors draw current is not looked at."""
+        sensors, none, unknown = self._core.sensors, np.zeros(self._on.shape), np.full(3, np.nan)
+        return RobotStatus(
+            time=0.0,
+            position=sensors.joint_position.copy(),
+            velocity=sensors.joint_velocity.copy(),
+            effort=none,
+            silence=none,
+            alert=none > 0,
+            restarted=none > 0,
+            voltage=none + self._ratings.supply,
+            temperature=none,
+            gyro=unknown,
+            accelerometer=unknown,
+            imu_silence=0.0,
+            up=unknown,
+            registers=UNREAD._replace(torque=np.ones(self._on.shape)),
+        )

@@ -1,9 +1,13 @@
 """Evaluation: whole episodes as one batch, score cards with confidence intervals, and their plots."""
 
-from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card, score
-from wlr_gym.learning.evaluation.card_report import (
+from wlr_gym.learning.curves import read_curve
+from wlr_gym.learning.evaluation.card import (
+    MAIN,
+    OTHER_PLANT,
+    Card,
     comparison_rows,
     rows,
+    score,
     seed_rows,
     sweep_comparison_rows,
     sweep_rows,
@@ -11,14 +15,11 @@ from wlr_gym.learning.evaluation.card_report import (
     write_card,
     write_episodes,
 )
-from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play, work
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, Sweep, play, read_sweep, sweeps_for, work
 from wlr_gym.learning.evaluation.episode_recorder import EpisodeRecorder, record_episodes, write_samples
-from wlr_gym.learning.evaluation.learning_curve import read_curve
-from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
+from wlr_gym.learning.evaluation.metrics import Estimate, Metric, Played, metrics_of, summarise
 from wlr_gym.learning.evaluation.rollout import Measure, Rollout, make_core, measures_of, roll_out, start_episodes
-from wlr_gym.learning.evaluation.statistics import Estimate
 from wlr_gym.learning.evaluation.subjects import Subject, common_robot, identity, make_player, read_subjects
-from wlr_gym.learning.evaluation.sweeps import Sweep, read_sweep, sweeps_for
 
 __all__ = [
     "FIRST_SEED",

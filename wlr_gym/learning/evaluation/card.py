@@ -1,20 +1,24 @@
-"""The score card: every subject's scores with confidence intervals, and how the first one compares with the others."""
+"""The score card: every subject's scores with confidence intervals, and how the first one compares with the others.
+
+As data (:class:`Card`), as tables of text, Markdown and JSON, and its episodes as a table.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.learning.evaluation.conditions import Results
-from wlr_gym.learning.evaluation.metrics import Metric, Played, metrics_of, summarise
+from wlr_gym.base.files import replace_file, write_json, write_text
+from wlr_gym.learning.evaluation.conditions import BLOCK, Results, Sweep
+from wlr_gym.learning.evaluation.metrics import CONFIDENCE, Bootstrap, Estimate, Metric, Played, metrics_of, summarise
 from wlr_gym.learning.evaluation.rollout import Rollout
-from wlr_gym.learning.evaluation.statistics import Bootstrap, Estimate
-from wlr_gym.learning.evaluation.sweeps import Sweep
 
 Array = NDArray[np.float64]
 Scores = dict[str, Estimate]
@@ -200,3 +204,256 @@ class Card:
     def seed_scores(self) -> dict[str, SeedScores]:
         """Subject -> scores of each of its training seeds, where there are several."""
         return {name: seed_scores(self.main[name], seeds) for name, seeds in self.training_seeds.items()}
+
+
+# ---- text, Markdown, JSON --------------------------------------------------------------------------------------------
+
+#: Version of ``card.json``.
+FORMAT = 2
+#: Beyond this a number is the quotient of something and next to nothing, such as the slip of a robot against one that rests.
+LARGEST = 1000.0
+#: Metrics that are shown for each training seed.
+PER_SEED = ("tracking_error", "success", "excess_slip", "reward")
+Table = list[list[str]]
+
+
+def rows(scores: Mapping[str, Scores], metrics: Sequence[Metric], *, short: bool = False) -> Table:
+    """Return a table as text: a header, then one row per metric with a column per subject.
+
+    ``short`` gives half the width of the interval instead of its ends.
+    """
+    header = ["metric", "unit", *scores]
+    return [header, *([m.key, m.unit, *(_value(m, own, short) for own in scores.values())] for m in metrics)]
+
+
+def _value(metric: Metric, scores: Scores, short: bool) -> str:
+    largest = math.inf if metric.key == "reward" else LARGEST  # a reward is no quotient
+    return cell(scores[metric.key], metric.digits, short, largest)
+
+
+def cell(estimate: Estimate, digits: int, short: bool = False, largest: float = LARGEST) -> str:
+    """Return ``mean [low, high]``, or ``mean ± half``; ``-`` where there is nothing or nothing to compare with.
+
+    The mean alone where it has no interval.
+    """
+    if not abs(estimate.mean) <= largest:
+        return "-"
+    if not math.isfinite(estimate.high - estimate.low):
+        return _text(estimate.mean, digits)
+    if short:
+        return f"{_text(estimate.mean, digits)} ± {_text((estimate.high - estimate.low) / 2, digits)}"
+    return f"{_text(estimate.mean, digits)} [{_text(estimate.low, digits)}, {_text(estimate.high, digits)}]"
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"  # no -0
+
+
+def comparison_rows(card: Card, label: str = MAIN, *, short: bool = False) -> Table:
+    """Return how much better the first subject is than each baseline: a header, then one row per metric, and the score."""
+    others = card.comparison[label]
+    table = [["better in", "unit", *others]]
+    for metric in card.metrics:
+        unit, digits = (metric.unit, metric.digits) if metric.key in BY_DIFFERENCE else ("%", 1)
+        unit = "points" if unit == "%" and metric.key in BY_DIFFERENCE else unit
+        table.append([metric.key, unit, *(_comparing(own[metric.key], digits, short) for own in others.values())])
+    if label == MAIN and card.share_of:
+        shares = [cell(card.share_of[name], 1, short) if name in card.share_of else "-" for name in others]
+        table.append(["score, % of the baseline's", "%", *shares])
+    return table
+
+
+def _comparing(estimate: Estimate, digits: int, short: bool) -> str:
+    """A cell, in bold (of Markdown) where the interval excludes zero."""
+    text = cell(estimate, digits, short)
+    return f"**{text}**" if not short and text != "-" and estimate.excludes_zero else text
+
+
+def sweep_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = True) -> Table:
+    """Return one metric of a sweep: a header, then one row per point with a column per subject."""
+    sweep = card.sweeps[index]
+    digits = next(metric.digits for metric in card.metrics if metric.key == key)
+    body = [
+        [point.label, *(cell(own[key], digits, short) for own in card.scores[sweep.label(point)].values())]
+        for point in sweep.points
+    ]
+    return [[sweep.axis, *card.names], *body]
+
+
+def sweep_comparison_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = False) -> Table:
+    """Return how much better the first subject is over a sweep, in %: one row per point with a column per baseline."""
+    sweep = card.sweeps[index]
+    body = [
+        [point.label, *(_comparing(own[key], 1, short) for own in card.comparison[sweep.label(point)].values())]
+        for point in sweep.points
+    ]
+    return [[sweep.axis, *card.names[1:]], *body]
+
+
+def transfer_rows(card: Card, *, short: bool = False) -> Table:
+    """Return scores on both plants on the same floors: a header, then one row per subject."""
+    keys = ("tracking_error", "success", "excess_slip")
+    digits = {metric.key: metric.digits for metric in card.metrics}
+    table = [["policy", "score kept (%)", *(f"{key}{plant}" for key in keys for plant in ("", ", other"))]]
+    for name in card.names:
+        kept = cell(card.kept[name], 1, short) if name in card.kept else "-"
+        pairs = [(card.scores[label][name][key], digits[key]) for key in keys for label in (MAIN, OTHER_PLANT)]
+        table.append([name, kept, *(cell(estimate, places, short) for estimate, places in pairs)])
+    return table
+
+
+def seed_rows(card: Card, name: str, *, short: bool = False) -> Table:
+    """Return the scores of a subject's training seeds: a header, then one row per seed and those over all seeds."""
+    seeds = card.seed_scores[name]
+    metrics = [
+        metric for metric in card.metrics if metric.key in PER_SEED and np.isfinite(card.scores[MAIN][name][metric.key].mean)
+    ]
+
+    def row(title: str, scores: Scores) -> list[str]:
+        return [title, *(_value(m, scores, short) for m in metrics)]
+
+    table = [["training seed", *(m.key if m.unit == "-" else f"{m.key} ({m.unit})" for m in metrics)]]
+    table += [row(seed, scores) for seed, scores in seeds.scores.items()]
+    table.append(row("mean", card.scores[MAIN][name]))
+    if seeds.interquartile_mean:
+        table.append(row("interquartile mean", seeds.interquartile_mean))
+    table.append(["median", *(_text(seeds.median(m.key), m.digits) for m in metrics)])
+    spreads = [seeds.spread(m.key) for m in metrics]
+    table.append(["(max - min) / median", *(f"{spread:.0f} %" if spread <= LARGEST else "-" for spread in spreads)])
+    return table
+
+
+def markdown(card: Card, pictures: Mapping[str, str] | None = None) -> str:
+    """Return the card as Markdown. ``pictures``: name -> file, linked where they belong."""
+    shown = dict(pictures or {})
+    ours = card.names[0]
+
+    def picture(name: str, text: str) -> list[str]:
+        return [f"![{text}]({shown[name]})", ""] if name in shown else []
+
+    lines = [f"# Score card: {ours}", "", *(f"- {name}: {value}" for name, value in card.conditions.items()), ""]
+    lines += [*_table(rows(card.scores[MAIN], card.metrics)), ""]
+    over = "training seeds and episodes" if card.training_seeds else "blocks and episodes"
+    lines += [f"Mean over episodes [{CONFIDENCE:.0%} bootstrap interval over {over}]; `-` where nothing moved.", ""]
+    lines += _training_seeds(card)
+    if len(card.names) > 1:
+        lines += [f"## {ours} against the others, on the same episodes", ""]
+        how = "is better (positive) or worse, paired episode by episode; bold: the interval excludes 0."
+        lines += [f"By how much {ours} {how}", ""]
+        lines += [*_table(comparison_rows(card)), "", *picture("improvement", "Paired improvements")]
+    lines += picture("pareto", "Tracking error against slip, 95 % intervals")
+    for index, sweep in enumerate(card.sweeps):
+        lines += [f"## Sweep: {sweep.name}", "", f"{sweep.doc[0].upper()}{sweep.doc[1:]}. Tracking error:", ""]
+        lines += [*_table(sweep_rows(card, index, short=False)), ""]
+        if len(card.names) > 1:
+            lines += [f"By how much {ours} is better in it (%), paired:", ""]
+            lines += [*_table(sweep_comparison_rows(card, index)), ""]
+        lines += picture(f"sweep_{sweep.name}", f"Sweep: {sweep.name}")
+    if OTHER_PLANT in card.results:
+        lines += ["## On the other plant", "", "The same floors, robots and commands in the other simulator.", ""]
+        lines += [*_table(transfer_rows(card)), ""]
+    if "spectrum" in shown:
+        lines += ["## Spectrum of the action", "", *picture("spectrum", "Spectrum of the action")]
+    if card.identities:
+        lines += ["## Who played", "", "SHA-256 of the policy file or of an agent's settings:", ""]
+        lines += [*(f"- {name}: `{identity}`" for name, identity in card.identities.items()), ""]
+    lines += ["## Meaning of the rows", ""]
+    lines += [f"- `{m.key}` ({m.unit}, {'less' if m.less_is_better else 'more'} is better): {m.doc}" for m in card.metrics]
+    lines += ["- score: reward above that of doing nothing on the same episodes"]
+    return "\n".join(lines) + "\n"
+
+
+def _training_seeds(card: Card) -> list[str]:
+    lines = []
+    for name, seeds in card.seed_scores.items():
+        said = (
+            f"{len(seeds.scores)} trainings of one recipe; median seed: {seeds.median_seed}. The interval of one seed is over "
+        )
+        said += "episodes alone; that over all seeds contains training-seed variance."
+        lines += [f"## Training seeds of {name}", "", said, "", *_table(seed_rows(card, name)), ""]
+    single = [name for name in card.names if name not in card.training_seeds]
+    if lines and single:
+        lines += [f"One policy each, intervals without training-seed variance of theirs: {', '.join(single)}.", ""]
+    return lines
+
+
+def _table(table: Table) -> list[str]:
+    header, *body = table
+    return [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}", *(f"| {' | '.join(row)} |" for row in body)]
+
+
+def content(card: Card) -> dict[str, Any]:
+    """Return the card as plain types: what ``card.json`` holds."""
+    power = {name: [None if np.isnan(p) else float(p) for p in played.power] for name, played in card.main.items()}
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "conditions": dict(card.conditions),
+        "identities": dict(card.identities),
+        "metrics": {m.key: {"unit": m.unit, "less_is_better": m.less_is_better, "doc": m.doc} for m in card.metrics},
+        **_policies(card, MAIN),
+        "score_in_percent_of": {name: _numbers(estimate) for name, estimate in card.share_of.items()},
+        "sweeps": {
+            sweep.name: [{"at": point.label, **_policies(card, sweep.label(point))} for point in sweep.points]
+            for sweep in card.sweeps
+        },
+        "spectrum": {"frequency": card.main[card.names[0]].frequency.tolist(), "power": power},
+    }
+    if OTHER_PLANT in card.results:
+        document["other_plant"] = {
+            **_policies(card, OTHER_PLANT),
+            "score_kept": {name: _numbers(estimate) for name, estimate in card.kept.items()},
+        }
+    if card.training_seeds:
+        document["training_seeds"] = {name: _seeds(seeds) for name, seeds in card.seed_scores.items()}
+    return document
+
+
+def _policies(card: Card, label: str) -> dict[str, Any]:
+    return {"policies": _scores(card.scores[label]), "better_than": _scores(card.comparison[label])}
+
+
+def _scores(scores: Mapping[str, Scores]) -> dict[str, Any]:
+    return {name: _estimates(own) for name, own in scores.items()}
+
+
+def _estimates(scores: Scores) -> dict[str, Any]:
+    return {key: _numbers(estimate) for key, estimate in scores.items()}
+
+
+def _seeds(seeds: SeedScores) -> dict[str, Any]:
+    spread = {key: seeds.spread(key) for key in next(iter(seeds.scores.values()))}
+    return {
+        "scores": _scores(seeds.scores),
+        "interquartile_mean": _estimates(seeds.interquartile_mean),
+        "median_seed": seeds.median_seed,
+        "spread_in_percent_of_median": {key: value if np.isfinite(value) else None for key, value in spread.items()},
+    }
+
+
+def _numbers(estimate: Estimate) -> dict[str, float | None]:
+    return {name: float(value) if np.isfinite(value) else None for name, value in vars(estimate).items()}
+
+
+def write_card(folder: Path, card: Card, pictures: Mapping[str, str] | None = None) -> None:
+    """Write ``card.md`` and ``card.json`` into ``folder``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "card.md", markdown(card, pictures))
+    write_json(folder / "card.json", content(card))
+
+
+def write_episodes(path: Path, card: Card, first_seed: int) -> None:
+    """Write one row per condition, subject, training seed and episode as Parquet: seeds and the episode's own metrics."""
+    import pandas
+
+    frames = []
+    for label, subjects in card.results.items():
+        for name, played in subjects.items():
+            count, blocks, episodes = played.pairs["success"].shape[:3]
+            seeds = first_seed + BLOCK * np.arange(blocks)[:, None] + np.arange(episodes)
+            table = {"condition": label, "policy": name, "seed": np.tile(seeds.ravel(), count)}
+            if card.training_seeds:
+                table["training_seed"] = np.repeat(card.training_seeds.get(name, ("",) * count), blocks * episodes)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                table |= {key: (pairs[..., 0] / pairs[..., 1]).ravel() for key, pairs in played.pairs.items()}
+            frames.append(pandas.DataFrame(table))
+    replace_file(path, lambda temporary: pandas.concat(frames, ignore_index=True).to_parquet(temporary, index=False))

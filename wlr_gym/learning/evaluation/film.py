@@ -41,18 +41,6 @@ class Driver(Protocol):
         ...
 
 
-class OwnCommands:
-    """Leaves the commands to the task."""
-
-    def command(self, time: float) -> Mapping[str, float]:
-        """Return nothing to change."""
-        return {}
-
-    def wants_reset(self) -> bool:
-        """Return False."""
-        return False
-
-
 def drive(core: Core, policy: Policy, seed: int, driver: Driver | None = None) -> Iterator[None]:
     """Let a policy drive the one robot of ``core`` for ever, episode after episode, yielding before every environment step.
 
@@ -62,15 +50,14 @@ def drive(core: Core, policy: Policy, seed: int, driver: Driver | None = None) -
         seed: of the first episode; the following ones follow from it.
         driver: where the commands come from; None = the task's own.
     """
-    driver, period = driver or OwnCommands(), core.task.config.control_period
     core.seed(0, seed)
     while True:
-        commands = driver.command(0.0)
+        commands = driver.command(0.0) if driver else {}
         core.begin_episodes(core.everyone, {"command": dict(commands)} if commands else None)
         policy.reset(core.everyone)
         yield
-        while not (driver.wants_reset() or core.terminated[0] or core.truncated[0]):
-            if commands := driver.command(float(core.episodes.steps[0]) * period):
+        while not ((driver and driver.wants_reset()) or core.terminated[0] or core.truncated[0]):
+            if driver and (commands := driver.command(present_time(core))):
                 core.set_command(dict(commands))
             core.step(policy.act(core.observation), core.everyone)
             yield

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.checks import check_number
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks.signals import yaw_of
 from wlr_gym.robot import Robot
@@ -112,8 +113,7 @@ def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> C
     from wlr_gym.envs.registry import task_source_of
     from wlr_gym.envs.settings import read_settings
 
-    if episodes < 1:
-        raise InputError(f"episodes = {episodes}: expected 1 or more")
+    check_number("episodes", episodes, least=1)
     return Core(task_source_of(environment), read_settings(keywords), episodes)
 
 

@@ -1,25 +1,30 @@
-"""Evaluation from Python: what ``wlr evaluate`` does."""
+"""Evaluation from Python: what ``wlr evaluate`` does; a score card, or the acceptance test."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.checks import check_name
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import write_json
 from wlr_gym.base.seeds import require_seed
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings
 from wlr_gym.envs.tasks.describe import contract
-from wlr_gym.envs.tasks.randomization import RandomizationConfig
-from wlr_gym.envs.tasks.task import having
+from wlr_gym.envs.tasks.randomization import RandomizationConfig, load_randomization
+from wlr_gym.envs.tasks.task import having, read_task
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
-from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, Watch, play, work
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED, FLOORS, Condition, Watch, play, read_sweep, work
 from wlr_gym.learning.evaluation.subjects import Source, common_robot, identity, read_subjects
-from wlr_gym.learning.evaluation.sweeps import read_sweep
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.policy import make_policy, trained_environment
+from wlr_gym.policy import make_policy, policy_environment, shipped_names, trained_environment
 from wlr_gym.robot import RobotSource, load_robot, robot_hash
 
 BACKENDS = ("gibbs_appell", "mujoco")
@@ -83,8 +88,7 @@ def evaluate(
         InputError: unknown policy, environment, sweep or backend, a policy that does not fit the environment, several that are
             not trainings of one recipe, or a seed that is out of range.
     """
-    if backend not in (*BACKENDS, "both"):
-        raise unknown_name("backend", backend, (*BACKENDS, "both"))
+    check_name("backend", backend, (*BACKENDS, "both"))
     for name, given in (("baselines", baselines), ("sweeps", sweeps)):
         if isinstance(given, str):
             raise InputError(f"{name} = {given!r}: expected a list of names, such as [{given!r}]")
@@ -146,3 +150,210 @@ def fitting_baselines(environment: str, names: Sequence[str] = BASELINES) -> tup
             make_policy(name, wanted)
             found.append(name)
     return tuple(found)
+
+
+# ---- the acceptance test: on no family of floors does a policy lose much against what it is to replace ---------------
+
+#: Task -> families of floors of its card. No training and no setting knows ``stripes`` and ``ribbed``.
+FAMILIES: Mapping[str, tuple[str, ...]] = {
+    "velocity": FLOORS,
+    "path": FLOORS,
+    "posture": ("asymmetric", "nominal", "slippery", "ice", "stripes", "ribbed"),
+    "slope": ("slope",),
+}
+#: Largest loss of tracking error that is accepted, %: the upper end of its 95 % interval counts.
+LARGEST_LOSS = 5.0
+ACCEPTANCE_EPISODES, ACCEPTANCE_BLOCKS = 512, 5
+#: Of the engine: twice as fast as float64, and what rounding changes is far below what floors do.
+PRECISION = "float32"
+#: Name of the file, and its version.
+ACCEPTANCE_FILE = "acceptance.json"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What a policy loses against a reference on a family of floors, in tracking error, paired episode by episode.
+
+    Attributes:
+        floors: name of the randomisation. reference: what it is compared with.
+        error, reference_error: mean tracking errors.
+        loss: by how much the policy's is larger, % of the reference's; negative = it gains.
+        bound: upper end of the 95 % interval of the loss, %.
+    """
+
+    floors: str
+    reference: str
+    error: float
+    reference_error: float
+    loss: float
+    bound: float
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Result of the test of one policy.
+
+    Attributes:
+        policy: as given. environment: id. episodes, blocks: per family of floors.
+        sensors: those of the robots that not every robot has; None = as their file says.
+        largest_loss: %, what was allowed.
+        inputs: SHA-256 of the policies and of the task, robot and randomisations that were played.
+        losses: one per family of floors and reference.
+    """
+
+    policy: str
+    environment: str
+    episodes: int
+    blocks: int
+    sensors: tuple[str, ...] | None
+    largest_loss: float
+    inputs: str
+    losses: tuple[Loss, ...]
+
+    @property
+    def refused(self) -> tuple[Loss, ...]:
+        """Losses that are larger than what was allowed."""
+        return tuple(loss for loss in self.losses if not loss.bound <= self.largest_loss)
+
+    @property
+    def accepted(self) -> bool:
+        """Whether no bound of a loss is larger than what was allowed."""
+        return not self.refused
+
+
+def accept(
+    policy: Source,
+    env_id: str | None = None,
+    *,
+    references: Sequence[Source] | None = None,
+    floors: Sequence[Any] | None = None,
+    episodes: int = ACCEPTANCE_EPISODES,
+    blocks: int = ACCEPTANCE_BLOCKS,
+    largest_loss: float = LARGEST_LOSS,
+    sensors: Sequence[str] | None = None,
+    robot: Any = None,
+    effects: Any = None,
+    threads: int = 1,
+    tell: Tell = lambda text, share: None,
+) -> Acceptance:
+    """Play a policy and its references on the same episodes of every family of floors.
+
+    Args:
+        policy: one policy or agent, as :func:`wlr_gym.learning.evaluation.scoring.evaluate` takes it.
+        env_id: id of the environment; None = the one the policy was trained in.
+        references: None = :func:`references_of` the policy. The policy itself is none.
+        floors: randomisations; None = those of the task's card.
+        episodes: per block. blocks: of episodes, each with its own seeds.
+        largest_loss: % of the tracking error.
+        sensors, robot, effects, threads: of the environment; None = the task's.
+        tell: called with what is going on and the share of the work that was done since.
+
+    Raises:
+        InputError: unknown names, or a policy without references.
+    """
+    subject = read_subjects([policy])[0]
+    environment = env_id or trained_environment(subject.sources[0]) or "WLR-Velocity-v0"
+    task = task_name_of(environment)
+    own = (read_task(task_source_of(environment)).randomization,)
+    chosen = tuple(FAMILIES.get(task, own) if floors is None else floors)
+    given = references_of(subject.sources[0], environment) if references is None else references
+    against = tuple(one for one in given if read_subjects([one])[0] != subject)
+    if not against:
+        raise InputError(f"policy '{policy}': nothing to compare it with; expected a reference")
+    losses: list[Loss] = []
+    for family in chosen:
+        card = evaluate(
+            policy,
+            environment,
+            baselines=against,
+            episodes=episodes,
+            blocks=blocks,
+            randomization=family,
+            sensors=sensors,
+            robot=robot,
+            effects=effects,
+            threads=threads,
+            precision=PRECISION,
+            tell=_part_of(tell, _name(family), len(chosen)),
+        )
+        errors = {name: scores["tracking_error"].mean for name, scores in card.scores[MAIN].items()}
+        for name, better in card.comparison[MAIN].items():
+            gain = better["tracking_error"]
+            losses.append(Loss(_name(family), name, errors[subject.name], errors[name], -gain.mean, -gain.low))
+    inputs = fingerprint(environment, [policy, *against], chosen, robot)
+    return Acceptance(
+        str(policy),
+        environment,
+        episodes,
+        blocks,
+        None if sensors is None else tuple(sensors),
+        largest_loss,
+        inputs,
+        tuple(losses),
+    )
+
+
+def _part_of(tell: Tell, family: str, families: int) -> Tell:
+    return lambda text, share: tell(f"{family}: {text}", share / families)
+
+
+def _name(family: Any) -> str:
+    said = randomization_said(family)
+    return said if isinstance(said, str) else str(said.get("name", "given"))
+
+
+def references_of(policy: Source, environment: str) -> tuple[str, ...]:
+    """Return what a policy is compared with: the controller it acts on or could be replaced by, and the task's blind policy."""
+    observer = policy_environment(policy).get("task", {}).get("observer") or {}
+    has_camera = observer.get("camera", True)
+    controller = "slip_compensating" if has_camera else "slip_compensating_no_camera"
+    blind = f"{task_name_of(environment)}_blind"
+    return (controller, *([blind] if blind in shipped_names() and blind != str(policy) else []))
+
+
+def fingerprint(environment: str, policies: Iterable[Source], floors: Sequence[Any], robot: Any = None) -> str:
+    """Return the SHA-256 of what is played: the policies' content, the task, the robot and the randomisations."""
+    config = read_task(task_source_of(environment))
+    own = load_robot(config.robot if robot is None else robot)
+    played = {
+        "policies": [identity(subject, config.name) for subject in read_subjects(list(policies))],
+        "task": config.model_dump(mode="json"),
+        "floors": [load_randomization(family, own).config.model_dump(mode="json") for family in floors],
+        "robot": own.model_dump(mode="json"),
+    }
+    return hashlib.sha256(json.dumps(played, sort_keys=True).encode()).hexdigest()
+
+
+#: Columns of a row of acceptance after its first, the floors or robots.
+COLUMNS = ("against", "tracking error", "its tracking error", "loss (%)", "upper bound (%)", "not worse")
+
+
+def acceptance_rows(result: Acceptance) -> list[list[str]]:
+    """Return the table as text: a header, then one row per family of floors and reference."""
+    table = [["floors", *COLUMNS]]
+    for loss in result.losses:
+        numbers = [f"{loss.error:.3f}", f"{loss.reference_error:.3f}", f"{loss.loss:.1f}", f"{loss.bound:.1f}"]
+        table.append([loss.floors, loss.reference, *numbers, "yes" if loss.bound <= result.largest_loss else "no"])
+    return table
+
+
+def write_acceptance(path: Path, result: Acceptance) -> None:
+    """Write a result as JSON."""
+    write_json(path, {"format": FORMAT, **asdict(result)})
+
+
+def read_acceptance(path: Path) -> Acceptance:
+    """Read what :func:`write_acceptance` wrote.
+
+    Raises:
+        InputError: not such a file.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        content.pop("format")
+        sensors = content.pop("sensors")
+        losses = tuple(Loss(**loss) for loss in content.pop("losses"))
+        return Acceptance(**content, sensors=None if sensors is None else tuple(sensors), losses=losses)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: expected a result of wlr evaluate --accept: {error}") from None

@@ -1,22 +1,113 @@
-"""Proximal policy optimisation (Schulman et al. 2017) with Stable-Baselines3 on the native batch of robots.
+"""Proximal policy optimisation (Schulman et al. 2017): its settings, its policies, and their ONNX graphs.
 
 Observations are normalised by the fixed scales of the task, which are part of the policy's contract: no statistics are
-gathered while training, none can go missing.
+gathered while training, none can go missing. Nothing here imports torch before a policy is made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from pydantic import Field, PositiveInt, model_validator
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.settings import parse_config
-from wlr_gym.learning.ppo.config import PpoConfig
+from wlr_gym.base.seeds import LARGEST_SEED
+from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.policy import contract_of
+from wlr_gym.robot import LEGS, WHEELS
+
+
+class PpoConfig(SettingsModel):
+    """Proximal policy optimisation on one native batch of robots.
+
+    Attributes:
+        seed: of weights, exploration, minibatches and episodes; the same seed gives the same run bit for bit.
+        total_steps: environment steps of all robots together.
+        schedule_steps: steps over which the learning rate falls; it stays where it ended after that. None = ``total_steps``.
+        num_envs, steps_per_env: robots, and environment steps of each, per update.
+        batch_size: samples per gradient step. Small ones cap the speed: the optimiser, not the physics, takes the time.
+        epochs: passes over the samples of an update.
+        learning_rate, final_learning_rate, learning_rate_falls: Adam's, over the training. Once little exploration noise is
+            left, a small step of the weights is a large one of the policy: then it should have fallen far.
+        gamma, gae_lambda, clip_range, entropy_coefficient, value_coefficient, max_gradient_norm: as in Stable-Baselines3.
+        target_kl: end the passes of an update early beyond 1.5 times this divergence; None = never.
+        desired_kl: divergence of an update by which the learning rate adapts: lowered above twice of it, raised below half.
+            None = the rate falls as ``final_learning_rate`` says.
+        hidden_layers, activation: of the networks of policy and value, which share nothing.
+        normalise: bring the observations to mean 0 and deviation 1, as the untrained policy meets them, inside the network.
+        residual: the network's output times this is added to the action of the task's ``controller``; None = no controller.
+        residual_share: how much of the residual the finished policy adds; all of it in training. Less than 1 shrinks what is
+            one seed's own more than what all seeds learn.
+        mirror: learn from the left-right mirror image of every other sample.
+        initial_log_std: logarithm of the exploration noise at the start, in actions: of all joints, or of (legs, wheels).
+        teacher: agent whose actions the actor learns before PPO starts (``warm_start.py``); None = from nothing.
+        evaluate_every: environment steps between scores on held-out episodes (``held_out.py``); 0 = never.
+        evaluation_episodes: how many these are.
+        checkpoint_every: environment steps between checkpoints.
+        keep_checkpoints: how many of the newest stay.
+        torch_threads: more than 1 was slower on busy machines, and changes the last bits.
+        environment: keywords of the environment (precision, randomization, task, ...).
+        tasks: task name -> settings that differ there (``load_agent_config`` lays them over the others).
+    """
+
+    seed: int = Field(0, ge=0, le=LARGEST_SEED)
+    total_steps: int = Field(5_000_000, gt=0)
+    schedule_steps: int | None = Field(None, gt=0)
+    num_envs: int = Field(512, gt=0)
+    steps_per_env: int = Field(32, gt=1)
+    batch_size: int = Field(4096, gt=1)
+    epochs: int = Field(5, gt=0)
+    learning_rate: float = Field(1e-3, gt=0)
+    final_learning_rate: float = Field(1e-4, gt=0)
+    learning_rate_falls: Literal["linearly", "exponentially"] = "linearly"
+    gamma: float = Field(0.99, gt=0, lt=1)
+    gae_lambda: float = Field(0.95, ge=0, le=1)
+    clip_range: float = Field(0.2, gt=0)
+    entropy_coefficient: float = Field(0.0, ge=0)
+    value_coefficient: float = Field(0.5, ge=0)
+    max_gradient_norm: float = Field(0.5, gt=0)
+    target_kl: float | None = Field(None, gt=0)
+    desired_kl: float | None = Field(None, gt=0)
+    normalise: bool = False
+    residual: float | None = Field(None, gt=0)
+    residual_share: float = Field(1.0, gt=0, le=1)
+    mirror: bool = False
+    hidden_layers: tuple[PositiveInt, ...] = (64, 64)
+    activation: Literal["tanh", "elu", "relu"] = "tanh"
+    initial_log_std: float | tuple[float, float] = 0.0
+    teacher: str | None = None
+    evaluate_every: int = Field(500_000, ge=0)
+    evaluation_episodes: int = Field(64, gt=0)
+    checkpoint_every: int = Field(1_000_000, gt=0)
+    keep_checkpoints: int = Field(3, gt=0)
+    torch_threads: int = Field(1, gt=0)
+    environment: dict[str, Any] = Field(default_factory=dict)
+    tasks: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+    def initial_log_stds(self) -> tuple[float, ...]:
+        """Return the logarithm of the exploration noise of each joint at the start."""
+        given = self.initial_log_std
+        legs, wheels = given if isinstance(given, tuple) else (given, given)
+        return (legs,) * len(LEGS) + (wheels,) * len(WHEELS)
+
+    @model_validator(mode="after")
+    def _whole_batches(self) -> PpoConfig:
+        if self.num_envs * self.steps_per_env % self.batch_size:
+            raise ValueError(
+                f"batch_size {self.batch_size} does not divide num_envs * steps_per_env = {self.num_envs * self.steps_per_env}"
+            )
+        return self
+
+
+# ---- policies --------------------------------------------------------------------------------------------------------
 
 MODEL_FILE = "model.zip"
 #: Settings that make the network.
@@ -89,7 +180,6 @@ def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
     """
     require_package("torch", "train")
     require_package("onnxscript", "export")
-    from wlr_gym.learning.ppo.export import to_onnx, with_learner
 
     graph = to_onnx(actor(load_policy(folder, contract).network), len(contract["environment"]["observation"]))
     weights = saved_weights(folder)
@@ -151,7 +241,7 @@ def actor(network: Any) -> Any:
 
 def acting_net(network: Any) -> Any:
     """Return the last layer of a network as the finished policy has it."""
-    from wlr_gym.learning.ppo.layers import Layered
+    from wlr_gym.learning.ppo.networks import Layered
 
     return network.acting_net() if isinstance(network, Layered) else network.action_net
 
@@ -165,8 +255,7 @@ def policy_class(config: PpoConfig, *, asymmetric: bool) -> Any:
     """Return the class of the configured network."""
     from stable_baselines3.common.policies import ActorCriticPolicy
 
-    from wlr_gym.learning.ppo.asymmetric import AsymmetricPolicy
-    from wlr_gym.learning.ppo.layers import LayeredAsymmetricPolicy, LayeredPolicy
+    from wlr_gym.learning.ppo.networks import AsymmetricPolicy, LayeredAsymmetricPolicy, LayeredPolicy
 
     plain, layered = (AsymmetricPolicy, LayeredAsymmetricPolicy) if asymmetric else (ActorCriticPolicy, LayeredPolicy)
     return layered if _is_layered(config) else plain
@@ -180,7 +269,7 @@ def policy_keywords(config: PpoConfig, contract: Mapping[str, Any]) -> dict[str,
     keywords = {"net_arch": list(config.hidden_layers), "activation_fn": activation}
     if not _is_layered(config):
         return keywords
-    from wlr_gym.learning.ppo.layers import Layers, controller_columns
+    from wlr_gym.learning.ppo.networks import Layers, controller_columns
 
     columns = () if config.residual is None else controller_columns(contract)
     return keywords | {"layers": Layers(config.normalise, columns, config.residual or 0.0, config.residual_share)}
@@ -206,3 +295,68 @@ def _network(contract: Mapping[str, Any], config: PpoConfig) -> Any:
         network = kind(observation_space, action_space, lambda _: config.learning_rate, **policy_keywords(config, contract))
     network.set_training_mode(False)
     return network
+
+
+# ---- the ONNX graph: the mean action, clipped ------------------------------------------------------------------------
+
+#: Before the names of weights that do not act.
+LEARNER = "learner."
+
+
+def to_onnx(actor: torch.nn.Module, width: int) -> bytes:
+    """Return a serialised ONNX model: ``observation`` (N, width) to ``action``, N free, nothing else in it.
+
+    Args:
+        actor: maps observations to actions, both float32.
+        width: of the observation.
+    """
+    robots = torch.export.Dim("robots")
+    with _quiet():
+        program = torch.onnx.export(
+            actor.eval(),
+            (torch.zeros(2, width),),
+            dynamo=True,
+            input_names=["observation"],
+            output_names=["action"],
+            dynamic_shapes=({0: robots},),
+            external_data=False,
+            verbose=False,
+        )
+    assert program is not None
+    model: Any = program.model_proto
+    graph = model.graph
+    # Without what the exporter notes about itself: source files, stack traces, intermediate shapes.
+    del model.metadata_props[:], graph.metadata_props[:], graph.value_info[:]
+    for part in [*graph.node, *graph.input, *graph.output, *graph.initializer]:
+        part.doc_string = ""
+        del part.metadata_props[:]
+    return model.SerializeToString(deterministic=True)
+
+
+def with_learner(graph: bytes, weights: Mapping[str, torch.Tensor]) -> bytes:
+    """Return an ONNX model that also holds what only a training needs: critic and exploration noise, beside the graph.
+
+    Args:
+        graph: serialised model. weights: those that do not act, by their names in the network.
+    """
+    import onnx
+    from onnx import numpy_helper
+
+    model = onnx.load_from_string(graph)
+    for name, value in weights.items():
+        model.graph.initializer.append(numpy_helper.from_array(value.numpy(), LEARNER + name))
+    return model.SerializeToString(deterministic=True)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's warnings about packages that are not installed and its own deprecated calls."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

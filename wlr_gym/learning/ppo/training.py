@@ -1,4 +1,4 @@
-"""The training loop: updates, stopping in good order, resuming.
+"""The training loop: updates, stopping in good order, resuming; and what a training writes.
 
 A checkpoint holds the learner and a snapshot of all robots. So a run that was killed or stopped, and resumed from a checkpoint,
 continues exactly, bit for bit, as it would have without the interruption.
@@ -6,33 +6,50 @@ continues exactly, bit for bit, as it would have without the interruption.
 
 from __future__ import annotations
 
+import math
+import pickle
+import random
+import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from rich.console import Console
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
 from wlr_gym.envs import Sb3VecEnv
-from wlr_gym.learning.ppo import checkpoint
-from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.learning.ppo.curve import Meter, losses
-from wlr_gym.learning.ppo.mirror import MirroredBuffer, MirroredDictBuffer, set_mirror
-from wlr_gym.learning.ppo.policy import parse_settings, policy_class, policy_keywords, with_network_of
-from wlr_gym.learning.ppo.training_log import TrainingLog
+from wlr_gym.envs.core import Core
+from wlr_gym.learning.curves import METRICS, CurveFile, best_of, is_better, read_curve
+from wlr_gym.learning.evaluation.metrics import summarise
+from wlr_gym.learning.evaluation.rollout import make_core, roll_out
+from wlr_gym.learning.ppo import sb3
+from wlr_gym.learning.ppo.networks import MirroredBuffer, MirroredDictBuffer, set_mirror
+from wlr_gym.learning.ppo.policy import (
+    MODEL_FILE,
+    PpoConfig,
+    PpoPolicy,
+    parse_settings,
+    policy_class,
+    policy_keywords,
+    with_network_of,
+)
 from wlr_gym.learning.ppo.warm_start import gather_scales, imitate, start_from
-from wlr_gym.policy import Training, TrainingProgress
+from wlr_gym.policy import Training, TrainingProgress, fed_environment, read_contract, write_contract
 
 #: Factor by which an adapting learning rate changes after an update, and where it stays.
 RATE_STEP, LOWEST_RATE, HIGHEST_RATE = 1.5, 1e-5, 1e-2
@@ -52,32 +69,23 @@ def run_training(training: Training) -> Path:
         Exception: what ``on_update`` raised, after a checkpoint was saved.
     """
     config = parse_settings(training.config)
-    start = checkpoint.newest(training.folder / "checkpoints") if training.resume else None
-    if training.init is not None and start is None:  # a checkpoint has all of it: the policy may be gone
+    checkpoints = sorted((training.folder / CHECKPOINTS).glob("step_*")) if training.resume else []
+    if training.init is not None and not checkpoints:  # a checkpoint has all of it: the policy may be gone
         config = with_network_of(config, training.init)
+    threads = torch.get_num_threads()
     env = Sb3VecEnv(training.environment, config.num_envs, **config.environment)
     try:
-        with torch_threads(config.torch_threads):
-            model = make_model(env, config)
-            if start is not None:
-                checkpoint.restore(start, model, env)
-            else:
-                _begin(training, config, env, model)
-            _record(training, config)
-            return _train(training, config, env, model)
+        torch.set_num_threads(config.torch_threads)
+        model = make_model(env, config)
+        if checkpoints:
+            restore_checkpoint(checkpoints[-1], model, env)
+        else:
+            _begin(training, config, env, model)
+        _record(training, config)
+        return _train(training, config, env, model)
     finally:
+        torch.set_num_threads(threads)
         env.close()
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use so many threads, and as many as before afterwards."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _begin(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> None:
@@ -149,7 +157,7 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) ->
         log = TrainingLog(training, config, env, model)
         try:
             meter = Meter(env.core, training.folder / "failure.npz")
-            model._setup_learn(config.total_steps - model.num_timesteps, callback=meter, reset_num_timesteps=False)
+            sb3.begin_learning(model, config.total_steps - model.num_timesteps, meter)
             with _progress(training, config, model.num_timesteps) as show:
                 if not log.scores:
                     log.score()
@@ -178,9 +186,9 @@ def _updates(log: TrainingLog, meter: Meter, stop: StopRequest, show: Callable[[
         seconds = time.monotonic() - began
         row |= {"seconds": seconds, "steps_per_second": (model.num_timesteps - first) / seconds}
         log.update(row)
-        if config.evaluate_every and crossed(config.evaluate_every, before, model.num_timesteps):
+        if config.evaluate_every and _crossed(config.evaluate_every, before, model.num_timesteps):
             log.score()
-        if crossed(config.checkpoint_every, before, model.num_timesteps):
+        if _crossed(config.checkpoint_every, before, model.num_timesteps):
             log.save_checkpoint()
         progress = TrainingProgress(training.folder, model.num_timesteps, config.total_steps, row, log.scores)
         show(progress)
@@ -193,8 +201,8 @@ def _updates(log: TrainingLog, meter: Meter, stop: StopRequest, show: Callable[[
             stopped = progress.stop_requested
 
 
-def crossed(every: int, before: int, now: int) -> bool:
-    """Return whether a multiple of ``every`` steps was reached."""
+def _crossed(every: int, before: int, now: int) -> bool:
+    """Whether a multiple of ``every`` steps was reached."""
     return now // every > before // every
 
 
@@ -206,9 +214,8 @@ def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:
     """
     env.set_progress(model.num_timesteps)
     env.seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1, np.uint32)[0]))
-    model._last_obs = env.reset()
+    sb3.go_on_from(model, env.reset(), np.ones(env.num_envs, bool))
     env.core.episodes.sooner[:] = np.arange(env.num_envs) * env.core.limit // env.num_envs
-    model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
 
 
 def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:
@@ -217,7 +224,7 @@ def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:
     try:
         model.collect_rollouts(model.env, meter, model.rollout_buffer, n_rollout_steps=config.steps_per_env)
         schedule = config.schedule_steps or config.total_steps
-        model._update_current_progress_remaining(min(model.num_timesteps, schedule), schedule)
+        sb3.set_share_done(model, min(model.num_timesteps, schedule), schedule)
         if config.desired_kl is not None:  # the rate is the optimiser's own, which checkpoints keep
             model.lr_schedule = ConstantSchedule(model.policy.optimizer.param_groups[0]["lr"])
         model.train()
@@ -230,7 +237,9 @@ def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:
             raise
     if not _healthy(model):
         meter.fail("a weight of the network, or its exploration noise, is not finite")
-    return {"steps": model.num_timesteps, **meter.take(), **losses(model.logger.name_to_value)}
+    logged = model.logger.name_to_value
+    losses = {name: float(logged.get(f"train/{name}", math.nan)) for name in LOSSES}
+    return {"steps": model.num_timesteps, **meter.take(), **losses}
 
 
 def adapt_rate(model: PPO, desired_kl: float) -> None:
@@ -247,6 +256,266 @@ def _healthy(model: PPO) -> bool:
     noise = torch.exp(model.policy.get_parameter("log_std"))
     finite = all(bool(torch.isfinite(weights).all()) for weights in [*model.policy.parameters(), noise])
     return finite and bool((noise > 0).all())
+
+
+# ---- what an update measures -----------------------------------------------------------------------------------------
+
+
+class TrainingError(RuntimeError):
+    """Training met a number that is not finite; the message names the file with the state it happened in."""
+
+
+class Meter(sb3.StepWatcher):
+    """Watches every environment step of an update: sums up what the learning curve shows and stops at non-finite numbers.
+
+    Args:
+        core: the batch of robots.
+        dump: file to write the state to when a number is not finite.
+    """
+
+    def __init__(self, core: Core, dump: Path) -> None:
+        super().__init__()
+        self.core = core
+        self.dump = dump
+        self._clear()
+
+    def _clear(self) -> None:
+        self._ticks, self._robots, self._reward, self._slip = 0, 0, 0.0, 0.0
+        self._terms = np.zeros(len(self.core.task.rewards))
+        self._episodes, self._falls = 0, 0
+
+    def on_robots_stepped(self) -> None:
+        """Add up a step."""
+        rewards, dones = self.locals["rewards"], self.locals["dones"]
+        if not all(np.isfinite(array).all() for array in (rewards, *_arrays("", self.locals["new_obs"]).values())):
+            self.fail("an observation or reward is not finite")
+        going_on = ~dones
+        slip = self.core.plant.truth()["slip_velocity"].reshape(-1, 4, 2)
+        self._ticks += 1
+        self._reward += float(rewards.mean(dtype=np.float64))
+        self._robots += int(going_on.sum())
+        self._terms += self.core.scores.terms[going_on].sum(axis=0)
+        self._slip += float(np.sqrt((slip * slip).sum(axis=-1)).mean(axis=-1)[going_on].sum())
+        for row in np.flatnonzero(dones):
+            self._episodes += 1
+            self._falls += not self.locals["infos"][row]["TimeLimit.truncated"]
+
+    def fail(self, reason: str) -> None:
+        """Write the state to the dump file and raise :class:`TrainingError`."""
+        arrays: dict[str, Any] = {}
+        for name in ("actions", "new_obs", "obs_tensor", "rewards"):
+            arrays |= _arrays(name, self.locals[name]) if name in self.locals else {}
+        episodes = self.core.episodes
+        arrays |= {"parameters": self.core.parameters.values, "robot_seeds": episodes.robot_seeds, "ticks": episodes.steps}
+        replace_file(self.dump, lambda temporary: np.savez(temporary, **arrays))  # type: ignore[arg-type]
+        raise TrainingError(f"{reason} after {self.num_timesteps} steps; state written to {self.dump}")
+
+    def take(self) -> dict[str, float]:
+        """Return the means since the last call, rewards per second; terms and slip over robots whose episode continued."""
+        period = self.core.task.config.control_period
+        terms = self._terms / max(self._robots, 1) / period
+        means = {"reward_per_second": self._reward / max(self._ticks, 1) / period}
+        means |= {f"term.{name}": float(value) for name, value in zip(self.core.task.rewards, terms, strict=True)}
+        means |= {"slip_speed": self._slip / max(self._robots, 1), "episodes": self._episodes, "falls": self._falls}
+        self._clear()
+        return means
+
+
+def _arrays(name: str, value: Any) -> dict[str, NDArray]:
+    """Return an observation, or anything else, as arrays by name: groups of an observation apart."""
+    if isinstance(value, Mapping):
+        return {f"{name}.{group}": np.asarray(part) for group, part in value.items()}
+    return {name: np.asarray(value)}
+
+
+# ---- what a training writes ------------------------------------------------------------------------------------------
+
+
+CURVE_FILE = "learning_curve.csv"
+SCORES_FILE = "held_out.csv"
+BEST, CHECKPOINTS = "best", "checkpoints"
+#: Of an update, as Stable-Baselines3 records them.
+LOSSES = ("policy_gradient_loss", "value_loss", "approx_kl", "explained_variance", "std")
+
+
+class TrainingLog:
+    """Writes the run folder of one training; a resumed one goes on in the same files.
+
+    Args:
+        training, config, env, model: what is being trained; ``model`` is where the run (re)starts.
+
+    Attributes:
+        training, config, env, model: as given.
+        scores: newest row of ``held_out.csv``; empty before the first.
+        best: that of the policy in ``best/``.
+    """
+
+    def __init__(self, training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> None:
+        self.training, self.config, self.env, self.model = training, config, env, model
+        folder, steps = training.folder, model.num_timesteps
+        self._curve = CurveFile(folder / CURVE_FILE, steps)
+        self._scores = CurveFile(folder / SCORES_FILE, steps) if config.evaluate_every else None
+        rows = read_curve(folder / SCORES_FILE) if self._scores else []
+        self.scores: Mapping[str, float] = rows[-1] if rows else {}
+        self.best: Mapping[str, float] = best_of(rows)
+        self._episodes = HeldOutEpisodes(training.environment, config) if config.evaluate_every else None
+        model.set_logger(Logger(str(folder), [sb3.ResumedTensorBoard(folder / "tensorboard", steps)]))
+
+    def close(self) -> None:
+        """Release the plant of the held-out episodes; the files are complete at any time."""
+        self.model.logger.close()
+        if self._episodes is not None:
+            self._episodes.close()
+
+    def update(self, row: Mapping[str, float]) -> None:
+        """Write what an update measured."""
+        self._curve.append(row)
+        for name, value in row.items():
+            if name != "steps" and name not in LOSSES:  # Stable-Baselines3 records the losses itself
+                group = "reward" if name.startswith("term.") else "training"
+                self.model.logger.record(f"{group}/{name.removeprefix('term.')}", value)
+        self.model.logger.dump(step=self.model.num_timesteps)
+
+    def score(self) -> None:
+        """Score the present policy on the held-out episodes, once per step count; keep it where it is the best so far."""
+        steps = self.model.num_timesteps
+        if self._episodes is None or self._scores is None or self.scores.get("steps") == steps:
+            return
+        self.scores = {"steps": steps, **self._episodes.score(self.model)}
+        self._scores.append(self.scores)
+        for name, value in self.scores.items():
+            if name != "steps":
+                self.model.logger.record(f"held_out/{name}", value)
+        self.model.logger.dump(step=steps)
+        if is_better(self.scores, self.best):
+            self.best = self.scores
+            self._save(self.training.folder / BEST)
+
+    def save_checkpoint(self) -> Path:
+        """Write a checkpoint that the training can be resumed from; drop the oldest."""
+        checkpoints = self.training.folder / CHECKPOINTS
+        place = self._save(checkpoints / f"step_{self.model.num_timesteps:012d}", to_resume=True)  # names sort by steps
+        for old in sorted(checkpoints.glob("step_*"))[: -self.config.keep_checkpoints]:
+            shutil.rmtree(old)
+        return place
+
+    def save_policy(self) -> Path:
+        """Write the present policy as that of the run."""
+        return self._save(self.training.folder / "policy")
+
+    def _save(self, place: Path, *, to_resume: bool = False) -> Path:
+        notes = {"environment": self.training.environment}
+        if self.scores.get("steps") == self.model.num_timesteps:
+            notes |= {"held_out": {name: value for name, value in self.scores.items() if name != "steps"}}
+        return write_policy(place, self.model, self.config, self.env, notes, to_resume=to_resume)
+
+
+#: Seed of the first held-out episode; those of ``wlr evaluate`` lie above: its scores owe nothing to the choice of the best.
+FIRST_SEED = 90_000
+#: Keywords of the training's environment that say which robot and plant are scored.
+SAME = ("backend", "plant", "robot", "effects", "precision", "control_period", "free_wheels", "threads")
+
+
+class HeldOutEpisodes:
+    """Fixed episodes that neither training nor ``wlr evaluate`` has: the task as it is scored, with its own
+    randomisation, commands and length, on the robot and plant of the training.
+
+    Args:
+        environment: id.
+        config: of the training.
+    """
+
+    def __init__(self, environment: str, config: PpoConfig) -> None:
+        same = {name: config.environment[name] for name in SAME if name in config.environment}
+        self.core = make_core(environment, config.evaluation_episodes, same | fed_environment(config.environment))
+
+    def score(self, model: PPO) -> dict[str, float]:
+        """Return :data:`METRICS` of the present policy, means over the episodes; the training notices nothing."""
+        played = summarise([roll_out(self.core, PpoPolicy(model.policy), FIRST_SEED)])
+        sums = {name: played.pairs[name].sum(axis=(0, 1, 2)) for name in METRICS}
+        return {name: float(total / count) for name, (total, count) in sums.items() if count > 0.0}
+
+    def close(self) -> None:
+        """Release the plant."""
+        self.core.close()
+
+
+# ---- checkpoints -----------------------------------------------------------------------------------------------------
+
+
+RANDOM_FILE = "random_state.pt"
+ROBOTS_FILE = "robots.pkl"
+
+
+def write_policy(
+    folder: Path, model: PPO, config: PpoConfig, env: Sb3VecEnv, notes: Mapping[str, Any], *, to_resume: bool = False
+) -> Path:
+    """Write weights, optimiser, contract and step count into ``folder``, in one step, replacing what is there.
+
+    Args:
+        folder: of the policy or checkpoint.
+        model, config, env: what trains.
+        notes: what the contract says of the training besides: its environment's id, scores.
+        to_resume: also write random state and robots, so that :func:`restore_checkpoint` goes on from there. Robots of a
+            plant whose state cannot be set begin new episodes.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    model.save(temporary / MODEL_FILE)
+    if to_resume:
+        torch.save(random_state(), temporary / RANDOM_FILE)
+        can_set_state = env.core.plant.capabilities.can_set_state
+        robots = (env.get_state() if can_set_state else None, sb3.episode_starts(model))
+        (temporary / ROBOTS_FILE).write_bytes(pickle.dumps(robots))
+    noise = float(model.policy.get_parameter("log_std").detach().mean())
+    done = {"steps": model.num_timesteps, "updates": sb3.updates_done(model)}
+    training = {**done, "seed": config.seed, "log_std": noise, **notes}
+    write_contract(temporary, "ppo", config.model_dump(mode="json"), env.contract(), training)
+    shutil.rmtree(folder, ignore_errors=True)
+    temporary.replace(folder)
+    return folder
+
+
+def restore_checkpoint(folder: Path, model: PPO, env: Sb3VecEnv) -> None:
+    """Put weights, optimiser, step count, random state and robots of a checkpoint into ``model`` and ``env``.
+
+    Raises:
+        InputError: the checkpoint cannot be read.
+    """
+    training = read_contract(folder)["training"]
+    try:
+        model.set_parameters(str(folder / MODEL_FILE), exact_match=True, device="cpu")
+        state = torch.load(folder / RANDOM_FILE, weights_only=True)
+        snapshot, starts = pickle.loads((folder / ROBOTS_FILE).read_bytes())  # as trusted as the model's own file
+    except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
+        raise InputError(f"{folder}: not a readable checkpoint: {error}") from None
+    model.num_timesteps = training["steps"]
+    sb3.set_updates_done(model, training["updates"])
+    sb3.go_on_from(model, env.reset(), np.ones(env.num_envs, bool))
+    if snapshot is not None:
+        sb3.go_on_from(model, env.set_state(snapshot), starts)
+    set_random_state(state)
+
+
+def random_state() -> dict[str, Any]:
+    """Return the state of the global generators of torch, numpy and Python."""
+    name, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)  # noqa: NPY002 - minibatches use it
+    numpy_state = (str(name), torch.from_numpy(np.asarray(keys, dtype=np.int64)), int(position), int(has_gauss), float(gauss))
+    return {"torch": torch.get_rng_state(), "numpy": numpy_state, "python": random.getstate()}
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Set the global generators to a saved state."""
+    name, keys, position, has_gauss, gauss = state["numpy"]
+    torch.set_rng_state(state["torch"])
+    np.random.set_state((name, keys.numpy().astype(np.uint32), position, has_gauss, gauss))  # noqa: NPY002
+    version, words, gauss_next = state["python"]
+    random.setstate((version, tuple(words), gauss_next))
+
+
+# ---- Ctrl-C ----------------------------------------------------------------------------------------------------------
 
 
 class StopRequest:

@@ -18,10 +18,18 @@ from torch import nn
 
 from wlr_gym.base.errors import require_package
 from wlr_gym.envs import Sb3VecEnv
-from wlr_gym.learning.ppo.config import PpoConfig
-from wlr_gym.learning.ppo.export import LEARNER
-from wlr_gym.learning.ppo.layers import normalisers, scale_residual
-from wlr_gym.learning.ppo.policy import ACTOR, actor, contract_to_start_from, load_actor, parse_settings, saved_weights
+from wlr_gym.learning.ppo.networks import normalisers, scale_residual
+from wlr_gym.learning.ppo.policy import (
+    ACTOR,
+    LEARNER,
+    PpoConfig,
+    actor,
+    contract_to_start_from,
+    load_actor,
+    parse_settings,
+    saved_weights,
+)
+from wlr_gym.learning.ppo.sb3 import go_on_from, last_observations
 from wlr_gym.policy import Policy, check_contract, find_policy, load_policy, make_policy
 
 #: 1 sigma of the noise on the controller's actions.
@@ -44,9 +52,10 @@ def gather_scales(model: PPO, env: Sb3VecEnv) -> None:
     """Let the untrained policy drive, and normalise observations by their mean and deviation there; the steps count."""
     groups = []
     for _ in range(GATHERED):
-        groups.append(_groups(model._last_obs))
-        actions, _ = model.predict(model._last_obs, deterministic=False)  # type: ignore[arg-type]
-        model._last_obs = env.step(np.clip(actions, -1.0, 1.0))[0]  # type: ignore[assignment]
+        seen = last_observations(model)
+        groups.append(_groups(seen))
+        actions, _ = model.predict(seen, deterministic=False)
+        go_on_from(model, env.step(np.clip(actions, -1.0, 1.0))[0])
     rows = {name: torch.as_tensor(np.concatenate([one[name] for one in groups])) for name in groups[0]}
     for normaliser in normalisers(model.policy):
         wide = normaliser.mean.shape[0] > rows["policy"].shape[1]

@@ -22,12 +22,11 @@ from wlr_gym.envs.registry import task_name_of
 from wlr_gym.learning.training import check_environment_settings, settings_of, with_robot
 from wlr_gym.policy.agents import agent_function, apply_changes, for_task, load_agent
 
-#: Metric of the held-out episodes -> whether less of it is better.
-METRICS = {"tracking_error": True, "success": False, "excess_slip": True, "reward": False}
 #: Setting of a trial that names one of the plan's ``variants``.
 VARIANT = "variant"
-#: With early stopping: scores per training, where the settings do not say.
-SCORES = 9
+#: Early stopping: after 1/9 and 1/3 of the steps the best third so far goes on; scores are needed at least so often.
+REDUCTION, RUNGS = 3, 2
+SCORES = REDUCTION**RUNGS
 #: Characters of a trial's name before it is cut and a hash of its settings added.
 _LONGEST = 120
 
@@ -119,22 +118,23 @@ class SweepPlan(SettingsModel):
     imports: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _variants_in_space(self) -> SweepPlan:
+    def _possible(self) -> SweepPlan:
         if self.space.setdefault(VARIANT, list(self.variants)) != list(self.variants):
             raise InputError(f"space: '{VARIANT}' is none of its settings; give 'variants', and there what each of them sets")
         if not self.variants:
             del self.space[VARIANT]
+        if "seed" in self.space:
+            raise InputError("space: 'seed' is none of its settings; give 'seeds'")
+        groups: dict[str, Mapping[str, Any]] = {"space": self.space}
         for name, changes in self.variants.items():
+            groups[f"variants: {name}"] = changes
             for key in changes:
                 if key == "seed" or key in self.space:
                     raise InputError(f"variants: '{name}' sets '{key}', which 'seeds' or 'space' sets too")
-        return self
-
-    @model_validator(mode="after")
-    def _complete(self) -> SweepPlan:
-        groups = {"space": self.space, **{f"variants: {name}": changes for name, changes in self.variants.items()}}
         for where, values in groups.items():
             for key, value in values.items():
+                if key.partition(".")[0] == "tasks":
+                    raise InputError(f"{where}: '{key}' comes too late: 'tasks' is read with the file; name the setting itself")
                 try:
                     json.dumps(None if isinstance(value, NumberRange) else value)
                 except TypeError as error:
@@ -144,11 +144,6 @@ class SweepPlan(SettingsModel):
             raise InputError(f"space: {', '.join(ranges)} is a range: give a list, or search with 'random' or 'optuna'")
         if self.search is not None and not self.space:
             raise InputError("search: there is no 'space' to search")
-        if "seed" in self.space:
-            raise InputError("space: 'seed' is none of its settings; give 'seeds'")
-        for where, names in groups.items():
-            if late := [name for name in names if name.partition(".")[0] == "tasks"]:
-                raise InputError(f"{where}: '{late[0]}' comes too late: 'tasks' is read with the file; name the setting itself")
         return self
 
     @property
@@ -165,26 +160,6 @@ class SweepPlan(SettingsModel):
     def metric(self) -> str:
         """Held-out score that decides which settings are best."""
         return self.search.metric if self.search else "tracking_error"
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One training of a sweep.
-
-    Attributes:
-        name: of its run folder: settings and seed.
-        settings: dotted name -> value: what this trial sets.
-        seed: of everything random in it.
-    """
-
-    name: str
-    settings: Mapping[str, Any]
-    seed: int
-
-    @property
-    def label(self) -> str:
-        """Its settings without its seed."""
-        return label_of(self.settings)
 
 
 def read_plan(path: Path, changes: Mapping[str, Any] | None = None) -> SweepPlan:
@@ -215,13 +190,68 @@ def resolve(plan: SweepPlan) -> SweepPlan:
     return whole
 
 
-def whole_settings(plan: SweepPlan, trial: Trial) -> dict[str, Any]:
-    """Return all settings of a trial, as ``wlr train`` takes them."""
-    settings = copy.deepcopy(plan.settings)
-    own = dict(trial.settings)
-    changes = plan.variants.get(own.pop(VARIANT, ""), {}) | own
-    apply_changes(settings, [f"{name}={json.dumps(value)}" for name, value in changes.items()])
-    return settings | {"seed": trial.seed}
+def _check(plan: SweepPlan) -> None:
+    """Refuse what no trial could do, before any begins."""
+    drawn = draw(plan, np.random.default_rng(0))
+    known = known_settings(plan) or [drawn]
+    variants = [drawn | {VARIANT: name} for name in plan.variants] if plan.search else []  # a search may begin with few of them
+    for several in (known, variants):
+        trials_of(several, plan.seed_list)  # no name twice
+        for settings in several:
+            trial = trial_of(settings, plan.seed_list[0])
+            whole = whole_settings(plan, trial)
+            try:
+                check_environment_settings(whole)
+                check_settings(plan.agent, whole)
+            except InputError as error:
+                raise InputError(f"trial {trial.name}: {error}") from None
+    if plan.search is None or not plan.search.early_stopping:
+        return
+    total, every = plan.settings.get("total_steps"), plan.settings.get("evaluate_every")
+    if not isinstance(total, int) or not isinstance(every, int) or not 0 < every <= total // SCORES:
+        raise InputError(
+            f"early_stopping: settings 'evaluate_every' = {every} and 'total_steps' = {total}: expected scores at least every "
+            "ninth of the steps; set evaluate_every"
+        )
+    if "total_steps" in plan.space or any("total_steps" in changes for changes in plan.variants.values()):
+        raise InputError("early_stopping: trials must be comparable at equal steps: 'total_steps' cannot be searched")
+
+
+def check_settings(agent: str, settings: Mapping[str, Any]) -> None:
+    """Refuse settings with which an agent cannot begin to train on this machine, if the agent can tell.
+
+    Raises:
+        InputError: unknown, or a bad value.
+        MissingPackageError: a package is not installed.
+    """
+    if hasattr(load_agent(agent), "check_settings"):
+        agent_function(agent, "check_settings")(settings)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One training of a sweep.
+
+    Attributes:
+        name: of its run folder: settings and seed.
+        settings: dotted name -> value: what this trial sets.
+        seed: of everything random in it.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    seed: int
+
+    @property
+    def label(self) -> str:
+        """Its settings without its seed."""
+        return label_of(self.settings)
+
+
+def trial_of(settings: Mapping[str, Any], seed: int) -> Trial:
+    """Return the trial of some settings with a seed."""
+    label = label_of(settings)
+    return Trial(f"{label},seed={seed}" if label else f"seed={seed}", settings, seed)
 
 
 def trials_of(settings: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Trial]:
@@ -240,23 +270,23 @@ def trials_of(settings: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> li
     return trials
 
 
-def trial_of(settings: Mapping[str, Any], seed: int) -> Trial:
-    """Return the trial of some settings with a seed."""
-    label = label_of(settings)
-    return Trial(f"{label},seed={seed}" if label else f"seed={seed}", settings, seed)
-
-
 def label_of(settings: Mapping[str, Any]) -> str:
     """Return settings as text that a folder may be called: ``learning_rate=0.001,gamma=0.97``."""
-    text = ",".join(f"{name}={_plain(value)}" for name, value in settings.items())
-    if len(text) <= _LONGEST:
-        return text
-    return f"{text[:_LONGEST]}-{hashlib.sha256(json.dumps(dict(settings)).encode()).hexdigest()[:8]}"
+    texts = (value if isinstance(value, str) else json.dumps(value, separators=(",", ":")) for value in settings.values())
+    plain = (re.sub(r"[^\w.,+=-]", "_", text) for text in texts)
+    label = ",".join(f"{name}={text}" for name, text in zip(settings, plain, strict=True))
+    if len(label) <= _LONGEST:
+        return label
+    return f"{label[:_LONGEST]}-{hashlib.sha256(json.dumps(dict(settings)).encode()).hexdigest()[:8]}"
 
 
-def _plain(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
-    return re.sub(r"[^\w.,+=-]", "_", text)
+def whole_settings(plan: SweepPlan, trial: Trial) -> dict[str, Any]:
+    """Return all settings of a trial, as ``wlr train`` takes them."""
+    settings = copy.deepcopy(plan.settings)
+    own = dict(trial.settings)
+    changes = plan.variants.get(own.pop(VARIANT, ""), {}) | own
+    apply_changes(settings, [f"{name}={json.dumps(value)}" for name, value in changes.items()])
+    return settings | {"seed": trial.seed}
 
 
 def known_settings(plan: SweepPlan) -> list[dict[str, Any]] | None:
@@ -277,47 +307,3 @@ def draw(plan: SweepPlan, random: np.random.Generator) -> dict[str, Any]:
         name: values.draw(random) if isinstance(values, NumberRange) else values[random.integers(len(values))]
         for name, values in plan.space.items()
     }
-
-
-# ---- checks ----------------------------------------------------------------------------------------------------------
-
-
-def _check(plan: SweepPlan) -> None:
-    """Refuse what no trial could do, before any begins."""
-    known = known_settings(plan)
-    trials_of([{}] if known is None else known, plan.seed_list)  # no name twice
-    drawn = draw(plan, np.random.default_rng(0))
-    variants = [drawn | {VARIANT: name} for name in plan.variants] if plan.search else []  # a search may begin with few of them
-    trials_of(variants, plan.seed_list)
-    for settings in [*(known or [drawn]), *variants]:
-        trial = trial_of(settings, plan.seed_list[0])
-        whole = whole_settings(plan, trial)
-        try:
-            check_environment_settings(whole)
-            check_settings(plan.agent, whole)
-        except InputError as error:
-            raise InputError(f"trial {trial.name}: {error}") from None
-    if plan.search is not None and plan.search.early_stopping:
-        _check_early_stopping(plan)
-
-
-def check_settings(agent: str, settings: Mapping[str, Any]) -> None:
-    """Refuse settings with which an agent cannot begin to train on this machine, if the agent can tell.
-
-    Raises:
-        InputError: unknown, or a bad value.
-        MissingPackageError: a package is not installed.
-    """
-    if hasattr(load_agent(agent), "check_settings"):
-        agent_function(agent, "check_settings")(settings)
-
-
-def _check_early_stopping(plan: SweepPlan) -> None:
-    total, every = plan.settings.get("total_steps"), plan.settings.get("evaluate_every")
-    if not isinstance(total, int) or not isinstance(every, int) or not 0 < every <= total // 9:
-        raise InputError(
-            f"early_stopping: settings 'evaluate_every' = {every} and 'total_steps' = {total}: expected scores at least every "
-            "ninth of the steps; set evaluate_every"
-        )
-    if "total_steps" in plan.space or any("total_steps" in changes for changes in plan.variants.values()):
-        raise InputError("early_stopping: trials must be comparable at equal steps: 'total_steps' cannot be searched")

@@ -1,27 +1,31 @@
-"""What the run folders of a sweep hold: scores, steps, time; and the table of all trials."""
+"""What a sweep has found: its trials' scores, the ranking of settings over their seeds, the table, the page."""
 
 from __future__ import annotations
 
 import json
 import shlex
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wlr_gym.base.files import replace_file
-from wlr_gym.base.provenance import CONFIG_FILE
-from wlr_gym.base.settings import read_yaml
-from wlr_gym.learning.evaluation import read_curve
-from wlr_gym.learning.ppo.held_out import best_of
-from wlr_gym.learning.sweep.plan import METRICS, Trial
+from wlr_gym.base.files import replace_file, write_text
+from wlr_gym.base.html import commands, document, folded, pictures_of, section, table
+from wlr_gym.base.text import duration, number, tally
+from wlr_gym.learning.curves import METRICS, best_of, read_curve
+from wlr_gym.learning.sweep.plan import SweepPlan, Trial
+from wlr_gym.learning.sweep.trial import is_complete, scores_of
 
 if TYPE_CHECKING:
-    import pandas
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 TABLE_FILE = "trials.parquet"
+PAGE_FILE = "sweep.html"
 #: Status of a trial.
 DONE = "done"
 FAILED = "failed"
@@ -67,88 +71,11 @@ class TrialResult:
 def read_result(trial: Trial, folder: Path, status: str = UNFINISHED, error: str = "") -> TrialResult:
     """Return what the run folder of a trial says; ``status`` and ``error`` where it is not complete."""
     curve = read_curve(folder / "learning_curve.csv") if (folder / "learning_curve.csv").is_file() else []
-    return TrialResult(
-        trial,
-        DONE if is_complete(folder) and not error else status,
-        scores_of(folder),
-        int(curve[-1]["steps"]) if curve else 0,
-        _seconds(curve),
-        error,
-        folder,
-    )
-
-
-def _seconds(curve: Sequence[Mapping[str, float]]) -> float:
-    """Return the time of all updates; the column starts anew wherever the training was resumed."""
-    seconds = [row["seconds"] for row in curve]
-    return sum(now - before if now > before else now for before, now in zip([0.0, *seconds], seconds, strict=False))
-
-
-def scores_of(folder: Path) -> list[dict[str, float]]:
-    """Return the held-out scores of a run folder, oldest first."""
-    file = folder / "held_out.csv"
-    return read_curve(file) if file.is_file() else []
-
-
-def is_complete(folder: Path) -> bool:
-    """Return whether a run folder holds a training that has done all its steps."""
-    contract = folder / "policy" / "contract.json"
-    if not contract.is_file() or not (folder / CONFIG_FILE).is_file():
-        return False
-    steps = json.loads(contract.read_text(encoding="utf-8")).get("training", {}).get("steps")
-    total = read_yaml(folder / CONFIG_FILE)["settings"].get("total_steps")
-    return steps is None or total is None or steps >= total
-
-
-# ---- the table -------------------------------------------------------------------------------------------------------
-
-
-def table(results: Sequence[TrialResult], out: Path) -> pandas.DataFrame:
-    """Return one row per trial: name, its settings, seed, status, final and best held-out scores, steps, seconds, folder."""
-    import pandas
-
-    names = dict.fromkeys(name for one in results for name in one.trial.settings)
-    columns = {name: _column([one.trial.settings.get(name) for one in results]) for name in names}
-    rows = [
-        {"name": one.trial.name, **{name: column[at] for name, column in columns.items()}, **_outcome(one, out)}
-        for at, one in enumerate(results)
-    ]
-    return pandas.DataFrame(rows)
-
-
-def write_table(results: Sequence[TrialResult], out: Path) -> None:
-    """Write ``trials.parquet``.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-    frame = table(results, out)
-    replace_file(out / TABLE_FILE, lambda temporary: frame.to_parquet(temporary, index=False))
-
-
-def stopped_early(out: Path) -> set[str]:
-    """Return the names of the trials that the table of a sweep says were stopped early."""
-    import pandas
-
-    if not (out / TABLE_FILE).is_file():
-        return set()
-    frame = pandas.read_parquet(out / TABLE_FILE, columns=["name", "status"])
-    return set(frame.loc[frame["status"] == STOPPED_EARLY, "name"])
-
-
-def _outcome(one: TrialResult, out: Path) -> dict[str, Any]:
-    row: dict[str, Any] = {"seed": one.trial.seed, "status": one.status}
-    row |= {f"final_{name}": one.final.get(name, np.nan) for name in METRICS}
-    row |= {f"best_{name}": one.best.get(name, np.nan) for name in METRICS}
-    row |= {"best_steps": one.best.get("steps", np.nan), "steps": one.steps, "seconds": one.seconds}
-    return row | {"error": one.error, "folder": str(one.folder.relative_to(out))}
-
-
-def _column(values: Sequence[Any]) -> Sequence[Any]:
-    """Return a setting's values as one column can hold them: numbers, words or truths (None is missing), all else as JSON."""
-    given = [value for value in values if value is not None]
-    kinds = {"number" if isinstance(value, int | float) and not isinstance(value, bool) else type(value) for value in given}
-    return values if kinds in ({"number"}, {str}, {bool}) else [json.dumps(value) for value in values]
+    clock = [row["seconds"] for row in curve]  # starts anew wherever the training was resumed
+    seconds = sum(now - before if now > before else now for before, now in zip([0.0, *clock], clock, strict=False))
+    whole = is_complete(folder) and not error
+    steps = int(curve[-1]["steps"]) if curve else 0
+    return TrialResult(trial, DONE if whole else status, scores_of(folder), steps, seconds, error, folder)
 
 
 # ---- settings over seeds ---------------------------------------------------------------------------------------------
@@ -198,38 +125,200 @@ def summarise(results: Sequence[TrialResult], metric: str) -> list[Summary]:
     return sorted(found, key=lambda one: (not one.is_whole, sign * one.mean))
 
 
-#: Numbers of which more than this many were tried are put into as many groups.
-_GROUPS = 4
+# ---- the table -------------------------------------------------------------------------------------------------------
 
 
-def importance(results: Sequence[TrialResult], metric: str) -> dict[str, float]:
-    """Return the share of the variance of final scores that each setting explains alone (epsilon squared, 0 to 1).
+def write_table(results: Sequence[TrialResult], out: Path) -> None:
+    """Write ``trials.parquet``: per trial its name, settings, seed, status, held-out scores, steps, seconds, error, folder.
 
-    Epsilon squared is the correlation ratio less what chance gives; the rest is the seed and settings that act together. Only
-    trials that were trained to their end count. Empty where there are too few of them.
+    Raises:
+        InputError: it cannot be written.
     """
-    ended = [one for one in results if one.status == DONE and np.isfinite(one.final.get(metric, np.nan))]
-    scores = np.array([one.final[metric] for one in ended])
-    names = list(dict.fromkeys(name for one in ended for name in one.trial.settings))
-    if len(ended) < 3 or not scores.std() > 0.0:
-        return {}
-    shares = {name: _explained(_groups([one.trial.settings[name] for one in ended]), scores) for name in names}
-    return dict(sorted(((name, share) for name, share in shares.items() if share is not None), key=lambda pair: -pair[1]))
+    import pandas
+
+    names = dict.fromkeys(name for one in results for name in one.trial.settings)
+    columns: dict[str, Sequence[Any]] = {"name": [one.trial.name for one in results]}
+    columns |= {name: _column([one.trial.settings.get(name) for one in results]) for name in names}
+    columns |= {"seed": [one.trial.seed for one in results], "status": [one.status for one in results]}
+    columns |= {f"final_{name}": [one.final.get(name, np.nan) for one in results] for name in METRICS}
+    columns |= {f"best_{name}": [one.best.get(name, np.nan) for one in results] for name in (*METRICS, "steps")}
+    columns |= {name: [getattr(one, name) for one in results] for name in ("steps", "seconds", "error")}
+    columns |= {"folder": [str(one.folder.relative_to(out)) for one in results]}
+    frame = pandas.DataFrame(columns)
+    replace_file(out / TABLE_FILE, lambda temporary: frame.to_parquet(temporary, index=False))
 
 
-def _groups(values: Sequence[Any]) -> np.ndarray:
-    """Return the group of each value: itself, or its quarter where many numbers were tried."""
-    if all(isinstance(value, int | float) for value in values):
-        kinds, ranks = np.unique(values, return_inverse=True)
-        return ranks if len(kinds) <= _GROUPS else ranks * _GROUPS // len(kinds)
-    return np.unique([json.dumps(value) for value in values], return_inverse=True)[1]
+def _column(values: Sequence[Any]) -> Sequence[Any]:
+    """Return a setting's values as one column can hold them: numbers, words or truths (None is missing), all else as JSON."""
+    given = [value for value in values if value is not None]
+    kinds = {"number" if isinstance(value, int | float) and not isinstance(value, bool) else type(value) for value in given}
+    return values if kinds in ({"number"}, {str}, {bool}) else [json.dumps(value) for value in values]
 
 
-def _explained(groups: np.ndarray, scores: np.ndarray) -> float | None:
-    """Return epsilon squared of groups; None where it cannot be known."""
-    count, kinds = len(scores), len(np.unique(groups))
-    if not 1 < kinds < count:
-        return None
-    within = sum(((scores[groups == group] - scores[groups == group].mean()) ** 2).sum() for group in np.unique(groups))
-    total = ((scores - scores.mean()) ** 2).sum()
-    return float(max(0.0, 1.0 - within / (count - kinds) / (total / (count - 1))))
+def stopped_early(out: Path) -> set[str]:
+    """Return the names of the trials that the table of a sweep says were stopped early."""
+    import pandas
+
+    if not (out / TABLE_FILE).is_file():
+        return set()
+    frame = pandas.read_parquet(out / TABLE_FILE, columns=["name", "status"])
+    return set(frame.loc[frame["status"] == STOPPED_EARLY, "name"])
+
+
+# ---- the page --------------------------------------------------------------------------------------------------------
+
+#: Rows of the ranking that are shown at once.
+_SHOWN = 10
+_GOOD, _INCOMPLETE, _BAD = "#2e7d32", "#8a6d00", "#b03030"
+_METRIC = {
+    "tracking_error": "tracking error", "success": "success (%)", "excess_slip": "excess slip (m/s)", "reward": "reward",
+}  # fmt: skip
+
+
+def write_page(plan: SweepPlan, results: Sequence[TrialResult], folder: Path) -> None:
+    """Write ``sweep.html``, one file with everything inside.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    ranking, title = summarise(results, plan.metric), f"Sweep of {plan.environment}"
+    count = Counter(one.status for one in results)
+    colour = _BAD if count[FAILED] else _INCOMPLETE if count[UNFINISHED] or not ranking else _GOOD
+    failed = [(one.trial.name, one.error) for one in results if one.status == FAILED]
+    logs = '<p class="small">What a trial printed is in <code>logs/</code>. Resume the sweep to try them again.</p>'
+    parts = [
+        _header(plan, results, ranking, title, count),
+        section("Failed", table(("trial", "error"), failed), logs) if failed else "",
+        *(_found(plan, ranking) if ranking else []),
+        _trials(plan, results),
+        "<footer><p>The table of all trials: <code>trials.parquet</code>.</p></footer>",
+    ]
+    write_text(folder / PAGE_FILE, document(title, colour, parts))
+
+
+def name_of(settings: Mapping[str, Any]) -> str:
+    """Return settings in words."""
+    return ", ".join(f"{name} {_value(value)}" for name, value in settings.items()) or "the settings as given"
+
+
+def _value(value: Any) -> str:
+    return number(value) if isinstance(value, float) else str(value)
+
+
+def _header(
+    plan: SweepPlan, results: Sequence[TrialResult], ranking: Sequence[Summary], title: str, count: Mapping[str, int]
+) -> str:
+    sentence = "No trial has scores yet."
+    if ranking:
+        best = ranking[0]
+        seeds = f"{number(min(best.values))} to {number(max(best.values))}, {len(best.values)} seeds"
+        spread = seeds if len(best.values) > 1 else "one seed"
+        sentence = f"Best: {name_of(best.settings)}. {_METRIC[plan.metric].capitalize()} {number(best.mean)} ({spread})."
+    method = ""
+    if plan.search is not None:
+        method = f", {plan.search.method} search" + (" with early stopping" if plan.search.early_stopping else "")
+    took = f"{sum(one.steps for one in results) / 1e6:,.3g} million environment steps"
+    took += f", {duration(sum(one.seconds for one in results))} of training"
+    return (
+        f'<header>\n<p class="label">{escape(title)}</p>\n<h1>{escape(sentence)}</h1>\n<p class="small">Agent '
+        f"{escape(plan.agent + method)}. Trials: {escape(tally(count))}; {took}, all together. Scores are of the held-out "
+        "episodes, which no training has seen, at the end of each training.</p>\n</header>"
+    )
+
+
+def _found(plan: SweepPlan, ranking: Sequence[Summary]) -> list[str]:
+    """Return the ranking, the curves, and how to use the best."""
+    from wlr_gym.base.plots import png
+
+    others = [name for name in _METRIC if name != plan.metric]
+    headings = (*plan.space, "seeds", _METRIC[plan.metric], "least", "largest", *(_METRIC[name] for name in others))
+    rows = []
+    for one in ranking:
+        ended = [result for result in one.results if result.status == DONE] or one.results
+        scores = (one.mean, min(one.values), max(one.values))
+        scores += tuple(float(np.mean([result.final.get(name, np.nan) for result in ended])) for name in others)
+        seeds = str(len(one.values)) if one.is_whole else one.results[0].status
+        rows.append((*(_value(one.settings.get(name)) for name in plan.space), seeds, *map(number, scores)))
+    numeric, best = range(len(plan.space), len(headings)), ranking[0]
+    note = ""
+    if len(ranking) > 1 and len(best.values) > 1 and min(ranking[1].values) <= max(best.values):
+        note = (
+            "<p>The scores of the best two overlap from seed to seed: training-seed variance may have put them in this order. "
+            "More seeds decide.</p>"
+        )
+    rest = folded(f"{len(rows) - _SHOWN} more", table(headings, rows[_SHOWN:], numeric)) if len(rows) > _SHOWN else ""
+    classes = ["selected", *[""] * (len(rows[:_SHOWN]) - 1)]
+    caption = (
+        "Scores on the held-out episodes over the training: mean over the seeds, band from the least to the largest. "
+        "The best settings in colour, the others grey."
+    )
+    lines = [
+        f"wlr evaluate {best.policies} --env {plan.environment}",
+        f"wlr play --agent {shlex.quote(str(best.results[0].folder))}",
+    ]
+    return [
+        section("Best settings", note, table(headings, rows[:_SHOWN], numeric, classes), rest),
+        section("While they learn", pictures_of("curves", {"curves": png(curves(ranking, plan.metric))}, caption)),
+        section("Use the best", "<p>Each trial is an ordinary run folder:</p>", commands(lines)),
+    ]
+
+
+def _trials(plan: SweepPlan, results: Sequence[TrialResult]) -> str:
+    headings = (*plan.space, "seed", "status", _METRIC[plan.metric], "best", "at steps", "steps", "time")
+    rows = [
+        (
+            *(_value(one.trial.settings.get(name)) for name in plan.space),
+            str(one.trial.seed),
+            one.status,
+            number(one.final.get(plan.metric, np.nan)),
+            number(one.best.get(plan.metric, np.nan)),
+            f"{one.best['steps']:,.0f}" if one.best else "-",
+            f"{one.steps:,}",
+            duration(one.seconds),
+        )
+        for one in results
+    ]
+    first = len(plan.space)
+    return section("All trials", folded(f"{len(rows)} trials", table(headings, rows, {first, *range(first + 2, first + 7)})))
+
+
+def curves(ranking: Sequence[Summary], metric: str) -> Figure:
+    """Draw the deciding metric and success over the steps: mean over the seeds, and a band from the least to the largest.
+
+    The best settings have a colour each, best first; all others are grey.
+    """
+    from wlr_gym.base.plots import COLOURS, PALE, new_figure, tidy
+
+    figure = new_figure(10.0, 4.6)
+    scored = {name for summary in ranking for one in summary.results for name in one.final}
+    shown = [metric, *(name for name in ("success", "reward") if name != metric and name in scored)][:2]
+    panels = figure.subplots(1, len(shown), squeeze=False)[0]
+    for axes, name in zip(panels, shown, strict=True):
+        for rank in reversed(range(len(ranking))):
+            _draw_curve(axes, ranking[rank], name, COLOURS[rank] if rank < len(COLOURS) else PALE, rank < len(COLOURS))
+        axes.set(xlabel="environment steps (millions)", ylabel=_METRIC[name])
+        tidy(axes)
+        if name == "success":
+            axes.set_ylim(-2.0, 102.0)
+        if name == "tracking_error":
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter("{x:g}")
+            axes.tick_params(axis="y", which="minor", labelsize=7)
+    handles, labels = panels[0].get_legend_handles_labels()
+    columns = 2 if len(labels) > 2 else 1
+    figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=columns, fontsize=8)
+    return figure
+
+
+def _draw_curve(axes: Axes, summary: Summary, metric: str, colour: str, named: bool) -> None:
+    """Draw the scores of settings at the steps at which their seeds were scored."""
+    seeds = [{row["steps"]: row[metric] for row in one.scores if row["steps"] > 0 and metric in row} for one in summary.results]
+    steps = sorted({step for row in seeds for step in row})
+    if not steps:
+        return
+    scores, x = np.array([[row.get(step, np.nan) for step in steps] for row in seeds]), np.array(steps) / 1e6
+    style: dict[str, Any] = {"label": name_of(summary.settings), "linewidth": 1.6} if named else {"linewidth": 1.0}
+    axes.plot(x, np.nanmean(scores, axis=0), color=colour, marker="o", markersize=3, **style)
+    if len(scores) > 1:
+        axes.fill_between(x, np.nanmin(scores, axis=0), np.nanmax(scores, axis=0), color=colour, alpha=0.15, linewidth=0)

@@ -11,17 +11,16 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from wlr_gym.base.checks import check_number
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import locked, make_output_folder, require_empty
 from wlr_gym.base.jobs import PATIENCE, Ended, Job, spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.base.text import counted, duration
-from wlr_gym.learning.sweep.page import write_page
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, known_settings, resolve, trial_of, trials_of
 from wlr_gym.learning.sweep.results import (
     DONE,
@@ -30,13 +29,13 @@ from wlr_gym.learning.sweep.results import (
     UNFINISHED,
     Summary,
     TrialResult,
-    is_complete,
     read_result,
     stopped_early,
     summarise,
+    write_page,
     write_table,
 )
-from wlr_gym.learning.sweep.trial import LOCKS, LOGS, TRIALS, check_job, job_of
+from wlr_gym.learning.sweep.trial import LOCKS, LOGS, TRIALS, check_job, is_complete, job_of
 
 PLAN_FILE = "sweep.yaml"
 #: Settings that a search has begun, a line of JSON each.
@@ -159,15 +158,12 @@ def resume_sweep(folder: str | Path, *, ray: str | None = None, workers: int | N
     return _run(plan, Path(folder), ray, workers, say)
 
 
-# ---- running ---------------------------------------------------------------------------------------------------------
-
-
 def _check_machines(plan: SweepPlan, ray: str | None, workers: int | None) -> None:
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
-        raise InputError(f"workers = {workers!r}: expected 1 or more")
+    if workers is not None:
+        check_number("workers", workers, least=1, whole=True)
     if ray is not None or plan.needs_ray:
         require_package("ray", "sweep")
-    if plan.search is not None and plan.search.method == "optuna":
+    if plan.needs_ray:
         require_package("optuna", "sweep")
 
 
@@ -177,28 +173,24 @@ def _run(plan: SweepPlan, folder: Path, ray: str | None, workers: int | None, sa
         make_output_folder(folder / name)
     with locked(folder / LOCKS / "sweep", _HANDOVER):
         book = _Book(plan, folder, say)
-        if ray is not None or plan.needs_ray:
-            return _run_on_ray(book, ray, workers)
-        count = workers or usable_cores()
-        say(f"{book.size}; {count} at a time, processes of this machine")
-        with _sigterm_interrupts():
-            return book.result_of(lambda: _train_all(book, lambda jobs: spread(jobs, count)))
+        if ray is None and not plan.needs_ray:
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            count = workers or cores
+            say(f"{book.size}; {count} at a time, processes of this machine")
+            with _sigterm_interrupts():
+                return book.result_of(lambda: _train_all(book, lambda jobs: spread(jobs, count)))
+        from wlr_gym.learning.sweep.ray import LOCAL, connected, fit_nodes, search_with_tune, spread_on_ray
 
+        address = ray or LOCAL
+        with connected(address, workers), _sigterm_interrupts():
+            say(f"{book.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
+            nodes = fit_nodes(check_job(plan, folder), say)
 
-def _run_on_ray(book: _Book, ray: str | None, workers: int | None) -> SweepResult:
-    from wlr_gym.learning.sweep.ray_cluster import LOCAL, connected, fit_nodes, spread_on_ray
+            def search() -> None:
+                search_with_tune(plan, folder, book.begun(), book.stopped, nodes, workers, book.begin, book.end)
 
-    plan, address = book.plan, ray or LOCAL
-    with connected(address, workers), _sigterm_interrupts():
-        book.say(f"{book.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
-        nodes = fit_nodes(check_job(plan, book.folder), book.say)
-        search = partial(_search_with_tune, book, nodes, workers) if plan.needs_ray else None
-        return book.result_of(lambda: _train_all(book, lambda jobs: spread_on_ray(jobs, nodes, workers), search))
-
-
-def usable_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            by_tune = search if plan.needs_ray else None
+            return book.result_of(lambda: _train_all(book, lambda jobs: spread_on_ray(jobs, nodes, workers), by_tune))
 
 
 @contextmanager
@@ -215,32 +207,16 @@ def _sigterm_interrupts() -> Iterator[None]:
 
 def _train_all(book: _Book, run: Run, search: Callable[[], None] | None = None) -> None:
     """Train the grid with all seeds; or search with the first seed, then train the best with the others."""
-    plan = book.plan
+    plan, known = book.plan, known_settings(book.plan) or []
     if plan.search is None:
-        book.train(trials_of(known_settings(plan) or [], plan.seed_list), run)
+        book.train(trials_of(known, plan.seed_list), run)
         return
     if search is not None:
         search()
     else:
-        book.train(trials_of(known_settings(plan) or [], plan.seed_list[:1]), run)
+        book.train(trials_of(known, plan.seed_list[:1]), run)
     best = [dict(one.settings) for one in summarise(book.results(), plan.metric)[: plan.search.repeat_best]]
     book.train(trials_of(best, plan.seed_list), run)
-
-
-def _search_with_tune(book: _Book, nodes: Mapping[str, str], at_once: int | None) -> None:
-    from wlr_gym.learning.sweep.tune_search import search_with_tune
-
-    known = known_settings(book.plan)
-    file = book.folder / BEGUN_FILE
-    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
-    # Oldest first, each once; a last line may be cut short.
-    begun = list({line: json.loads(line) for line in lines if line.endswith("}")}.values())
-    for settings in known if known is not None else begun:
-        book.enter(trial_of(settings, book.plan.seed_list[0]))
-    search_with_tune(book.plan, book.folder, begun, book.stopped, nodes, at_once, book.begin, book.end)
-
-
-# ---- what is known of the trials -------------------------------------------------------------------------------------
 
 
 class _Book:
@@ -260,7 +236,6 @@ class _Book:
         self._ended: dict[str, tuple[str, str]] = {}
         self._known: dict[str, TrialResult] = {}
         self._began, self._done, self._expected = time.monotonic(), 0, 0
-        self._page_due = self._began + 60.0
 
     @property
     def size(self) -> str:
@@ -275,20 +250,30 @@ class _Book:
         best = min(plan.search.repeat_best, count)
         return f"{counted(count, 'trial')}{each}, then the best {best} with {counted(seeds, 'seed')}"
 
-    def enter(self, trial: Trial) -> None:
-        """Count a trial in."""
-        self._trials.setdefault(trial.name, trial)
+    def begun(self) -> list[dict[str, Any]]:
+        """Return the settings that a search tries first, and count their trials in: all known ones, or those begun before."""
+        known, file = known_settings(self.plan), self.folder / BEGUN_FILE
+        if known is None:
+            lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+            # Oldest first, each once; a last line may be cut short.
+            known = list({line: json.loads(line) for line in lines if line.endswith("}")}.values())
+        for settings in known:
+            self._enter(trial_of(settings, self.plan.seed_list[0]))
+        return known
 
     def begin(self, trial: Trial) -> None:
         """Note a trial that a search has chosen, in a line of a file."""
-        self.enter(trial)
+        self._enter(trial)
         with (self.folder / BEGUN_FILE).open("a", encoding="utf-8") as file:
             file.write(f"{json.dumps(dict(trial.settings))}\n")
+
+    def _enter(self, trial: Trial) -> None:
+        self._trials.setdefault(trial.name, trial)
 
     def train(self, trials: Sequence[Trial], run: Run) -> None:
         """Train those of some trials that are not complete."""
         for trial in trials:
-            self.enter(trial)
+            self._enter(trial)
         left = [trial for trial in trials if not is_complete(self.folder / TRIALS / trial.name)]
         if len(left) < len(trials):
             self.say(f"{len(trials) - len(left)} of {len(trials)} trials are done already")
@@ -299,32 +284,23 @@ class _Book:
 
     def end(self, trial: Trial, error: str, early: bool = False) -> None:
         """Note how a trial ended; write the table."""
-        self.enter(trial)
+        self._enter(trial)
         self._ended[trial.name] = FAILED if error else STOPPED_EARLY if early else DONE, error
         self._known.pop(trial.name, None)
         self._done += 1
         self.say(self._line(trial))
         try:
             write_table(self.results(), self.folder)
-            self._write_page_now_and_then()
         except InputError as problem:  # a full disk; the trials go on
             self.say(str(problem))
 
-    def _write_page_now_and_then(self) -> None:
-        """Write the page as trials end, each minute at most and in 2 % of the time at most."""
-        if (began := time.monotonic()) < self._page_due:
-            return
-        write_page(self.plan, self.results(), self.folder)
-        self._page_due = time.monotonic() + max(60.0, 50.0 * (time.monotonic() - began))
-
     def _line(self, trial: Trial) -> str:
-        result = self._result(trial)
+        result, metric = self._result(trial), self.plan.metric
         of = f"/{self._expected}" if self._expected else ""
         if result.status == FAILED:
             return f"{self._done}{of}  {trial.name}: FAILED: {result.error}"
-        scores = f"{self.plan.metric} {result.final[self.plan.metric]:.3f}" if self.plan.metric in result.final else "no scores"
-        passed = time.monotonic() - self._began
-        left = passed / self._done * (self._expected - self._done)
+        scores = f"{metric} {result.final[metric]:.3f}" if metric in result.final else "no scores"
+        left = (time.monotonic() - self._began) / self._done * (self._expected - self._done)
         rest = f"; about {duration(left)} left" if left > 0.0 else ""
         return f"{self._done}{of}  {trial.name}: {result.status}, {scores}, {duration(result.seconds)}{rest}"
 
@@ -343,6 +319,7 @@ class _Book:
 
     def result_of(self, work: Callable[[], None]) -> SweepResult:
         """Do the work; write table and page of what there is, however it ends; return the result."""
+        resume = f"wlr sweep --resume {self.folder}"
         try:
             work()
         except KeyboardInterrupt:
@@ -350,16 +327,13 @@ class _Book:
                 self.write()
             except InputError as problem:
                 self.say(str(problem))
-            raise KeyboardInterrupt(
-                f"interrupted; trials have checkpoints; resume with: wlr sweep --resume {self.folder}"
-            ) from None
+            raise KeyboardInterrupt(f"interrupted; trials have checkpoints; resume with: {resume}") from None
         try:
             self.write()
         except InputError as problem:
             found = Counter(one.status for one in self.results())
             count = ", ".join(f"{status}: {number}" for status, number in found.items())
-            again = f"wlr sweep --resume {self.folder}"
-            raise InputError(f"{problem}; trials {count}; when it can be written: {again}") from None
+            raise InputError(f"{problem}; trials {count}; when it can be written: {resume}") from None
         results = self.results()
         return SweepResult(self.folder, results, summarise(results, self.plan.metric))
 

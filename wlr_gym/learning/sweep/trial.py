@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import json
 import platform
 import shutil
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +16,10 @@ from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
 from wlr_gym.base.jobs import PATIENCE, Job, Send, import_modules, serve
-from wlr_gym.base.paths import PACKAGE
-from wlr_gym.base.provenance import git_commit
+from wlr_gym.base.provenance import CONFIG_FILE
+from wlr_gym.base.settings import read_yaml
+from wlr_gym.learning.curves import read_curve
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, check_settings, draw, trial_of, whole_settings
-from wlr_gym.learning.sweep.results import is_complete, scores_of
 from wlr_gym.learning.training import can_resume, resume_training, run_training
 from wlr_gym.policy import Training, TrainingProgress
 
@@ -59,9 +56,8 @@ def job_of(plan: SweepPlan, trial: Trial, out: Path, *, report: bool = False, tr
 
 def check_job(plan: SweepPlan, out: Path) -> Job:
     """Return a job that ends well where trials can be trained: the same version, all packages, the modules to import."""
-    any_settings = draw(plan, np.random.default_rng(0))
-    job = job_of(plan, trial_of(any_settings, plan.seed_list[0]), out)
-    return replace(job, name="check", task={**job.task, "check": True}, log=str(out.resolve() / LOGS / "check.txt"))
+    job = job_of(plan, trial_of(draw(plan, np.random.default_rng(0)), plan.seed_list[0]), out)
+    return Job("check", job.module, {**job.task, "check": True}, str(out.resolve() / LOGS / "check.txt"))
 
 
 def train_trial(task: Mapping[str, Any], send: Send) -> None:
@@ -78,79 +74,53 @@ def train_trial(task: Mapping[str, Any], send: Send) -> None:
         check_settings(task["agent"], task["settings"])
         return
     sys.argv[:] = task["command"]  # the run folder says how the sweep was started, not how its processes are
-    out = Path(task["out"])
+    out, told = Path(task["out"]), -1.0
     folder = out / TRIALS / task["name"]
+
+    def tell(scores: Mapping[str, float]) -> None:
+        """Say held-out scores, each once."""
+        nonlocal told
+        if task["report"] and scores and scores["steps"] > told:
+            told = scores["steps"]
+            send(dict(scores))
+
     with locked(out / LOCKS / task["name"], 2 * PATIENCE):
-        reporter = _Reporter(folder, send if task["report"] else None)
+        for row in scores_of(folder):  # what a trial that is resumed has already
+            tell(row)
         if task["train"] and not is_complete(folder):
-            _train(task, folder, reporter)
-        reporter.catch_up()
+            _train(task, folder, tell)
+        for row in scores_of(folder):  # what the end of the training added
+            tell(row)
 
 
-def _train(task: Mapping[str, Any], folder: Path, reporter: _Reporter) -> None:
+def _train(task: Mapping[str, Any], folder: Path, tell: Send) -> None:
     """Train, or resume from the newest checkpoint; what has none is trained from the beginning."""
-    keywords = task["settings"].get("environment") or {}
-    with contextlib.ExitStack() as until_compiled:
-        if (compiled := _compiled(task["environment"], keywords)) is not None and not compiled.is_file():
-            until_compiled.enter_context(locked(compiled.with_suffix(".lock"), 900.0))  # longer than a compilation takes
 
-        def on_update(progress: TrainingProgress) -> None:
-            if compiled is not None:
-                with contextlib.suppress(OSError):
-                    compiled.touch()
-                until_compiled.close()
-            reporter.tell(progress.held_out)
+    def on_update(progress: TrainingProgress) -> None:
+        tell(progress.held_out)
 
-        if can_resume(folder):
-            resume_training(folder, on_update=on_update)
-            return
-        shutil.rmtree(folder, ignore_errors=True)
-        run_training(
-            task["agent"],
-            Training(task["environment"], folder, task["settings"], False, None, False, task["init"], on_update),
-        )
+    if can_resume(folder):
+        resume_training(folder, on_update=on_update)
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    training = Training(task["environment"], folder, task["settings"], progress=False, init=task["init"], on_update=on_update)
+    run_training(task["agent"], training)
 
 
-class _Reporter:
-    """Says each held-out score once, the earlier ones of a resumed trial first.
-
-    Args:
-        folder: run folder.
-        send: None = say nothing.
-    """
-
-    def __init__(self, folder: Path, send: Callable[[Mapping[str, Any]], None] | None) -> None:
-        self._folder, self._send, self._told = folder, send, -1.0
-        self.catch_up()
-
-    def tell(self, scores: Mapping[str, float]) -> None:
-        """Say scores, if they are new."""
-        if self._send is not None and scores and scores["steps"] > self._told:
-            self._told = scores["steps"]
-            self._send(dict(scores))
-
-    def catch_up(self) -> None:
-        """Say what is new in the run folder, such as what the end of the training added."""
-        for row in scores_of(self._folder):
-            self.tell(row)
+def scores_of(folder: Path) -> list[dict[str, float]]:
+    """Return the held-out scores of a run folder, oldest first."""
+    file = folder / "held_out.csv"
+    return read_curve(file) if file.is_file() else []
 
 
-# ---- kernels ---------------------------------------------------------------------------------------------------------
-
-
-def _compiled(environment: str, keywords: Mapping[str, Any]) -> Path | None:
-    """Return the file that says that this machine has the kernels of an environment.
-
-    The first trial of a kind holds a lock until its first update is done, when all is compiled; the others load the kernels.
-    A file that is wrong (the cache was emptied) costs time only.
-    """
-    import llvmlite.binding
-
-    from wlr_gym.physics.codegen.compilation import cache_directory, fingerprint
-
-    texts = (environment, json.dumps(keywords, sort_keys=True), str(PACKAGE), str(git_commit()), __version__)
-    key = hashlib.sha256("\0".join((fingerprint(*texts), str(llvmlite.binding.get_host_cpu_name()))).encode()).hexdigest()[:16]
-    return cache_directory() / f"compiled_{key}.txt"
+def is_complete(folder: Path) -> bool:
+    """Return whether a run folder holds a training that has done all its steps."""
+    contract = folder / "policy" / "contract.json"
+    if not contract.is_file() or not (folder / CONFIG_FILE).is_file():
+        return False
+    steps = json.loads(contract.read_text(encoding="utf-8")).get("training", {}).get("steps")
+    total = read_yaml(folder / CONFIG_FILE)["settings"].get("total_steps")
+    return steps is None or total is None or steps >= total
 
 
 if __name__ == "__main__":
