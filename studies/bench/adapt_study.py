@@ -27,8 +27,8 @@ from wlr_gym.gap.decision import Decided
 from wlr_gym.gap.estimation.fit import fit, widened
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.estimation.uncertainty import half_widths
-from wlr_gym.gap.report.entries import Result
-from wlr_gym.gap.robot.open import open_robot
+from wlr_gym.gap.report.result import Result
+from wlr_gym.gap.robot.problem import open_robot
 from wlr_gym.gap.workflow import SCATTER
 from wlr_gym.learning.adaptation.adapt import find_uncertainty, task_randomization
 from wlr_gym.learning.adaptation.driving import EmulatedRobot, episodes_of, errors_of

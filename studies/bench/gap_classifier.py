@@ -94,8 +94,7 @@ def training_screen(runs: Path, seed: int) -> dict[str, Any]:
 
     A drawn model whose simulation breaks down is drawn anew.
     """
-    from wlr_gym.gap.robot.open import open_robot
-    from wlr_gym.gap.robot.problem import RobotProblem
+    from wlr_gym.gap.robot.problem import RobotProblem, open_robot
     from wlr_gym.gap.selection.search import screened
     from wlr_gym.gap.validation.data_split import informative_split
     from wlr_gym.gap.workflow import calibrated_fit

@@ -19,11 +19,20 @@ from numpy.typing import NDArray
 from studies.bench.sysid_contest import Contest, PeerProblem, PeerRun, contest_between
 from wlr_gym.base.random import generator
 from wlr_gym.gap.problem import Setting
-from wlr_gym.gap.rig import kernel
-from wlr_gym.gap.rig.model import DATA_SHEET_VOLTAGE, DUTY_PER_GAIN, GRAVITY, QUANTITIES, model_of, pack
-from wlr_gym.gap.rig.problem import ENCODER_NOISE, RigProblem
-from wlr_gym.gap.rig.recording import Recording
-from wlr_gym.gap.rig.replay import STEP, Replay
+from wlr_gym.gap.rig import pendulum
+from wlr_gym.gap.rig.pendulum import (
+    DATA_SHEET_VOLTAGE,
+    ENCODER_NOISE,
+    GRAVITY,
+    QUANTITIES,
+    STEP,
+    PendulumProblem,
+    Replay,
+    RigModel,
+    model_of,
+    pack,
+)
+from wlr_gym.gap.rig.pendulum_recordings import DUTY_PER_GAIN, Recording
 from wlr_gym.physics import servo
 
 Array = NDArray[np.float64]
@@ -42,21 +51,19 @@ RUNS = ((0.1, 0.15, 200.0), (0.2, 0.1, 400.0), (0.1, 0.1, 800.0), (0.3, 0.1, 300
 SUPPLY = 5.0
 
 
-class WholeRuns(RigProblem):
+class WholeRuns(PendulumProblem):
     """The rig's problem with the numbers that both sides can fit, and one signal: the angle over whole runs."""
 
     def __init__(self, recordings: Sequence[Recording]) -> None:
         super().__init__(recordings)
         self.quantities = tuple(quantity for quantity, free in zip(QUANTITIES, _FREE, strict=True) if free)
-        self.signals = self.signals[:1]
-        for replay in self._replays:  # every run starts at rest where the encoder reads 0, and both sides are told
+        self.signals, self.windows = self.signals[:1], self.windows[:1]
+        for replay in self.replays:  # every run starts at rest where the encoder reads 0, and both sides are told
             replay.angle[0] = replay.rate[0] = 0.0
 
-    def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
-        """Return the angle (settings, rows, 1) of each run, rad."""
-        models = [model_of(Setting(all_numbers(setting.quantities)), QUANTITIES) for setting in settings]
-        zero = np.array([model.numbers["zero"] for model in models])[:, None, None]
-        return [self._replays[run].simulate(models)[:, :, :1] + zero for run in runs]
+    def model(self, setting: Setting) -> RigModel:
+        """Return the model of a setting, with the numbers that are not fitted."""
+        return model_of(Setting(all_numbers(setting.quantities)), QUANTITIES)
 
 
 def all_numbers(free: Array) -> Array:
@@ -87,14 +94,14 @@ def make_rig(seconds: float) -> tuple[WholeRuns, Array]:
 
 def peer_of(problem: WholeRuns) -> PeerProblem:
     """Return the same problem for ``mujoco.sysid``."""
-    return PeerProblem(problem.quantities, [_peer_run(replay) for replay in problem._replays])  # the same setpoints and starts
+    return PeerProblem(problem.quantities, [_peer_run(replay) for replay in problem.replays])  # the same setpoints and starts
 
 
 def _peer_run(replay: Replay) -> PeerRun:
     recording, model = replay.recording, _pendulum()
     delay = round(_NOMINAL[[q.name for q in QUANTITIES].index("delay")] / STEP)
-    setpoints = replay._goals[np.maximum(np.arange(len(replay._goals)) - delay, 0)]
-    at_rows = (np.arange(1, len(recording.time)) * ROW) - 1
+    setpoints = replay.goals[np.maximum(np.arange(len(replay.goals)) - delay, 0)]
+    at_rows = (np.arange(1, len(recording.t)) * ROW) - 1
 
     def build(values: Array) -> mujoco.MjModel:
         return _with_numbers(copy.copy(model), recording, values)
@@ -103,7 +110,7 @@ def _peer_run(replay: Replay) -> PeerRun:
         return (recording.angle[1:] - state[at_rows, 1]) / ENCODER_NOISE
 
     start = np.array([0.0, replay.angle[0], replay.rate[0]])
-    times = recording.time[0] + STEP * np.arange(len(setpoints) + 1)
+    times = recording.t[0] + STEP * np.arange(len(setpoints) + 1)
     control = np.append(setpoints, setpoints[-1:])[:, None]
     return PeerRun(model, build, times, control, start, residual)
 
@@ -178,7 +185,7 @@ def _recorded(run: int, seconds: float, truth: Array, rng: np.random.Generator) 
     starts[0] = 0
     model = model_of(Setting(all_numbers(truth)), QUANTITIES)
     lag = np.array([model.numbers["delay"]]) / step
-    found = kernel.simulate(pack([model], empty, step), lag, setpoints, inputs, starts, np.zeros((1, 2)), step)[0]
+    found = pendulum.simulate(pack([model], empty, step), lag, setpoints, inputs, starts, np.zeros((1, 2)), step)[0]
     angle = found[:: FINE * ROW, 0][:rows] + model.numbers["zero"]
     noisy = angle + np.sqrt(1.0 - 1.0 / 12.0) * ENCODER_NOISE * rng.standard_normal(rows)
     counted = ENCODER_NOISE * np.round(noisy / ENCODER_NOISE)

@@ -30,9 +30,8 @@ from wlr_gym.data.read import Run
 from wlr_gym.data.run_states import start_state
 from wlr_gym.data.sensor_columns import SENSED, channels
 from wlr_gym.gap.problem import Setting
-from wlr_gym.gap.robot.clock import LEAD
 from wlr_gym.gap.robot.problem import RobotProblem
-from wlr_gym.gap.robot.windows import anchored_residuals
+from wlr_gym.gap.robot.windows import LEAD, anchored_residuals
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS, load_robot

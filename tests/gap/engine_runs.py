@@ -10,8 +10,8 @@ from wlr_gym.data.body_pose import euler_angles
 from wlr_gym.data.format import CHANNELS, COMMANDS
 from wlr_gym.data.noise import noise_parts
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.gap.robot.clock import CLOCK
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
+from wlr_gym.gap.robot.windows import CLOCK
 from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state

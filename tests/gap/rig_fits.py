@@ -4,8 +4,8 @@ import numpy as np
 
 from wlr_gym.gap.estimation.fit import fit
 from wlr_gym.gap.estimation.model import FittedModel, nominal_model
-from wlr_gym.gap.rig.candidates import rig_candidates
-from wlr_gym.gap.rig.problem import ENCODER_NOISE
+from wlr_gym.gap.rig.pendulum import ENCODER_NOISE, JOINT, RIG_EFFECTS
+from wlr_gym.gap.rig.problem import law_candidates
 
 
 def nominal(problem):
@@ -19,9 +19,9 @@ def position_errors(problem, setting, runs):
 
 def best_fit(problem, runs, effects, autocorrelation_time=None):
     """The better of two fits: from the data sheet, and from a stronger motor with less friction."""
-    candidates = {
-        c.name: c for present in (("coulomb_friction",), ("load_dependent_friction",)) for c in rig_candidates(present)[1]
-    }
+    candidates = {}
+    for present in ("coulomb_friction", "load_dependent_friction"):
+        candidates |= {c.name: c for c in law_candidates(RIG_EFFECTS, JOINT, {present})[1]}
     stronger = nominal(problem).copy()
     names = [quantity.name for quantity in problem.quantities]
     for name, value in {"stall_torque": 0.735, "armature": 0.0018, "coulomb_friction": 0.02}.items():

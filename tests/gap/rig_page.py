@@ -14,7 +14,8 @@ from rig_fits import best_fit, position_errors
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import git_commit
-from wlr_gym.gap.rig import RigProblem, read_recordings
+from wlr_gym.gap.rig.pendulum import PendulumProblem
+from wlr_gym.gap.rig.pendulum_recordings import read_recordings
 
 SATURATION, LOAD = {"torque_saturation": (0.4,)}, {"load_dependent_friction": (0.2,)}
 MODELS = (
@@ -29,7 +30,7 @@ MODELS = (
 TAKEN = ("verdict", "effects", "gap", "runs")
 
 
-def measured(problem: RigProblem, effects: dict[str, tuple[float, ...]]) -> dict[str, object]:
+def measured(problem: PendulumProblem, effects: dict[str, tuple[float, ...]]) -> dict[str, object]:
     """Mean error of the angle of a model fitted to all runs, and its effects' numbers."""
     runs = range(len(problem.runs))
     model = best_fit(problem, runs, effects).model
@@ -40,7 +41,7 @@ def measured(problem: RigProblem, effects: dict[str, tuple[float, ...]]) -> dict
 
 
 def main(recordings: str, result: str, data: str) -> None:
-    problem = RigProblem(read_recordings(Path(recordings)))
+    problem = PendulumProblem(read_recordings(Path(recordings)))
     found = json.loads(Path(result).read_text(encoding="utf-8"))
     workflow = {name: found[name] for name in TAKEN} | {"commit": found["provenance"]["git_commit"]}
     models = [measured(problem, effects) for effects in MODELS]

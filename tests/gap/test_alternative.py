@@ -8,13 +8,11 @@ from toy_problem import CHANNELS, NOISE, QUANTITIES, STRENGTH, Toy, candidate, c
 
 from wlr_gym.gap.analysis import NOTHING_MISSING, UNKNOWN
 from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.likelihood import autocorrelation_times
-from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation.model import autocorrelation_times, nominal_model
 from wlr_gym.gap.problem import Candidate, Start
 from wlr_gym.gap.report.text import sentence
 from wlr_gym.gap.selection import cross_validation
-from wlr_gym.gap.selection.alternative import Products, rescored
-from wlr_gym.gap.selection.screening import LEAST_GAIN, responses, screen
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Products, rescored, responses, screen
 from wlr_gym.gap.selection.search import search_effects
 from wlr_gym.gap.workflow import analyse_problem
 

@@ -16,8 +16,7 @@ from wlr_gym.data.excitations import GENTLE, excite
 from wlr_gym.data.read import read_run
 from wlr_gym.data.record import record_simulation
 from wlr_gym.gap import Budget, Recorded, decide
-from wlr_gym.gap.report.entries import Result
-from wlr_gym.gap.report.explanations import Explanation, explanations
+from wlr_gym.gap.report.result import Explanation, Result, explanations
 from wlr_gym.gap.robot import next_run
 from wlr_gym.physics.effects import PatchEffect
 from wlr_gym.robot import load_robot

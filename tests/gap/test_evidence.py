@@ -9,8 +9,7 @@ from toy_problem import Toy, candidate, sized
 from wlr_gym.gap.estimation.fit import fit
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Start
-from wlr_gym.gap.selection.evidence import credible_names, occam, probabilities
-from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.hypothesis import Hypothesis, credible_names, occam, probabilities
 from wlr_gym.gap.selection.screening import Score
 from wlr_gym.gap.selection.search import search_effects
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from toy_problem import NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured
 
-from wlr_gym.gap.estimation.fit import fit, linearise
-from wlr_gym.gap.estimation.least_squares import corrected
-from wlr_gym.gap.estimation.likelihood import LONGEST, estimate_noise, minus_two_log_likelihood
+from wlr_gym.gap.estimation.fit import corrected, fit, linearise
 from wlr_gym.gap.estimation.model import (
+    LONGEST,
     FittedModel,
+    estimate_noise,
+    minus_two_log_likelihood,
     moved,
     nominal_model,
     on_bounds,

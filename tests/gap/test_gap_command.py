@@ -10,7 +10,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.gap.report.folder import save_analysis
+from wlr_gym.gap.report.page import save_analysis
 
 workflow = importlib.import_module("wlr_gym.gap.workflow")
 
@@ -39,7 +39,7 @@ def answer(monkeypatch):
         monkeypatch.setattr(workflow, "analyse", analyse)
         return asked
 
-    monkeypatch.setattr("wlr_gym.gap.report.folder.draw", lambda analysis: {"gap": b"\x89PNG"})
+    monkeypatch.setattr("wlr_gym.gap.report.page.draw", lambda analysis: {"gap": b"\x89PNG"})
     return give
 
 

@@ -6,8 +6,7 @@ from pathlib import Path
 from gap_examples import EFFECT_FOUND
 from toy_problem import Toy
 
-from wlr_gym.gap.report.entries import Result
-from wlr_gym.gap.report.result import result_of
+from wlr_gym.gap.report.result import Result, result_of
 from wlr_gym.gap.report.text import TITLES
 from wlr_gym.gap.validation.data_split import informative_split
 from wlr_gym.gap.validation.held_out import LEAST_FOR_INTERVAL

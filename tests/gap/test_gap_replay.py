@@ -12,13 +12,12 @@ from wlr_gym.data import RunMeta
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.noise import channel_noise
 from wlr_gym.gap.estimation.model import nominal_model
-from wlr_gym.gap.robot import loop, simulate
-from wlr_gym.gap.robot.clock import CLOCK, RunClock
+from wlr_gym.gap.robot import replay_loop as loop
+from wlr_gym.gap.robot import simulate
 from wlr_gym.gap.robot.problem import RobotProblem
-from wlr_gym.gap.robot.recorder import TRUTH
-from wlr_gym.gap.robot.schedule import WrittenSetpoints
+from wlr_gym.gap.robot.replay_loop import TRUTH, WrittenSetpoints
 from wlr_gym.gap.robot.simulate import replay_batch
-from wlr_gym.gap.robot.windows import anchored_residuals
+from wlr_gym.gap.robot.windows import CLOCK, RunClock, anchored_residuals
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.robot import JOINTS
 from wlr_gym.robot.parameters import Parameters

@@ -19,19 +19,15 @@ from wlr_gym.data.record import record_simulation
 from wlr_gym.data.replay import replay
 from wlr_gym.data.write import write_run
 from wlr_gym.gap.analysis import ParameterEstimate
-from wlr_gym.gap.estimation.likelihood import level, mean_squares
-from wlr_gym.gap.estimation.model import FittedModel, nominal_model
+from wlr_gym.gap.estimation.model import FittedModel, level, mean_squares, nominal_model
 from wlr_gym.gap.problem import Setting, Unknown
-from wlr_gym.gap.report.relations import relation_of
+from wlr_gym.gap.report.recommendation import relation_of
 from wlr_gym.gap.report.result import write_result
-from wlr_gym.gap.robot.candidates import robot_candidates, shown_by
-from wlr_gym.gap.robot.clock import RunClock
-from wlr_gym.gap.robot.formulas import formula_candidates, wave_frequency
-from wlr_gym.gap.robot.observed import wave_order
-from wlr_gym.gap.robot.open import LEAST_RUNS, open_robot
-from wlr_gym.gap.robot.problem import LOST, WORTH_APART, RobotProblem
+from wlr_gym.gap.robot.candidates import formula_candidates, robot_candidates, shown_by, wave_frequency, wave_order
+from wlr_gym.gap.robot.problem import LEAST_RUNS, LOST, WORTH_APART, RobotProblem, open_robot
 from wlr_gym.gap.robot.quantities import knobs, write
 from wlr_gym.gap.robot.simulate import PHYSICS_STEP
+from wlr_gym.gap.robot.windows import RunClock
 from wlr_gym.gap.selection.hypothesis import within_tolerance
 from wlr_gym.gap.validation.held_out import noise_floor
 from wlr_gym.gap.workflow import found_effect

@@ -6,12 +6,11 @@ from toy_problem import CHANNELS, NOISE, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import Place
 from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.likelihood import level, mean_squares
-from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation.model import level, mean_squares, nominal_model
 from wlr_gym.gap.selection.cross_validation import improvement
 from wlr_gym.gap.selection.screening import LEAST_GAIN
 from wlr_gym.gap.validation.held_out import _beyond_need, _interval, compare_models, reduction
-from wlr_gym.gap.validation.traces import MOST, informative_traces
+from wlr_gym.gap.validation.localisation import MOST, informative_traces
 
 FITTED, HELD_OUT = [0, 1, 2, 4], [3, 5, 6]
 

@@ -11,10 +11,8 @@ from wlr_gym.data import Run
 from wlr_gym.data.write import write_run
 from wlr_gym.gap import analyse
 from wlr_gym.gap.analysis import NO_PROFILE
-from wlr_gym.gap.robot.intake import CHECKS, findings_of
-from wlr_gym.gap.robot.intake.check import ChannelFault
-from wlr_gym.gap.robot.intake.joints import wrapped
-from wlr_gym.gap.robot.open import open_robot
+from wlr_gym.gap.robot.intake import CHECKS, ChannelFault, findings_of, wrapped
+from wlr_gym.gap.robot.problem import open_robot
 
 
 def lively(t):

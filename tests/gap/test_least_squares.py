@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wlr_gym.gap.estimation.least_squares import bounded_minimum
+from wlr_gym.gap.estimation.fit import bounded_minimum
 
 
 @pytest.mark.parametrize("held", [False, True])

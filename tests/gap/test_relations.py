@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wlr_gym.gap.problem import Candidate, Start, Unknown
-from wlr_gym.gap.report.relations import relation_of, relations
+from wlr_gym.gap.report.recommendation import relation_of, relations
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import JOINTS

@@ -28,10 +28,8 @@ from wlr_gym.gap.analysis import (
     Place,
     Threshold,
 )
-from wlr_gym.gap.opened import named_robot
-from wlr_gym.gap.report import folder
-from wlr_gym.gap.report.folder import check_folder, save_analysis
-from wlr_gym.gap.report.page import report
+from wlr_gym.gap.report import page as folder
+from wlr_gym.gap.report.page import check_folder, report, save_analysis
 from wlr_gym.gap.report.plots import draw, figures
 from wlr_gym.gap.report.result import result_of
 from wlr_gym.gap.report.text import (
@@ -48,6 +46,7 @@ from wlr_gym.gap.report.text import (
     sentence,
     title,
 )
+from wlr_gym.gap.workflow import named_robot
 
 EVERY = pytest.mark.parametrize("analysis", examples.ALL.values(), ids=list(examples.ALL))
 PICTURE = {"gap": b"\x89PNG"}

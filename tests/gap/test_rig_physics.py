@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import ArrayLike
 
 from wlr_gym.gap.problem import Setting
-from wlr_gym.gap.rig import kernel, law
-from wlr_gym.gap.rig.model import QUANTITIES, model_of, pack
-from wlr_gym.gap.rig.recording import Recording
+from wlr_gym.gap.rig import pendulum
+from wlr_gym.gap.rig.pendulum import QUANTITIES, model_of, pack
+from wlr_gym.gap.rig.pendulum_recordings import Recording
 from wlr_gym.physics.plants.drive import TEETH_DAMPING, fitted_weight
 from wlr_gym.physics.servo import motor_constants, motor_torque
 
@@ -37,8 +37,8 @@ def run(seconds, angle=0.0, rate=0.0, goal: ArrayLike = 0.0, supply=7.4, on=1.0,
     inputs = np.stack([np.broadcast_to(np.asarray(v, float), (count,)) for v in (supply, on, warmth)], axis=1)
     starts = np.full(count, -1)
     starts[0] = 0
-    row = np.array([[parameters[name] for name in law.PARAMETERS]])
-    return kernel.simulate(row, np.array([lag]), setpoints, inputs, starts, np.array([[angle, rate]]), step)[0]
+    row = np.array([[parameters[name] for name in pendulum.PARAMETERS]])
+    return pendulum.simulate(row, np.array([lag]), setpoints, inputs, starts, np.array([[angle, rate]]), step)[0]
 
 
 # --- pendulum
@@ -208,7 +208,7 @@ def test_arm_and_load_give_gravity_and_inertia():
     recording = read_recording_of(mass=0.49, length=0.098)
     numbers = {quantity.name: quantity.nominal for quantity in QUANTITIES} | {"arm_mass": 0.06, "length_error": 0.002}
     model = model_of(Setting(np.array(list(numbers.values()))), QUANTITIES)
-    lanes = dict(zip(law.PARAMETERS, pack([model], recording, STEP)[0], strict=True))
+    lanes = dict(zip(pendulum.PARAMETERS, pack([model], recording, STEP)[0], strict=True))
     assert lanes["gravity"] == pytest.approx(9.81 * 0.1 * (0.49 + 0.03))
     assert lanes["inertia"] == pytest.approx(0.01 * (0.49 + 0.02) + numbers["armature"])
     assert lanes["volt_gain"] == pytest.approx(0.52 / 5.0)
@@ -242,7 +242,7 @@ def test_kernel_does_what_the_law_says(half_play):
     for k in range(1500):
         assert found[k, ANGLE] == pytest.approx(state["angle"], abs=1e-9)
         lanes = {**parameters, **state, "goal": goal[k], "supply": 7.4, "on": 1.0, "warmth": 9.0}
-        new = law.substep(lanes, STEP, features)
+        new = pendulum.substep(lanes, STEP, features)
         assert found[k, TORQUE] == pytest.approx(new["motor_torque"], abs=1e-7)
-        state = {name: float(new[name]) for name in law.STATE}
+        state = {name: float(new[name]) for name in pendulum.STATE}
     assert np.ptp(found[:, ANGLE]) > 0.2

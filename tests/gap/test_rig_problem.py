@@ -11,9 +11,9 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.gap.estimation.fit import fit
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Setting
-from wlr_gym.gap.rig import RIG_EFFECTS, RigProblem, read_recordings
-from wlr_gym.gap.rig.candidates import rig_candidates
-from wlr_gym.gap.rig.problem import ENCODER_NOISE, LOST
+from wlr_gym.gap.rig.pendulum import ENCODER_NOISE, JOINT, RIG_EFFECTS, PendulumProblem
+from wlr_gym.gap.rig.pendulum_recordings import read_recordings
+from wlr_gym.gap.rig.problem import LOST, law_candidates
 from wlr_gym.gap.selection.search import search_effects
 from wlr_gym.gap.validation.data_split import named_split
 from wlr_gym.physics.effects.effect import PatchEffect
@@ -24,7 +24,7 @@ LOADED = Bench(load_ratio=0.15)
 
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory):
-    return RigProblem(read_recordings(write(tmp_path_factory.mktemp("loaded"), LOADED, gains=(100, 300, 800))))
+    return PendulumProblem(read_recordings(write(tmp_path_factory.mktemp("loaded"), LOADED, gains=(100, 300, 800))))
 
 
 def split(problem):
@@ -97,13 +97,13 @@ def test_every_effect_is_neutral_where_it_says_and_acts_elsewhere(loaded):
 
 
 def test_every_probe_is_felt_and_candidates_start_from_them(loaded):
-    probes, _ = rig_candidates({"load_dependent_friction", "coulomb_friction"})
+    probes, _ = law_candidates(RIG_EFFECTS, JOINT, {"load_dependent_friction", "coulomb_friction"})
     probes = [probe for probe in probes if not probe.key.startswith("torque_limit")]  # this bench does not reach them
     settings = [Setting(nominal(loaded), probe.effects) for probe in probes]
     base, *found = (r for r in loaded.residuals([Setting(nominal(loaded)), *settings], [6])[0])
     for probe, residual in zip(probes, found, strict=True):
         assert np.abs(residual - base).max() > 0.1, probe.key
-    probes, candidates = rig_candidates(())
+    probes, candidates = law_candidates(RIG_EFFECTS, JOINT, set())
     keys = {probe.key for probe in probes}
     for candidate in candidates:
         for start in candidate.starts:
@@ -139,7 +139,7 @@ def test_unknown_effects_and_missing_parameters_are_refused(loaded):
         with pytest.raises(InputError, match=message):
             loaded.residuals([Setting(nominal(loaded), (effect,))], [0])
     with pytest.raises(InputError, match="no recordings"):
-        RigProblem([])
+        PendulumProblem([])
 
 
 def test_a_formula_acts_like_the_effect_it_spells_out(loaded):
@@ -209,12 +209,12 @@ def test_hidden_load_dependent_friction_is_named_and_measured(loaded):
 
 def test_other_numbers_alone_are_no_effect(tmp_path):
     bench = Bench(torque_constant=0.5, resistance=4.8, coulomb=0.04, viscous=0.008, inertia=0.0068, gravity=0.5)
-    problem = RigProblem(read_recordings(write(tmp_path, bench, gains=(100, 400))))
+    problem = PendulumProblem(read_recordings(write(tmp_path, bench, gains=(100, 400))))
     assert named(problem, range(len(problem.runs))).fit.model.effects == ()
 
 
 def test_a_model_without_friction_is_told_that_it_lacks_friction(tmp_path):
-    problem = RigProblem(read_recordings(write(tmp_path, Bench(), gains=(100, 400))), friction_is_known=False)
+    problem = PendulumProblem(read_recordings(write(tmp_path, Bench(), gains=(100, 400))), friction_is_known=False)
     assert not any("friction" in quantity.name for quantity in problem.quantities)
     assert "coulomb_friction" in {candidate.name for candidate, _ in named(problem, range(6)).fit.model.effects}
 
@@ -224,7 +224,7 @@ def test_a_model_without_friction_is_told_that_it_lacks_friction(tmp_path):
 
 @pytest.fixture(scope="module")
 def real():
-    return RigProblem(read_recordings(REAL))
+    return PendulumProblem(read_recordings(REAL))
 
 
 @pytest.mark.slow

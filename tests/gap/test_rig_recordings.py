@@ -1,6 +1,7 @@
 """Recordings of the test rig: decoding, refusals, what intake notices, what is held out."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
@@ -13,10 +14,9 @@ from wlr_gym.gap.analysis import Analysis, FoundEffect, ParameterEstimate
 from wlr_gym.gap.estimation.model import nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.result import patch_of
-from wlr_gym.gap.rig import RigProblem, findings, open_rig, read_recordings, rig_patch
-from wlr_gym.gap.rig.candidates import rig_candidates
-from wlr_gym.gap.rig.recording import decode_load, read_recording
-from wlr_gym.gap.rig.replay import GOAL_LEAD, STEP, Replay, smoothed_state
+from wlr_gym.gap.rig.pendulum import GOAL_LEAD, JOINT, RIG_EFFECTS, STEP, PendulumProblem, Replay, open_pendulum, pendulum_patch
+from wlr_gym.gap.rig.pendulum_recordings import decode_load, findings, read_recording, read_recordings
+from wlr_gym.gap.rig.problem import law_candidates, smoothed_state
 from wlr_gym.gap.workflow import analyse
 from wlr_gym.physics.effects import Patch, save_patch
 
@@ -44,19 +44,19 @@ def test_decoded_duty_is_what_the_gain_asks_for(made):
 
 def test_states_come_from_the_rows_around(made):
     recording = read_recordings(made)[0]
-    angle, rate = smoothed_state(recording.time, np.sin(3.0 * recording.time))
-    np.testing.assert_allclose(angle, np.sin(3.0 * recording.time), atol=1e-6)
-    np.testing.assert_allclose(rate[4:-4], 3.0 * np.cos(3.0 * recording.time[4:-4]), atol=1e-4)
+    angle, rate = smoothed_state(recording.t, np.sin(3.0 * recording.t))
+    np.testing.assert_allclose(angle, np.sin(3.0 * recording.t), atol=1e-6)
+    np.testing.assert_allclose(rate[4:-4], 3.0 * np.cos(3.0 * recording.t[4:-4]), atol=1e-4)
 
 
 def test_goals_hold_from_row_to_row_and_keep_their_area(made):
     recording = read_recordings(made)[0]
     replay = Replay(recording)
-    middle = recording.time[0] + STEP * (np.arange(len(replay._goals)) + 0.5)
-    row = np.clip(np.searchsorted(recording.time - GOAL_LEAD, middle, side="right") - 1, 0, None)
-    inside = np.abs(replay._goals - recording.goal[row]) < 1e-12
+    middle = recording.t[0] + STEP * (np.arange(len(replay.goals)) + 0.5)
+    row = np.clip(np.searchsorted(recording.t - GOAL_LEAD, middle, side="right") - 1, 0, None)
+    inside = np.abs(replay.goals - recording.goal[row]) < 1e-12
     assert inside.mean() > 0.55  # the others hold the change of a goal
-    assert replay._goals.sum() == pytest.approx(recording.goal[row].sum(), rel=2e-3)
+    assert replay.goals.sum() == pytest.approx(recording.goal[row].sum(), rel=2e-3)
 
 
 # --- refusals
@@ -137,10 +137,10 @@ def test_intake_notices_what_is_odd(made):
     supply = one.supply.copy()
     supply[100] = 5.7
     assert "supply" in with_one(supply=supply)
-    late = one.time + 0.1 * (np.arange(len(one.time)) > 200)
-    assert "gap" in with_one(time=late)
+    late = one.t + 0.1 * (np.arange(len(one.t)) > 200)
+    assert "gap" in with_one(t=late)
     assert "dead" in with_one(angle=np.zeros_like(one.angle))
-    assert "off" in with_one(enabled=one.time < 2.0)
+    assert "off" in with_one(enabled=one.t < 2.0)
     assert "control_law" in with_one(gain=200.0)
     assert "wrap" not in with_one(raw_load=np.abs(one.duty) * 885)
 
@@ -172,7 +172,7 @@ def test_what_goes_together_over_the_runs_is_said(made):
 
 def test_held_out_runs_cover_gains_and_trajectories(made):
     recordings = read_recordings(made)
-    held_out = RigProblem(recordings).held_out
+    held_out = PendulumProblem(recordings).held_out
     held = [recording for recording in recordings if recording.name in held_out]
     assert len(held) == len(held_out) == 2
     assert len({recording.gain for recording in held}) == 2
@@ -180,7 +180,7 @@ def test_held_out_runs_cover_gains_and_trajectories(made):
 
 
 def test_opening_leaves_out_what_cannot_be_used(made, tmp_path):
-    problem, found = open_rig(made)
+    problem, found = open_pendulum(made)
     assert problem is not None
     assert len(problem.runs) == 6
     assert not any(f.fatal for f in found)
@@ -190,12 +190,12 @@ def test_opening_leaves_out_what_cannot_be_used(made, tmp_path):
         entry["goal_position"] = 57.3 * entry["goal_position"]
     for k, one in enumerate(runs):
         (tmp_path / f"run_{k}.json").write_text(json.dumps(one))
-    problem, found = open_rig(tmp_path)
+    problem, found = open_pendulum(tmp_path)
     assert problem is not None
     assert problem.runs == ("run_1", "run_2", "run_3")
     assert {f.run for f in found if f.fatal} == {"run_0"}
     (tmp_path / "run_3.json").unlink()
-    problem, found = open_rig(tmp_path)
+    problem, found = open_pendulum(tmp_path)
     assert problem is None
     assert found[-1].kind == "few_runs"
     assert found[-1].fatal
@@ -204,16 +204,19 @@ def test_opening_leaves_out_what_cannot_be_used(made, tmp_path):
 def test_the_patch_that_an_analysis_of_the_rig_writes_can_be_given_back(made, tmp_path):
     """Every effect that it may find, through the file; a known effect acts as the same effect in a setting does."""
     found = []
-    for candidate in rig_candidates({"load_dependent_friction", "coulomb_friction"})[1] + rig_candidates(())[1]:
+    each = (
+        law_candidates(RIG_EFFECTS, JOINT, present)[1] for present in ({"load_dependent_friction", "coulomb_friction"}, set())
+    )
+    for candidate in itertools.chain(*each):
         values = candidate.parameters(candidate.kept([0.5 * (u.low + u.high) for u in candidate.unknowns]))
         estimates = {name: ParameterEstimate(value, value, value, "-") for name, value in values.items()}
         found.append(FoundEffect(candidate.name, candidate.where, estimates, 0.9, 100.0))
     written = patch_of(Analysis("made", "effect_found", "", effects=tuple(found)))
-    patch = rig_patch(save_patch(written, tmp_path / "patch.yaml"))
+    patch = pendulum_patch(save_patch(written, tmp_path / "patch.yaml"))
     assert patch.effects == written.effects
     assert patch.provenance == written.provenance
     one = Patch(tuple(effect for effect in patch.effects if effect.name == "torque_saturation")[:1])
-    problem, plain = open_rig(made, one)[0], open_rig(made)[0]
+    problem, plain = open_pendulum(made, one)[0], open_pendulum(made)[0]
     assert problem is not None
     assert plain is not None
     numbers = nominal_model(plain).quantities
@@ -228,12 +231,12 @@ def test_the_patch_that_an_analysis_of_the_rig_writes_can_be_given_back(made, tm
 def test_patches_of_the_rig_are_read_from_anything_that_effects_are():
     entry = {"name": "load_dependent_friction", "where": ["servo"], "parameters": {"ratio": 0.2}}
     formula = {"name": "unknown_effect", "formula": "-b * rate", "parameters": {"b": 0.1}, "units": {"b": "N m s/rad"}}
-    both = rig_patch([entry, {"effects": [formula]}])
+    both = pendulum_patch([entry, {"effects": [formula]}])
     assert [effect.name for effect in both.effects] == ["load_dependent_friction", "unknown_effect"]
-    assert rig_patch(both) is both
-    assert rig_patch(entry).effects == both.effects[:1]
-    assert not rig_patch(None).effects
-    assert not rig_patch([]).effects
+    assert pendulum_patch(both) is both
+    assert pendulum_patch(entry).effects == both.effects[:1]
+    assert not pendulum_patch(None).effects
+    assert not pendulum_patch([]).effects
 
 
 @pytest.mark.parametrize(
@@ -257,9 +260,9 @@ def test_patches_of_the_rig_are_read_from_anything_that_effects_are():
 )
 def test_patches_that_the_rig_cannot_take_are_refused(entry, words):
     with pytest.raises(InputError, match=words):
-        rig_patch({"effects": [entry]})
+        pendulum_patch({"effects": [entry]})
     with pytest.raises(InputError, match="expected a mapping with 'effects'"):
-        rig_patch({"effect": [entry]})
+        pendulum_patch({"effect": [entry]})
 
 
 @pytest.mark.parametrize(
@@ -272,7 +275,7 @@ def test_patches_that_the_rig_cannot_take_are_refused(entry, words):
 )
 def test_what_is_no_patch_of_the_rig_is_refused(source, words):
     with pytest.raises(InputError, match=words):
-        rig_patch(source)
+        pendulum_patch(source)
 
 
 def test_a_run_that_cannot_be_used_cannot_be_held_out(tmp_path):

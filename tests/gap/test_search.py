@@ -9,8 +9,7 @@ from toy_problem import DECOYS, NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, si
 
 from wlr_gym.gap.analysis import EFFECT_FOUND, NOT_EXCITED, NOTHING_MISSING
 from wlr_gym.gap.estimation.fit import Fit, fit, linearise
-from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.estimation.model import nominal_model, total_cost, untouched
+from wlr_gym.gap.estimation.model import estimate_noise, nominal_model, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.report.text import NOTHING_CLEAR, sentence, title
 from wlr_gym.gap.selection import cross_validation, search
@@ -26,13 +25,21 @@ from wlr_gym.gap.selection.cross_validation import (
     without_each_run,
     worth_a_fit,
 )
-from wlr_gym.gap.selection.equivalence import EQUIVALENT, equivalents
-from wlr_gym.gap.selection.hypothesis import INSISTENT, Hypothesis
-from wlr_gym.gap.selection.outcomes import REFUTED, evidence_of
+from wlr_gym.gap.selection.hypothesis import EQUIVALENT, INSISTENT, Hypothesis, equivalents
 from wlr_gym.gap.selection.refit import refit
-from wlr_gym.gap.selection.screening import LEAST_GAIN, PER_UNKNOWN, Score, responses, screen
-from wlr_gym.gap.selection.search import MOST_EFFECTS, remove_redundant, search_effects
-from wlr_gym.gap.selection.shortlist import MORE_NAMES, PER_NAME, SHORTLIST, one_per_label, shortlist
+from wlr_gym.gap.selection.screening import (
+    LEAST_GAIN,
+    MORE_NAMES,
+    PER_NAME,
+    PER_UNKNOWN,
+    SHORTLIST,
+    Score,
+    one_per_label,
+    responses,
+    screen,
+    shortlist,
+)
+from wlr_gym.gap.selection.search import MOST_EFFECTS, REFUTED, evidence_of, remove_redundant, search_effects
 from wlr_gym.gap.validation.held_out import MOST_SEARCHES
 from wlr_gym.gap.workflow import analyse_problem
 

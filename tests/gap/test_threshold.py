@@ -7,11 +7,18 @@ import pytest
 from toy_problem import Toy, sized
 
 from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.likelihood import estimate_noise
-from wlr_gym.gap.estimation.model import nominal_model
-from wlr_gym.gap.selection.alternative import Products, rescored
-from wlr_gym.gap.selection.screening import LEAST_GAIN, LEAST_SHARE, PER_UNKNOWN, responses, screen
-from wlr_gym.gap.selection.threshold import acceptance_threshold, largest_by_chance
+from wlr_gym.gap.estimation.model import estimate_noise, nominal_model
+from wlr_gym.gap.selection.screening import (
+    LEAST_GAIN,
+    LEAST_SHARE,
+    PER_UNKNOWN,
+    Products,
+    acceptance_threshold,
+    largest_by_chance,
+    rescored,
+    responses,
+    screen,
+)
 
 RUNS = range(5)
 #: Rows of a run: 20 s.

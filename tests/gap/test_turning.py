@@ -11,10 +11,10 @@ from gap_examples import EFFECT_FOUND
 from toy_problem import Toy
 
 from wlr_gym.gap.analysis import UNKNOWN, Turning
-from wlr_gym.gap.report.folder import save_analysis
+from wlr_gym.gap.report.page import save_analysis
 from wlr_gym.gap.report.result import read_result
 from wlr_gym.gap.report.text import sentence
-from wlr_gym.gap.validation.turning import turning
+from wlr_gym.gap.validation.residual_tests import turning
 from wlr_gym.gap.workflow import analyse_problem
 
 RNG = np.random.default_rng(3)

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit, widened
-from wlr_gym.gap.estimation.least_squares import normal_equations
+from wlr_gym.gap.estimation.fit import fit, normal_equations, widened
 from wlr_gym.gap.estimation.model import nominal_model, on_bounds
 from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, estimates, half_widths, two_sided_95
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
-from wlr_gym.gap.selection.detectability import detectable
-from wlr_gym.gap.selection.equivalence import selection_frequency
-from wlr_gym.gap.selection.hypothesis import Hypothesis
-from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, least_gain, responses, screen
+from wlr_gym.gap.selection.hypothesis import Hypothesis, selection_frequency
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, detectable, least_gain, responses, screen
 from wlr_gym.gap.selection.search import search_effects
 
 RUNS = range(5)

@@ -8,7 +8,7 @@ from toy_problem import Toy, coloured
 
 from wlr_gym.gap.analysis import EFFECT_FOUND, NOTHING_MISSING
 from wlr_gym.gap.report.text import made_worse
-from wlr_gym.gap.validation.worse import worse_channels
+from wlr_gym.gap.validation.held_out import worse_channels
 
 RUNS = [0, 2, 3]
 ROWS = 1000

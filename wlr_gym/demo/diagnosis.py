@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data.replay import ChannelError, ReplayResult
     from wlr_gym.gap.analysis import Analysis
-    from wlr_gym.gap.report.entries import EffectEntry, GapEntry, Result, RunGapEntry
+    from wlr_gym.gap.report.result import EffectEntry, GapEntry, Result, RunGapEntry
     from wlr_gym.physics.effects.effect import PatchEffect
 
 NAME_TITLE = "4. What does the simulator lack?"
@@ -39,7 +39,7 @@ def name(demo: Demo, tell: Tell) -> Section:
     """Run the gap workflow on the measured runs, and nothing else."""
     from wlr_gym.gap import analyse
     from wlr_gym.gap.analysis import EFFECT_FOUND
-    from wlr_gym.gap.report.folder import REPORT_FILE
+    from wlr_gym.gap.report.page import REPORT_FILE
     from wlr_gym.gap.report.text import sentence
 
     if not demo.measured.is_dir():

@@ -150,7 +150,7 @@ class Place:
 class Relation:
     """A relation of the model, the law that explains most by acting there alone, and its predicted improvement.
 
-    See :mod:`wlr_gym.gap.report.relations`.
+    See :mod:`wlr_gym.gap.report.recommendation`.
     """
 
     name: str
@@ -231,7 +231,7 @@ class RunGap:
 class ChannelGap:
     """RMS residual of one channel over the held-out runs, in noise units; channels of a kind share a ``group``.
 
-    ``worse``: the effects make it significantly worse (:mod:`wlr_gym.gap.validation.worse`).
+    ``worse``: the effects make it significantly worse (:mod:`wlr_gym.gap.validation.held_out`).
     """
 
     channel: str
@@ -324,7 +324,7 @@ class Adequacy:
 
 @dataclass(frozen=True)
 class Turning:
-    """Part of a signal's residual is periodic in the angle of its joint; see :mod:`wlr_gym.gap.validation.turning`.
+    """Part of a signal's residual is periodic in the angle of its joint; see :mod:`wlr_gym.gap.validation.residual_tests`.
 
     Attributes:
         joint, signal: whose.
@@ -346,8 +346,8 @@ class Turning:
 class Threshold:
     """By how much an effect with one unknown had to improve the fit in a round of the search, and what chance alone gives.
 
-    ``by_chance``: 98 % of draws of chance have no larger improvement (:mod:`wlr_gym.gap.selection.threshold`); NaN = not drawn.
-    ``none``: probability that none of the refitted candidates is missing (:mod:`wlr_gym.gap.selection.evidence`).
+    ``by_chance``: 98 % of draws of chance have no larger improvement (:mod:`wlr_gym.gap.selection.screening`); NaN = not drawn.
+    ``none``: probability that none of the refitted candidates is missing (:mod:`wlr_gym.gap.selection.hypothesis`).
     """
 
     round: int

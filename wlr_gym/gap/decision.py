@@ -18,13 +18,10 @@ from wlr_gym.data.format import META_FILE
 from wlr_gym.data.read import read_meta, read_run, run_files
 from wlr_gym.data.replay import robot_of
 from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED
-from wlr_gym.gap.report.entries import Result
-from wlr_gym.gap.report.explanations import DECIDED, NOTHING, Explanation, explanations
-from wlr_gym.gap.report.result import RESULT_FILE, read_result
+from wlr_gym.gap.report.result import DECIDED, NOTHING, RESULT_FILE, Explanation, Result, explanations, read_result
 from wlr_gym.gap.robot.next_run import TELLS, driven_already, most_shown, motions_to_drive, promises
-from wlr_gym.gap.robot.open import LEAST_RUNS
-from wlr_gym.gap.robot.problem import MISFIT
-from wlr_gym.gap.validation.misfit import most_left
+from wlr_gym.gap.robot.problem import LEAST_RUNS, MISFIT
+from wlr_gym.gap.validation.held_out import most_left
 from wlr_gym.gap.workflow import Tell, analyse
 from wlr_gym.physics.effects import Patch, Source, load_patch
 

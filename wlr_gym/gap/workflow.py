@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -33,27 +33,18 @@ from wlr_gym.gap.analysis import (
     Turning,
 )
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
-from wlr_gym.gap.estimation.likelihood import mean_of_runs, mean_squares
-from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation.model import mean_of_runs, mean_squares, nominal_model
 from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
-from wlr_gym.gap.opened import named_robot, open_problem
 from wlr_gym.gap.problem import Candidate, Problem
-from wlr_gym.gap.report.recommendation import recommend, separating_run
-from wlr_gym.gap.report.relations import relations
-from wlr_gym.gap.selection.detectability import detectable
-from wlr_gym.gap.selection.equivalence import equivalents, selection_frequency
-from wlr_gym.gap.selection.hypothesis import INSISTENT
-from wlr_gym.gap.selection.outcomes import evidence_of, refuted_evidence
-from wlr_gym.gap.selection.search import SearchResult, search_effects
-from wlr_gym.gap.selection.threshold import chance
+from wlr_gym.gap.report.recommendation import recommend, relations, separating_run
+from wlr_gym.gap.selection.hypothesis import INSISTENT, equivalents, selection_frequency
+from wlr_gym.gap.selection.screening import chance, detectable
+from wlr_gym.gap.selection.search import SearchResult, evidence_of, refuted_evidence, search_effects
 from wlr_gym.gap.validation.data_split import informative_split, named_split
-from wlr_gym.gap.validation.held_out import compare_models, confirmed, noise_floor
-from wlr_gym.gap.validation.localisation import localise
-from wlr_gym.gap.validation.misfit import most_in, most_left
-from wlr_gym.gap.validation.residual_tests import adequacy_of
-from wlr_gym.gap.validation.traces import informative_traces
-from wlr_gym.gap.validation.turning import turning
-from wlr_gym.physics.effects import Source, load_patch
+from wlr_gym.gap.validation.held_out import compare_models, confirmed, most_in, most_left, noise_floor
+from wlr_gym.gap.validation.localisation import informative_traces, localise
+from wlr_gym.gap.validation.residual_tests import adequacy_of, turning
+from wlr_gym.physics.effects import Patch, Source, load_patch
 
 Array = NDArray[np.float64]
 #: Told of the present stage and of the share of the whole work that is done.
@@ -107,7 +98,7 @@ def analyse(
     if threads < 1:
         raise InputError(f"threads = {threads}: expected 1 or more")
     if out is not None:
-        from wlr_gym.gap.report.folder import check_folder
+        from wlr_gym.gap.report.page import check_folder
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
@@ -125,7 +116,7 @@ def analyse(
     if named := named_robot(data, rig, robot):
         done = replace(done, provenance={**done.provenance, "robot": named})
     if out is not None:
-        from wlr_gym.gap.report.folder import save_analysis
+        from wlr_gym.gap.report.page import save_analysis
 
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))
@@ -352,3 +343,67 @@ def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
         quantity.name: Calibrated(quantity.nominal, float(value), quantity.unit, quantity.sigma, float(half))
         for quantity, value, half in zip(problem.quantities, found.model.quantities, halves, strict=False)
     }
+
+
+# ---- opening ---------------------------------------------------------------------------------------------------------
+
+
+#: Kinds of rigs.
+RIGS = ("pendulum",)
+#: Ending of the file of a rig of one's own.
+OWN_RIG = ".py"
+
+
+def open_problem(
+    data: str | Path, known: Source, rig: str | Path | None, backend: str, threads: int, robot: str | Path | None
+) -> tuple[Patch, Problem | None, list[IntakeFinding]]:
+    """Return what is known already, the problem (None where the data are too bad to go on), and what was noticed.
+
+    For the arguments and errors see :func:`wlr_gym.gap.workflow.analyse`.
+    """
+    patch = known_patch(known, rig)
+    if rig is None:
+        from wlr_gym.gap.robot.problem import open_robot
+
+        return patch, *open_robot(data, patch, backend, threads, robot)
+    if rig in RIGS:
+        from wlr_gym.gap.rig.pendulum import open_pendulum
+
+        return patch, *open_pendulum(data, patch)
+    from wlr_gym.gap.rig.own import load_rig, open_own_rig
+
+    return patch, *open_own_rig(data, load_rig(rig), patch.effects)
+
+
+def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | None) -> str | None:
+    """Return what ``--robot`` takes for the robot that is analysed; None = nothing names it, or it is a rig."""
+    from wlr_gym.data.read import read_meta
+    from wlr_gym.data.robot_file import names_file, shipped_robots
+
+    if rig is not None:
+        return None
+    if robot is not None:
+        return str(robot)
+    named = read_meta(data).robot
+    if named is None:
+        return None
+    return str(Path(data) / named) if names_file(named) else shipped_robots()[named].stem
+
+
+def known_patch(known: Source, rig: str | Path | None) -> Patch:
+    """Return the effects given as known, in the vocabulary of the robot or of the rig.
+
+    Raises:
+        InputError: an effect that it does not have, or a rig that does not exist.
+    """
+    if rig is None:
+        return load_patch(known)
+    if rig in RIGS:
+        from wlr_gym.gap.rig.pendulum import pendulum_patch
+
+        return pendulum_patch(known)
+    if Path(rig).suffix != OWN_RIG:
+        raise unknown_name("rig", str(rig), RIGS)
+    from wlr_gym.gap.rig.own import load_rig, own_patch
+
+    return own_patch(known, load_rig(rig))

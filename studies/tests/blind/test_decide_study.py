@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.read import read_run
-from wlr_gym.gap.report.entries import Result
+from wlr_gym.gap.report.result import Result
 
 decision = importlib.import_module("wlr_gym.gap.decision")
 EMPTY = {"equivalent": [], "calibration": {}, "localisation": {}, "gap": None, "patch": "patch.yaml"}

@@ -19,7 +19,7 @@ from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import record_simulation
 from wlr_gym.envs.tasks import load_randomization
 from wlr_gym.gap.decision import HISTORY_FILE, Decided, History, Recorded
-from wlr_gym.gap.report.entries import Result
+from wlr_gym.gap.report.result import Result
 from wlr_gym.learning.adaptation import driving, retraining, uncertainty
 from wlr_gym.learning.adaptation.adapt import state_uncertainty
 from wlr_gym.learning.adaptation.driving import EmulatedRobot

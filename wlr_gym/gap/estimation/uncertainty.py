@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from wlr_gym.gap.analysis import ParameterEstimate
-from wlr_gym.gap.estimation.fit import PINNED, Fit
-from wlr_gym.gap.estimation.least_squares import equations_by_run
+from wlr_gym.gap.estimation.fit import PINNED, Fit, equations_by_run
 from wlr_gym.gap.estimation.model import on_bounds, prior_tightness, scaled_nominal, scaled_numbers, scales
 from wlr_gym.gap.problem import Candidate, Problem
 

@@ -1,4 +1,4 @@
-"""The report of an analysis: one HTML page with its pictures inside, for an engineer who never saw the tool."""
+"""The report of an analysis: one HTML page with its pictures inside, for an engineer who never saw the tool; and its folder."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from pathlib import Path
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder, replace_file, require_output_place, write_text
 from wlr_gym.base.html import commands, document, folded, heading, pictures_of, section, table
-from wlr_gym.base.text import duration, number
+from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
+from wlr_gym.base.text import counted, duration, number
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -19,20 +21,25 @@ from wlr_gym.gap.analysis import (
     NO_PROFILE,
     NOT_EXCITED,
     NOTHING_MISSING,
+    REJECTED,
+    SELECTED,
     UNKNOWN,
     Adequacy,
     Analysis,
     Calibrated,
     ChannelGap,
     Detectable,
+    Evidence,
+    FoundEffect,
     GapFigures,
     IntakeFinding,
     RunGap,
     Statistic,
 )
-from wlr_gym.gap.report.evidence import evidence_section
+from wlr_gym.gap.problem import Range
+from wlr_gym.gap.report.plots import draw
 from wlr_gym.gap.report.recommendation import record_commands
-from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of
+from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of, read_result, result_of, write_result
 from wlr_gym.gap.report.text import (
     adequacy,
     below_floor,
@@ -40,6 +47,7 @@ from wlr_gym.gap.report.text import (
     channel,
     closure,
     error,
+    estimate,
     interval,
     listed,
     made_worse,
@@ -53,7 +61,7 @@ from wlr_gym.gap.report.text import (
     unit_of,
 )
 from wlr_gym.gap.validation.held_out import LEAST_FOR_INTERVAL
-from wlr_gym.physics.effects import EFFECTS, load_patch
+from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, load_patch
 from wlr_gym.robot.parameter_table import TABLE
 
 _COLOURS = {
@@ -395,3 +403,158 @@ def _footer(analysis: Analysis) -> str:
     origin = [f"{key}: {value}" for key, value in analysis.provenance.items() if isinstance(value, str | int | float)]
     made = "; ".join([f"Made by wlr gap {__version__}", *origin])
     return f"<footer><p>{escape(f'{total}{made}.')}</p></footer>"
+
+
+# ---- what is missing -------------------------------------------------------------------------------------------------
+
+
+def evidence_section(analysis: Analysis, picture: str) -> str:
+    """Return what was found, what the data cannot distinguish it from, and every candidate; ``picture`` is HTML."""
+    parts = [_effect(effect) for effect in analysis.effects]
+    if analysis.equivalent:
+        rows = [(listed([plain(name) for name in group.names], "or"), group.separating_run) for group in analysis.equivalent]
+        parts += [heading("Effects not distinguishable in these data"), table(("one of", "discriminating experiment"), rows)]
+    if analysis.evidence:
+        rounds = sorted({one.round for one in analysis.evidence})
+        parts += [heading("Candidates compared"), _COMPARED, picture]
+        none = {one.round: one.none for one in analysis.thresholds}
+        for turn in rounds:
+            parts.append(_evidence([one for one in analysis.evidence if one.round == turn], turn, none.get(turn, math.nan)))
+    return section("What", *parts)
+
+
+_COMPARED = """<p>Every candidate was scored by its <i>predicted</i> improvement of the calibrated model (score test, a linear
+estimate). The best were added and refitted together with all calibrated parameters: their <i>gain</i> is the fall of minus two
+log posterior, of which chance alone gives about 1 for each fitted number. Their
+<i>probability</i> is among all that were refitted and none of them. One effect is selected per round, then the search starts
+again.</p>"""
+
+
+def _effect(effect: FoundEffect) -> str:
+    known = None if effect.doc else EFFECTS.get(effect.name)
+    doc = known.doc if known else effect.doc
+    meaning = f"What is missing: {doc}." if doc else "Nothing in the library explains it."
+    law = effect.formula or (known.equation if known else "")
+    unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
+    rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
+    return "\n".join(
+        [
+            heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
+            f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
+            f"</code>. Selection frequency {percent(effect.confidence)}.</p>",
+            f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
+            *([f"<p>Tried where {_tried(effect.validity)}; beyond, it is untested.</p>"] if effect.validity else []),
+            table(("parameter", "value (95 % interval)"), rows),
+        ]
+    )
+
+
+def _tried(validity: Mapping[str, Range]) -> str:
+    texts = [f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in validity.items()]
+    return escape(listed(texts, "and"))
+
+
+def _evidence(evidence: Sequence[Evidence], turn: int, none: float) -> str:
+    """The candidates of one round; ``none``: probability that none of them is missing."""
+    fitted = sorted((one for one in evidence if one.outcome != REJECTED), key=_rank)
+    rows = [
+        (
+            plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), percent(one.probability),
+            one.outcome, one.reason,
+        )
+        for one in fitted
+    ]  # fmt: skip
+    screened = [one for one in evidence if one.outcome == REJECTED]
+    screened.sort(key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
+    rejected = [(plain(one.name), places(one.where), number(max(one.screened, 0.0)), one.reason) for one in screened]
+    classes = ["selected" if one.outcome == SELECTED else "" for one in fitted]
+    return "\n".join(
+        [
+            heading(f"Round {turn}: {counted(len(fitted), 'candidate')} refitted"),
+            table(
+                ("candidate", "where", "values", "gain", "predicted", "probability", "outcome", "reason"),
+                rows,
+                {3, 4, 5},
+                classes,
+            ),
+            f"<p>Probability that none of them is missing: {percent(none)}.</p>" if math.isfinite(none) else "",
+            folded(
+                f"{counted(len(rejected), 'effect')} rejected at screening",
+                table(("effect", "where it would gain most", "predicted", "reason"), rejected, {2}),
+            ),
+        ]
+    )
+
+
+def _rank(one: Evidence) -> tuple[bool, float]:
+    """Order of the fitted: the selected one, then by gain."""
+    return one.outcome != SELECTED, -one.gain if math.isfinite(one.gain) else math.inf
+
+
+def _values(one: Evidence) -> str:
+    known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
+    units = {name: spec.unit for name, spec in known.items()} | dict(one.units)
+    return ", ".join(f"{name} {number(value)}{unit_of(units.get(name, ''))}" for name, value in one.values.items())
+
+
+# ---- the folder ------------------------------------------------------------------------------------------------------
+
+
+REPORT_FILE = "report.html"
+#: Folder of the pictures.
+PLOTS = "plots"
+_OWN = {RESULT_FILE, PATCH_FILE, REPORT_FILE, PLOTS, CONFIG_FILE, PROVENANCE_FILE}
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse, before the work, a folder that the results cannot go into; nothing is made.
+
+    Raises:
+        InputError: a file, a folder without rights, or one with contents that no earlier analysis wrote.
+    """
+    if folder.is_dir():
+        _require_own(folder)
+    require_output_place(folder)
+
+
+def _require_own(folder: Path) -> None:
+    there = sorted(path.name for path in folder.iterdir())
+    strange = [name for name in there if name not in _OWN] or ([] if _is_analysis(folder) else there)
+    if strange:
+        raise InputError(f"--out {folder}: '{strange[0]}' in it is not of an analysis; expected a new folder or an earlier one")
+
+
+def _is_analysis(folder: Path) -> bool:
+    """Whether an analysis wrote a folder: files of these names alone may be anybody's."""
+    if not (folder / RESULT_FILE).exists():  # one that was interrupted, before anything but pictures was there
+        return (folder / PROVENANCE_FILE).exists() or not any((folder / name).exists() for name in (PATCH_FILE, CONFIG_FILE))
+    try:
+        read_result(folder / RESULT_FILE)
+    except InputError:
+        return False
+    return True
+
+
+def save_analysis(analysis: Analysis, folder: Path) -> Path:
+    """Write report, pictures, patch and result into ``folder``, and return the path of the result.
+
+    Everything is made before anything is written, and ``result.json`` comes last: a folder that holds one is whole.
+
+    Raises:
+        InputError: see :func:`check_folder`, or a folder that cannot be written to.
+    """
+    check_folder(folder)
+    result_of(analysis)
+    pictures = draw(analysis)
+    page = report(analysis, pictures, folder)
+    make_output_folder(folder / PLOTS)
+    # the provenance stays until there is a result: it tells whose the folder is
+    for stale in (RESULT_FILE, PATCH_FILE, CONFIG_FILE):
+        (folder / stale).unlink(missing_ok=True)
+    for stale in (folder / PLOTS).glob("*.png"):
+        if stale.stem.rstrip("_0123456789") in CAPTIONS:
+            stale.unlink()
+    for name, picture in pictures.items():
+        replace_file(folder / PLOTS / f"{name}.png", lambda temporary, picture=picture: temporary.write_bytes(picture))
+    write_text(folder / REPORT_FILE, page)
+    return write_result(analysis, folder)

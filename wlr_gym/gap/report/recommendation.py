@@ -1,4 +1,9 @@
-"""What to record next: the excitation that shows what these data could not, or distinguishes equivalent effects."""
+"""What a report says beyond the fits: what to record next, and which relation of the model could hold the gap.
+
+Excitations are recommended that show what these data could not, or distinguish equivalent effects. A relation is a joint's
+torque, a wheel's contact, a length, a time, a sensor: laws that act on one alone are tried on each, and the score of a relation
+is the predicted improvement by its best law (:mod:`wlr_gym.gap.selection.screening`).
+"""
 
 from __future__ import annotations
 
@@ -6,10 +11,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.data.format import Profile
-from wlr_gym.gap.analysis import EFFECT_FOUND, Equivalent, Recommendation
+from wlr_gym.gap.analysis import EFFECT_FOUND, Equivalent, Recommendation, Relation
+from wlr_gym.gap.problem import Candidate
+from wlr_gym.gap.report.text import places
 from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
 from wlr_gym.gap.selection.search import Round
-from wlr_gym.robot import LEGS
+from wlr_gym.physics.effects import EFFECTS
+from wlr_gym.robot import JOINTS, LEGS
 
 _FRICTION = frozenset({"coulomb_friction", "viscous_friction", "stribeck_friction", "load_dependent_friction"})
 _PULL = frozenset({"floor_slope", "external_force", "tether"})
@@ -163,3 +172,34 @@ def record_commands(excitations: Iterable[str]) -> list[str]:
     return [
         f"wlr record --excitation {' '.join(names)} --out {out}" for out, names in zip(folders, alike.values(), strict=True)
     ]
+
+
+# ---- relations -------------------------------------------------------------------------------------------------------
+
+
+#: What effects outside the library change.
+_TORQUE = "torque in the {}"
+
+
+def relation_of(candidate: Candidate) -> str | None:
+    """Return the relation that a candidate changes, in words; None where it changes several places at once."""
+    effect = EFFECTS.get(candidate.name)
+    search = None if effect is None else effect.search
+    if len(candidate.where) != 1:
+        at_all_places = effect is not None and candidate.where == effect.where
+        return (search.relation_of_all or None) if search is not None and at_all_places else None
+    where = places(candidate.where)
+    if candidate.formula and candidate.where[0] not in JOINTS:
+        return where
+    return (_TORQUE if search is None else search.relation).format(where)
+
+
+def relations(scores: Sequence[Score]) -> tuple[Relation, ...]:
+    """Return the relations in which a law could explain more than chance, the best one of each, strongest first."""
+    best: dict[str, Score] = {}
+    for score in scores:
+        relation = relation_of(score.candidate)
+        if relation is not None and score.gain > max(LEAST_GAIN, best[relation].gain if relation in best else 0.0):
+            best[relation] = score
+    found = [Relation(relation, score.candidate.name, score.candidate.formula, score.gain) for relation, score in best.items()]
+    return tuple(sorted(found, key=lambda one: -one.gain))

@@ -1,29 +1,273 @@
 """The result file of an analysis, ``result.json``, and the patch that adds what was found to the model, ``patch.yaml``.
 
-The models of :mod:`wlr_gym.gap.report.entries` are the format: what is written has passed them, and :func:`read_result`
-checks a file against them. Keys that other versions add are kept.
+The models of this module, :class:`Result` and its parts, are the format: what is written has passed them, and
+:func:`read_result` checks a file against them. Keys that other versions add are kept. :func:`explanations` says what a result
+leaves open: the names that its data do not distinguish, and "nothing more".
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
-from wlr_gym.gap.analysis import Adequacy, Analysis, Calibrated, Evidence, FoundEffect, GapFigures, ParameterEstimate, Statistic
-from wlr_gym.gap.report.entries import Result, finite
+from wlr_gym.base.settings import SettingsModel
+from wlr_gym.gap.analysis import (
+    EQUIVALENT,
+    FAILS_CROSS_VALIDATION,
+    REMOVED,
+    SELECTED,
+    TOO_LITTLE,
+    WORSE_FIT,
+    Adequacy,
+    Analysis,
+    Calibrated,
+    FoundEffect,
+    Statistic,
+)
 from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
 from wlr_gym.physics.plants.forces import COORDINATES
+
+
+def finite(value: Any) -> Any:
+    """JSON has no NaN: a number that is none becomes null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+MaybeNumber = Annotated[float | None, BeforeValidator(finite)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Interval = tuple[Number, Number]
+
+
+class _Entry(SettingsModel):
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="allow", allow_inf_nan=True)
+
+
+class ParameterEntry(_Entry):
+    """A fitted parameter of an effect; ``ci95`` is null where the data give none."""
+
+    value: Number
+    ci95: Interval | None
+    unit: str
+
+    @model_validator(mode="after")
+    def _inside(self) -> ParameterEntry:
+        if self.ci95 is not None and not self.ci95[0] <= self.value <= self.ci95[1]:
+            raise ValueError(f"value {self.value:g} is not within its ci95 {list(self.ci95)}")
+        return self
+
+
+class RangeEntry(_Entry):
+    """Lowest and highest value of what a formula reads, in the fitted runs."""
+
+    range: Interval
+    unit: str
+
+
+class EffectEntry(_Entry):
+    """One missing effect.
+
+    ``confidence`` is its selection frequency; ``formula`` is text with units, of unknown effects only, ``validity`` where
+    it was tried.
+    """
+
+    name: str
+    where: list[str]
+    parameters: dict[str, ParameterEntry]
+    confidence: Share
+    gain: MaybeNumber = None
+    formula: str | None = None
+    validity: dict[str, RangeEntry] = Field(default_factory=dict)
+
+
+class CalibrationEntry(_Entry):
+    """A calibrated parameter; ``sigma`` is its tolerance."""
+
+    nominal: Number
+    fitted: Number
+    unit: str
+    sigma: MaybeNumber = None
+    ci95: Interval | None = None
+
+
+class LocalisationEntry(_Entry):
+    """Where the gap is."""
+
+    share_of_gap: Share
+    state_dependence: str
+
+
+class GapEntry(_Entry):
+    """The gap: rms error of replayed runs, 1.0 = sensor noise.
+
+    ``reduction`` lies in 0..1; ``reduction_signed`` is negative where the effects make held-out runs worse, and null where
+    calibration leaves nothing to remove and in results of versions without it. The interval is that of
+    ``reduction_signed``, null where held-out runs are too few. ``cap``: what a reading counts at most.
+    """
+
+    metric: str
+    fit_before: MaybeNumber
+    fit_after: MaybeNumber
+    heldout_before: MaybeNumber
+    heldout_calibrated: MaybeNumber
+    heldout_after: MaybeNumber
+    noise_floor: MaybeNumber
+    reduction: Share
+    reduction_signed: Annotated[float | None, Field(le=1.0), BeforeValidator(finite)] = None
+    reduction_ci95: tuple[MaybeNumber, MaybeNumber] | None
+    cap: MaybeNumber = None
+
+
+class RelationEntry(_Entry):
+    """A relation of the model and the predicted improvement of the best law there, as a fall of minus two log posterior."""
+
+    name: str
+    law: str
+    formula: str
+    gain: Number
+
+
+class RunGapEntry(_Entry):
+    """Error of one run: of the model as given, calibrated, and with all effects; ``reduction``: the share that they remove."""
+
+    run: str
+    heldout: bool
+    before: MaybeNumber = None
+    calibrated: MaybeNumber = None
+    after: MaybeNumber
+    reduction: MaybeNumber = None
+
+
+class RunsEntry(_Entry):
+    """Names of the runs that were fitted to, and of the held-out ones."""
+
+    fit: list[str]
+    heldout: list[str]
+
+
+class DetectableEntry(_Entry):
+    """Smallest severity of an effect that the data would have shown; null: none that is plausible."""
+
+    parameter: str
+    value: MaybeNumber
+    unit: str
+
+
+class StatisticEntry(_Entry):
+    """A statistic of what the final model leaves in the fitted runs, beside the same of runs that it made itself.
+
+    ``expected`` is their median, ``limit`` their 95 % quantile, ``p`` the share of them, the observed ones counted in, that is
+    as large, ``ratio`` value over expected.
+    """
+
+    value: MaybeNumber
+    expected: MaybeNumber
+    limit: MaybeNumber
+    p: MaybeNumber
+    ratio: MaybeNumber
+
+
+class ByChannelEntry(StatisticEntry):
+    """A statistic over all channels, and of each."""
+
+    channels: dict[str, StatisticEntry]
+
+
+class PulledEntry(StatisticEntry):
+    """By how many standard errors one run pulls a number away from the other runs: the largest there is."""
+
+    number: str
+    run: str
+
+
+class ConstancyEntry(StatisticEntry):
+    """Scatter of the runs' estimates of the model's numbers, over what their rows predict."""
+
+    pulled_most: PulledEntry
+
+
+class TurningEntry(_Entry):
+    """A signal's residual is periodic in its joint's angle; ``amplitude``: noise units, ``confidence``: selection frequency."""
+
+    joint: str
+    signal: str
+    order: int
+    share: float
+    amplitude: float
+    confidence: float
+
+
+class AdequacyEntry(_Entry):
+    """Whether the final model is adequate: information, no decision. ``replicates`` sets of runs were made by it."""
+
+    replicates: int
+    level: ByChannelEntry
+    whiteness: ByChannelEntry
+    constancy: ConstancyEntry
+
+
+class EvidenceEntry(_Entry):
+    """One candidate in one round of the search, and its outcome; see :class:`wlr_gym.gap.analysis.Evidence`."""
+
+    round: int
+    name: str
+    where: list[str]
+    values: dict[str, MaybeNumber]
+    outcome: str
+    probability: Share = 0.0
+    formula: str = ""
+    units: dict[str, str] = Field(default_factory=dict)
+
+
+class ThresholdEntry(_Entry):
+    """One round of the search; ``none``: probability that none of its candidates is missing."""
+
+    round: int
+    none: MaybeNumber = None
+
+
+class RecommendationEntry(_Entry):
+    """A run to record next."""
+
+    excitation: str
+    why: str
+
+
+class Result(_Entry):
+    """Contents of ``result.json``."""
+
+    verdict: Literal["bad_data", "not_excited", "nothing_missing", "effect_found", "unknown_effect"]
+    summary: str = ""
+    effects: list[EffectEntry]
+    equivalent: list[list[str]]
+    separating_runs: list[str] = Field(default_factory=list)
+    calibration: dict[str, CalibrationEntry]
+    localisation: dict[str, LocalisationEntry]
+    relations: list[RelationEntry] = Field(default_factory=list)
+    gap: GapEntry | None
+    run_gaps: list[RunGapEntry] = Field(default_factory=list)
+    runs: RunsEntry
+    patch: str
+    detectable: dict[str, DetectableEntry] = Field(default_factory=dict)
+    closure: str = ""
+    turning: TurningEntry | None = None
+    evidence: list[EvidenceEntry] = Field(default_factory=list)
+    thresholds: list[ThresholdEntry] = Field(default_factory=list)
+    recommendations: list[RecommendationEntry] = Field(default_factory=list)
+    adequacy: AdequacyEntry | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel
+
 
 RESULT_FILE = "result.json"
 PATCH_FILE = "patch.yaml"
@@ -63,30 +307,29 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
         ValueError: a number that makes no sense, such as a share above 1.
     """
     places = sorted(analysis.localisation, key=lambda place: -place.share)
+    gap, as_it_is = analysis.gap, (
+        "calibration", "relations", "detectable", "turning", "evidence", "thresholds", "run_gaps", "channel_gaps", "intake",
+        "recommendations", "known_effects", "seconds",
+    )  # fmt: skip
     content = {
+        **{name: getattr(analysis, name) for name in as_it_is},
         "verdict": analysis.verdict,
         "summary": sentence(analysis),
+        "closure": closure(analysis),
         "effects": [_effect(effect) for effect in analysis.effects],
-        "equivalent": [list(group.names) for group in analysis.equivalent],
+        "equivalent": [group.names for group in analysis.equivalent],
         "separating_runs": [group.separating_run for group in analysis.equivalent],
         "calibration": {name: _calibrated(moved) for name, moved in analysis.calibration.items()},
         "localisation": {p.name: {"share_of_gap": p.share, "state_dependence": p.dependence} for p in places},
-        "relations": [dict(vars(one)) for one in analysis.relations],
-        "gap": None if analysis.gap is None else _gap(analysis.gap),
-        "runs": {"fit": list(analysis.fit_runs), "heldout": list(analysis.heldout_runs)},
+        "gap": gap and {
+            **vars(gap),
+            "reduction": min(max(gap.reduction, 0.0), 1.0) if math.isfinite(gap.reduction) else 0.0,
+            "reduction_signed": gap.reduction,
+            "reduction_ci95": gap.reduction_ci95 if all(map(math.isfinite, gap.reduction_ci95)) else None,
+        },
+        "runs": {"fit": analysis.fit_runs, "heldout": analysis.heldout_runs},
         "patch": str(patch),
-        "detectable": {name: dict(vars(one)) for name, one in analysis.detectable.items()},
-        "closure": closure(analysis),
-        "turning": None if analysis.turning is None else dict(vars(analysis.turning)),
-        "evidence": [_evidence(one) for one in analysis.evidence],
-        "thresholds": [dict(vars(one)) for one in analysis.thresholds],
-        "run_gaps": [dict(vars(one)) for one in analysis.run_gaps],
-        "channel_gaps": [dict(vars(one)) for one in analysis.channel_gaps],
-        "intake": [dict(vars(one)) for one in analysis.intake],
-        "recommendations": [dict(vars(one)) for one in analysis.recommendations],
-        "adequacy": None if analysis.adequacy is None else _adequacy(analysis.adequacy),
-        "known_effects": [dict(known) for known in analysis.known_effects],
-        "seconds": dict(analysis.seconds),
+        "adequacy": analysis.adequacy and _adequacy(analysis.adequacy),
         "provenance": {
             "made_by": MADE_BY, "data": analysis.data, "date": _today(), "version": __version__, **analysis.provenance
         },
@@ -108,73 +351,56 @@ def write_result(analysis: Analysis, folder: Path) -> Path:
 
 
 def _effect(effect: FoundEffect) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "name": effect.name,
-        "where": list(effect.where),
-        "parameters": {name: _parameter(found) for name, found in effect.parameters.items()},
-        "confidence": effect.confidence,
-        "gain": effect.gain,
-        "formula": _formula(effect) if effect.formula else None,
-        "validity": {name: {"range": [one.low, one.high], "unit": one.unit} for name, one in effect.validity.items()},
-    }
-    return entry
-
-
-def _parameter(found: ParameterEstimate) -> dict[str, Any]:
-    known = math.isfinite(found.low) and math.isfinite(found.high)
-    interval = [min(found.low, found.value), max(found.high, found.value)] if known else None
-    return {"value": found.value, "ci95": interval, "unit": found.unit}
-
-
-def _formula(effect: FoundEffect) -> str:
-    """Return the formula with the units of its force and its constants: ``-k * leg_angle N m; k in N m/rad``."""
+    """An effect; its formula with the units of its force and its constants: ``-k * leg_angle N m; k in N m/rad``."""
     force = unit_of(COORDINATES.get(effect.where[0], "")) if effect.where else ""
     constants = [f"{name} in {'1' if unit == '-' else unit}" for name, unit in effect.units.items()]
-    return "; ".join([effect.formula + force, *constants])
+    return {
+        "name": effect.name,
+        "where": effect.where,
+        "parameters": {
+            name: {
+                "value": one.value,
+                "ci95": _interval(min(one.low, one.value), max(one.high, one.value)) if math.isfinite(one.low) else None,
+                "unit": one.unit,
+            }
+            for name, one in effect.parameters.items()
+        },
+        "confidence": effect.confidence,
+        "gain": effect.gain,
+        "formula": "; ".join([effect.formula + force, *constants]) if effect.formula else None,
+        "validity": {name: {"range": [one.low, one.high], "unit": one.unit} for name, one in effect.validity.items()},
+    }
 
 
 def _calibrated(moved: Calibrated) -> dict[str, Any]:
-    half = moved.uncertainty
-    interval = [moved.fitted - half, moved.fitted + half] if math.isfinite(half) else None
+    interval = _interval(moved.fitted - moved.uncertainty, moved.fitted + moved.uncertainty)
     return {
         "nominal": moved.nominal, "fitted": moved.fitted, "unit": moved.unit, "sigma": moved.sigma, "ci95": interval
     }  # fmt: skip
 
 
-def _gap(gap: GapFigures) -> dict[str, Any]:
-    known = all(map(math.isfinite, gap.reduction_ci95))
-    share = min(max(gap.reduction, 0.0), 1.0) if math.isfinite(gap.reduction) else 0.0
-    interval = list(gap.reduction_ci95) if known else None
-    return {**vars(gap), "reduction": share, "reduction_signed": gap.reduction, "reduction_ci95": interval}
+def _interval(low: float, high: float) -> list[float] | None:
+    return [low, high] if math.isfinite(low) and math.isfinite(high) else None
 
 
 def _adequacy(found: Adequacy) -> dict[str, Any]:
-    pulled = {"number": found.pulled.number, "run": found.pulled.run, **_statistic(found.pulled.errors)}
-    by_channel = [{name: _statistic(both[k]) for name, both in found.channels.items()} for k in (0, 1)]
+    def told(one: Statistic, **more: Any) -> dict[str, Any]:
+        return {**vars(one), "ratio": one.ratio, **more}
+
+    levels, whites = ({name: told(both[k]) for name, both in found.channels.items()} for k in (0, 1))
+    pulled = told(found.pulled.errors, number=found.pulled.number, run=found.pulled.run)
     return {
         "replicates": found.replicates,
-        "level": {**_statistic(found.level), "channels": by_channel[0]},
-        "whiteness": {**_statistic(found.whiteness), "channels": by_channel[1]},
-        "constancy": {**_statistic(found.constancy), "pulled_most": pulled},
-    }
-
-
-def _statistic(found: Statistic) -> dict[str, float]:
-    return {**vars(found), "ratio": found.ratio}
-
-
-def _evidence(one: Evidence) -> dict[str, Any]:
-    return {
-        **vars(one),
-        "where": list(one.where),
-        "values": dict(one.values),
-        "by_run": dict(one.by_run),
-        "units": dict(one.units),
+        "level": told(found.level, channels=levels),
+        "whiteness": told(found.whiteness, channels=whites),
+        "constancy": told(found.constancy, pulled_most=pulled),
     }
 
 
 def _plain(value: Any) -> Any:
-    """Return nested mappings and sequences of plain JSON types; what is not finite becomes null outside required numbers."""
+    """Return nested records, mappings and sequences of plain JSON types; what is not finite becomes null."""
+    if is_dataclass(value):
+        return _plain(vars(value))
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -209,3 +435,80 @@ def read_result(path: str | Path) -> Result:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"])) or "content"
         raise InputError(f"{path}: {place}: {first['msg']}") from None
+
+
+# ---- what a result leaves open ---------------------------------------------------------------------------------------
+
+
+#: Probability from which on a name is decided.
+DECIDED = 0.95
+#: Name of the explanation that adds nothing to the effects found before.
+NOTHING = "nothing"
+#: Outcomes that further runs can change: what needs an implausible size, or less than tolerances allow, they do not.
+_OPEN = frozenset({SELECTED, EQUIVALENT, WORSE_FIT, TOO_LITTLE, FAILS_CROSS_VALIDATION})
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """One way to explain the runs.
+
+    Attributes:
+        name: of the effect in question, or :data:`NOTHING`.
+        probability: among all explanations of its round.
+        effects: of the whole model, those found in earlier rounds included.
+    """
+
+    name: str
+    probability: float
+    effects: tuple[PatchEffect, ...]
+
+
+def explanations(result: Result) -> tuple[Explanation, ...]:
+    """Return the explanations in play, most probable first; one where the runs distinguish it, none without an analysis.
+
+    They are those of the first round of the search in which no name alone has 95 %, or names are equivalent: the smallest set
+    of names that has 95 %, nothing among them, what was selected, and what is equivalent to it (probabilities know nothing of
+    what simulators cannot reproduce). Once an effect was found, a round that adds nothing is decided.
+    """
+    added: tuple[PatchEffect, ...] = ()
+    found: list[Explanation] = []
+    for threshold in result.thresholds:
+        entries = [one for one in result.evidence if one.round == threshold.round and one.outcome in _OPEN]
+        selected = next((one for one in entries if one.outcome == SELECTED), None)
+        if any(one.outcome == REMOVED for one in result.evidence if one.round == threshold.round):
+            continue
+        if selected is None and added:
+            break
+        found = _of_round(entries, threshold.none or 0.0, added)
+        if selected is None or len(found) > 1:
+            break
+        added = found[0].effects
+    return tuple(found)
+
+
+def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[PatchEffect, ...]) -> list[Explanation]:
+    best: dict[str, EvidenceEntry] = {}
+    total: dict[str, float] = {NOTHING: nothing}
+    for entry in sorted(entries, key=lambda one: -one.probability):
+        best.setdefault(entry.name, entry)
+        total[entry.name] = total.get(entry.name, 0.0) + entry.probability
+    whole = sum(total.values()) or 1.0
+    ranked = [
+        Explanation(name, share / whole, (*added, _added_effect(best[name])) if name in best else added)
+        for name, share in sorted(total.items(), key=lambda one: -one[1])
+    ]
+    chosen = next((entry.name for entry in entries if entry.outcome == SELECTED), NOTHING)
+    rivals = {entry.name for entry in entries if entry.outcome == EQUIVALENT}
+    if ranked[0].name == chosen and ranked[0].probability >= DECIDED and not rivals:
+        return ranked[:1]
+    reached, credible = 0.0, set()
+    for one in ranked:
+        if reached < DECIDED:
+            credible.add(one.name)
+        reached += one.probability
+    return [one for one in ranked if one.name in credible | rivals | {chosen}]
+
+
+def _added_effect(entry: EvidenceEntry) -> PatchEffect:
+    values = {name: value for name, value in entry.values.items() if value is not None}
+    return PatchEffect(entry.name, tuple(entry.where), values, entry.formula, entry.units)

@@ -22,7 +22,7 @@ from wlr_gym.gap.analysis import (
     Statistic,
     Turning,
 )
-from wlr_gym.gap.validation.misfit import most_in, most_left
+from wlr_gym.gap.validation.held_out import most_in, most_left
 from wlr_gym.physics.effects import UNKNOWN_EFFECT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.robot import CORNER_NAMES, CORNERS, LEGS, WHEELS

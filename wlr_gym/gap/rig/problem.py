@@ -1,173 +1,318 @@
-"""Recordings of the test rig as a :class:`wlr_gym.gap.problem.Problem`."""
+"""A rig as a :class:`wlr_gym.gap.problem.Problem`: windows, residuals, first guesses and patches, whatever simulates it.
+
+:class:`RigProblem` is what all rigs share; how a model is simulated is its subclasses' to say: a system of one's own
+(:mod:`wlr_gym.gap.rig.own`), and one servo that swings a pendulum (:mod:`wlr_gym.gap.rig.pendulum`).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.checks import check_name
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.random import generator
-from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
-from wlr_gym.gap.rig.candidates import rig_candidates
-from wlr_gym.gap.rig.formula import lanes_read, rig_force
-from wlr_gym.gap.rig.kernel import OUTPUTS
-from wlr_gym.gap.rig.model import QUANTITIES, model_of
-from wlr_gym.gap.rig.recording import Recording
-from wlr_gym.gap.rig.replay import Replay
-from wlr_gym.gap.validation.data_split import HELD_OUT_SHARE
-from wlr_gym.physics.effects.effect import PatchEffect
+from wlr_gym.base.paths import find_config
+from wlr_gym.base.settings import read_yaml
+from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, Start, Unknown
+from wlr_gym.physics.codegen.expression import finite_number
+from wlr_gym.physics.effects import UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source, compose
+from wlr_gym.physics.effects.effect import Change, Guess
+from wlr_gym.robot.parameter_table import range_in_words
 
 Array = NDArray[np.float64]
 
-#: One sigma of the encoder, rad: one of 4096 counts per turn, for rounding and for what a magnetic encoder adds to it.
-ENCODER_NOISE = 2 * math.pi / 4096
-#: Noise units that every residual of a simulation that broke down counts: more than two turns.
+#: Runs that an analysis needs: two to fit, one to hold out.
+LEAST_RUNS = 3
+#: Noise units that every residual of a simulation that broke down counts: more than two turns of a servo.
 LOST = 1e4
-#: Signal -> s of free simulation before it starts again from the measured state; None = the whole run.
-HORIZONS: Mapping[str, float | None] = {"position": None, "position_within_0.2s": 0.2}
-_ANGLE = OUTPUTS.index("angle")
+#: Steps of finite differences per plausible range.
+STEPS_PER_RANGE = 50.0
+#: Rows on either side through which a cubic is laid to find a value and its rate at a row.
+HALF_WINDOW = 4
 
 
-def with_lost(found: Array, measured: Array, simulated: Array) -> Array:
-    """Return residuals (S, T, C) in which a setting whose simulation broke down is as far from the data as can be."""
-    lost = ~np.isfinite(simulated).all(axis=(1, 2))
-    found[lost] = np.where(np.isfinite(measured), LOST, np.nan)
-    return found
+@dataclass(frozen=True)
+class RigLaw:
+    """A law that may be missing.
+
+    Attributes:
+        doc: what is missing without it, and its formula; empty = as the effect of its name in the library.
+        parameters: as of an effect of the library: ``prior`` is the plausible range, ``severity`` what is tried first.
+        guesses: ways to a first guess, several where its response is not linear; none = one change by ``severity`` for each
+            parameter that says how large it is.
+        refines: law that must be in the model before this one is looked for; empty = none.
+    """
+
+    doc: str
+    parameters: Mapping[str, EffectParameter]
+    guesses: tuple[Guess, ...] = ()
+    refines: str = ""
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """What is fitted: its parameters, within their priors."""
+        found = []
+        for name, one in self.parameters.items():
+            low, high = one.prior
+            step = (high - low) / STEPS_PER_RANGE
+            found.append(Unknown(name, one.unit, float(one.neutral), low, high, step, one.is_size))
+        return tuple(found)
 
 
-class RigProblem:
-    """Recordings of one servo with a pendulum, and a simulator of it; see :class:`wlr_gym.gap.problem.Problem`.
+class MeasuredRun(Protocol):
+    """One run of a rig: its file's name, times (rows,) in s, and columns (rows, columns) in SI, NaN where not measured."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def t(self) -> Array: ...
+
+    @property
+    def measured(self) -> Array: ...
+
+
+class RigProblem(ABC):
+    """Runs of one rig, and a simulator of it; see :class:`wlr_gym.gap.problem.Problem`.
+
+    Every run is replayed once per window length, and each measured column is a signal of each.
 
     Args:
-        recordings: of one servo.
+        name: of the place where its effects act.
+        runs: of one rig.
+        columns: what is measured.
+        quantities: what calibration may move.
+        laws: that may be missing.
+        windows: s after which a replay starts again from what was measured; infinite = one replay of the whole run.
         known: effects that are in the model from the start.
-        friction_is_known: dry and viscous friction are numbers of the model. Otherwise it has none, and they are candidates.
 
     Attributes:
         held_out: names of the runs to hold out where the user names none.
+        in_model: names of laws that are numbers of the model.
     """
 
-    metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in units of sensor noise"
-    #: A servo that sticks elsewhere is off by hundreds of counts, and that is the gap.
-    cap = LOST
-    steps = 20
-    #: A replay costs milliseconds, and a joint that sticks answers far from linearly: every hypothesis is worth a whole fit.
-    threads, thorough, tempering, disagreement, misfit = 1, True, 1.0, 0.0, math.inf
+    metric: str
+    in_model: Set[str] = frozenset()
+    #: A replay costs milliseconds, and what sticks answers far from linearly: every hypothesis is worth a whole fit.
+    thorough = True
+    steps, tempering, threads, misfit, disagreement, cap = 20, 1.0, 1, math.inf, 0.0, LOST
+    held_out: tuple[str, ...] = ()
     turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     motions: Mapping[str, str] = MappingProxyType({})
 
     def __init__(
-        self, recordings: Sequence[Recording], known: Sequence[PatchEffect] = (), friction_is_known: bool = True
+        self,
+        name: str,
+        runs: Sequence[MeasuredRun],
+        columns: Sequence[MeasuredSignal],
+        quantities: Sequence[Quantity],
+        laws: Mapping[str, RigLaw],
+        windows: Sequence[float],
+        known: Sequence[PatchEffect] = (),
     ) -> None:
-        if not recordings:
-            raise InputError("no recordings to analyse")
-        self.recordings: tuple[Recording, ...] = tuple(recordings)
+        self.name, self.laws = name, laws
         self.known: tuple[PatchEffect, ...] = tuple(known)
-        self.runs: tuple[str, ...] = tuple(recording.name for recording in recordings)
+        self.windows: tuple[float, ...] = tuple(windows)
+        self.runs: tuple[str, ...] = tuple(run.name for run in runs)
+        self.quantities: tuple[Quantity, ...] = tuple(quantities)
         self.signals: tuple[MeasuredSignal, ...] = tuple(
-            MeasuredSignal(name, "rad", ENCODER_NOISE, "position") for name in HORIZONS
+            replace(column, name=column.name if math.isinf(length) else f"{column.name}_within_{length:g}s", place=name)
+            for length in windows
+            for column in columns
         )
-        self.quantities: tuple[Quantity, ...] = tuple(
-            quantity for quantity in QUANTITIES if friction_is_known or not quantity.name.endswith("friction")
-        )
-        self.held_out: tuple[str, ...] = spread_over_conditions(self.recordings)
-        self._replays = [Replay(recording) for recording in recordings]
+        self._all_runs: Sequence[MeasuredRun] = runs
+
+    @abstractmethod
+    def replayed(self, settings: Sequence[Setting], run: int, length: float) -> Array:
+        """Return what the columns would have read (settings, rows, columns), begun anew after every ``length`` s."""
+
+    @abstractmethod
+    def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
+        """Replay runs that a model itself would have made; see :meth:`wlr_gym.gap.problem.Problem.remade`."""
+
+    @abstractmethod
+    def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
+        """Return what residuals are mapped over, (rows,) each."""
 
     def times(self, run: int) -> Array:
         """Return the times (rows,) of a run, s."""
-        return self.recordings[run].time
+        return self._all_runs[run].t
 
     def measured(self, run: int) -> Array:
-        """Return the measured angle (rows, signals), rad: the same for every horizon."""
-        return np.repeat(self.recordings[run].angle[:, None], len(self.signals), axis=1)
+        """Return what was measured (rows, signals), SI: the same for every window length."""
+        return np.tile(self._all_runs[run].measured, len(self.windows))
 
     def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
-        """Return what the encoder would have read: (settings, rows, signals) per run, rad."""
-        models = [model_of(setting, self.quantities, self.known) for setting in settings]
-        zero = np.array([model.numbers["zero"] for model in models])[:, None]
-        found = []
-        for run in runs:
-            replay = self._replays[run]
-            found.append(
-                np.stack([replay.simulate(models, horizon)[:, :, _ANGLE] + zero for horizon in HORIZONS.values()], axis=2)
-            )
-        return found
-
-    def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
-        """Replay recordings that a model itself would have made; see :meth:`wlr_gym.gap.problem.Problem.remade`.
-
-        They are rounded to counts, and differ by where within a count the servo's zero lies.
-        """
-        clean = [angles[0, :, 0] for angles in self.simulate([setting], runs)]
-        for shift in (0.0, *generator(0, "gap", "zero of the encoder").uniform(-0.5, 0.5, count - 1)):
-            made = [
-                replace(self.recordings[run], angle=(np.round(angle / ENCODER_NOISE + shift) - shift) * ENCODER_NOISE)
-                for run, angle in zip(runs, clean, strict=True)
-            ]
-            twin = RigProblem(made, self.known, len(self.quantities) == len(QUANTITIES))
-            yield [residual[0] for residual in twin.residuals([setting], range(len(made)))]
+        """Return what the columns would have read: (settings, rows, signals) per run, SI."""
+        return [np.concatenate([self.replayed(settings, run, one) for one in self.windows], axis=2) for run in runs]
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
-        """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
-        return [self._residuals(run, angles) for run, angles in zip(runs, self.simulate(settings, runs), strict=True)]
+        """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`.
 
-    def _residuals(self, run: int, simulated: Array) -> Array:
-        """Of one run; a setting whose simulation broke down is as far from the data as can be."""
-        measured = self.measured(run)
-        return with_lost((measured - simulated) / ENCODER_NOISE, measured, simulated)
+        A setting whose simulation broke down is as far from the data as can be.
+        """
+        noise, found = np.array([signal.noise for signal in self.signals]), []
+        for run, simulated in zip(runs, self.simulate(settings, runs), strict=True):
+            measured = self.measured(run)
+            left = self.without_first_states(run, (measured - simulated) / noise)
+            left[~np.isfinite(simulated).all(axis=(1, 2))] = np.where(np.isfinite(measured), LOST, np.nan)
+            found.append(left)
+        return found
+
+    def without_first_states(self, run: int, residuals: Array) -> Array:
+        """Take out of residuals (settings, rows, signals), in place, what errors of windows' first states explain: nothing."""
+        return residuals
 
     def candidates(
         self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
     ) -> tuple[list[Probe], list[Candidate]]:
-        """Return the effects to try beyond ``setting``, and the probes of their first guesses."""
+        """Return the laws to try beyond ``setting``, and the probes of their first guesses."""
         present = {effect.name for effect in (*self.known, *setting.effects)}
-        present |= {quantity.name for quantity in self.quantities}
-        return rig_candidates(present)
+        return law_candidates(self.laws, self.name, present | self.in_model)
 
     def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
-        """Return over which range of each feature a formula was tried; see :meth:`wlr_gym.gap.problem.Problem.reach`."""
-        model = model_of(setting, self.quantities, self.known)
-        values = np.concatenate([self._replays[run].simulate([model])[0] for run in runs])
-        columns = dict(zip(OUTPUTS, values.T, strict=True))
-        read = lanes_read(rig_force(effect), {**columns, "supply": columns["voltage"]}).items()
-        return {name: Range(float(np.nanmin(found)), float(np.nanmax(found)), unit) for name, (unit, found) in read}
+        """Return over which range of each feature a formula was tried: none is."""
+        return {}
 
-    def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
-        """Return what residuals are mapped over, (rows,) each, units in the names."""
-        model = model_of(setting, self.quantities, self.known)
-        found: list[Mapping[str, Array]] = []
-        for run in runs:
-            recording, replay = self.recordings[run], self._replays[run]
-            values = replay.simulate([model])[0]
-            columns = {name: values[:, k] for k, name in enumerate(OUTPUTS)}
-            found.append(
-                {
-                    "angle [rad]": columns["angle"],
-                    "rate [rad/s]": columns["rate"],
-                    "motor torque [N m]": columns["motor_torque"],
-                    "voltage [V]": columns["voltage"],
-                    "time since reversal [s]": since_reversal(recording.time, columns["rate"]),
-                    "time [s]": recording.time,
-                    "supply [V]": recording.supply,
-                    "temperature [deg C]": recording.temperature,
-                    "P gain [register]": np.full(len(recording.time), recording.gain),
-                }
+
+def few_runs(text: str, usable: int) -> list[IntakeFinding]:
+    """Return that there are too few runs, ``text`` saying how many; nothing where there are enough."""
+    text = f"{text}: record {LEAST_RUNS} or more, two to fit and one to hold out"
+    return [] if usable >= LEAST_RUNS else [IntakeFinding("", "", "few_runs", text, fatal=True)]
+
+
+def smoothed_state(time: Array, values: Array) -> tuple[Array, Array]:
+    """Return a column and its rate at every row (rows,), from a cubic through the rows around it."""
+    count = len(time)
+    first = np.clip(np.arange(count) - HALF_WINDOW, 0, count - 2 * HALF_WINDOW - 1)
+    rows = first[:, None] + np.arange(2 * HALF_WINDOW + 1)
+    scale = time[rows[:, -1]] - time[rows[:, 0]]
+    powers = ((time[rows] - time[:, None]) / scale[:, None])[:, :, None] ** np.arange(4)
+    turned = powers.transpose(0, 2, 1)
+    fitted = np.linalg.solve(turned @ powers, turned @ values[rows][:, :, None])[:, :, 0]
+    return np.asarray(fitted[:, 0], np.float64), np.asarray(fitted[:, 1] / scale, np.float64)
+
+
+# ---- what may be missing ---------------------------------------------------------------------------------------------
+
+
+def law_candidates(laws: Mapping[str, RigLaw], place: str, present: Set[str]) -> tuple[list[Probe], list[Candidate]]:
+    """Return probes and candidates of laws, but for those that are ``present`` already.
+
+    What refines another law is offered once that is there.
+    """
+    probes: dict[str, Probe] = {}
+
+    def probe(name: str, change: Change) -> str:
+        key = " ".join([name, *(f"{parameter} {value:g}" for parameter, value in change.parameters.items())])
+        probes[key] = Probe(key, (PatchEffect(name, (place,), change.parameters),))
+        return key
+
+    candidates = []
+    for name, law in laws.items():
+        if name not in present and (not law.refines or law.refines in present):
+            starts = tuple(
+                Start(tuple(tuple(probe(name, change) for change in changes) for changes in guess.directions), guess.values)
+                for guess in law.guesses or (_guess(law),)
             )
-        return found
+            candidates.append(Candidate(name, (place,), law.unknowns, starts, doc=law.doc))
+    return list(probes.values()), candidates
 
 
-def spread_over_conditions(recordings: Sequence[Recording], share: float = HELD_OUT_SHARE) -> tuple[str, ...]:
-    """Return the names of runs to hold out: in turn one of every gain, each of the trajectory that is held out least so far."""
-    gains = sorted({recording.gain for recording in recordings})
-    chosen: list[Recording] = []
-    for turn in range(math.ceil(share * len(recordings))):
-        left = [recording for recording in recordings if recording not in chosen]
-        left = [recording for recording in left if recording.gain == gains[turn % len(gains)]] or left
-        held = [recording.trajectory for recording in chosen]
-        chosen.append(min(left, key=lambda recording: held.count(recording.trajectory)))
-    return tuple(recording.name for recording in recordings if recording in chosen)
+def _guess(law: RigLaw) -> Guess:
+    """One change for each number that says how large the law is; the others are where they are clear."""
+    neutral = {key: float(one.neutral) for key, one in law.parameters.items()}
+    sizes = {key: one.severity for key, one in law.parameters.items() if one.is_size}
+    shape = {key: one.severity for key, one in law.parameters.items() if not one.is_size}
+
+    def values(amplitudes: Array) -> tuple[float, ...]:
+        pairs = zip(sizes.items(), amplitudes, strict=True)
+        grown = {key: neutral[key] + float(amplitude) * (severe - neutral[key]) for (key, severe), amplitude in pairs}
+        return tuple({**neutral, **shape, **grown}.values())
+
+    return Guess(tuple((Change({**neutral, **shape, key: severe}),) for key, severe in sizes.items()), values)
+
+
+# ---- patches ---------------------------------------------------------------------------------------------------------
+
+
+def rig_patch(
+    source: Source, laws: Mapping[str, RigLaw], joint: str, check_formula: Callable[[PatchEffect], object] | None = None
+) -> Patch:
+    """Load a patch of a rig, as its analyses write it.
+
+    Args:
+        source: as for :func:`wlr_gym.physics.effects.load_patch`.
+        laws: what the rig knows.
+        joint: the one place where they act.
+        check_formula: refuses a formula that is broken; None = the rig takes none.
+
+    Raises:
+        InputError: naming file, effect, key and the nearest valid name.
+    """
+    if source is None or isinstance(source, Patch):
+        return source or Patch()
+    if isinstance(source, str | Path):
+        path = find_config("effects", source)
+        content, name = read_yaml(path), str(path)
+    elif isinstance(source, Mapping):
+        content, name = {"effects": [source]} if "name" in source else source, "effects"
+    elif isinstance(source, Sequence):
+        return compose(*(rig_patch(one, laws, joint, check_formula) for one in source))
+    else:
+        raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
+    entries = content.get("effects") if isinstance(content, Mapping) else None
+    if not isinstance(entries, list | tuple):
+        raise InputError(f"{name}: expected a mapping with 'effects', a list of effects")
+    found = tuple(_effect(entry, f"{name}: effect {k}", laws, joint, check_formula) for k, entry in enumerate(entries, 1))
+    return Patch(found, _mapping(content, "provenance", name), name)
+
+
+def _effect(
+    entry: Any, place: str, laws: Mapping[str, RigLaw], joint: str, check_formula: Callable[[PatchEffect], object] | None
+) -> PatchEffect:
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("parameters", {}), Mapping):
+        raise InputError(f"{place}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}")
+    name, given = str(entry.get("name")), dict(entry.get("parameters", {}))
+    is_formula = name == UNKNOWN_EFFECT and check_formula is not None
+    if not is_formula:
+        check_name("effect of the test rig", name, laws, place)
+    named = f"{place} ({name})"
+    if entry.get("where", joint) not in (joint, [joint], (joint,)):
+        raise InputError(f"{named}: where = {entry['where']!r}: the rig has one joint, {joint}")
+    if is_formula:
+        formula = entry.get("formula")
+        if not isinstance(formula, str):
+            raise InputError(f"{named}: formula = {formula!r}: expected a formula of the torque, such as '-b * rate'")
+        effect = PatchEffect(name, (joint,), given, formula, _mapping(entry, "units", named), named)
+        check_formula(effect)
+        return effect
+    known = laws[name].parameters
+    for key in given:
+        check_name("parameter", key, known, named)
+    numbers = {key: _number(given.get(key), spec, f"{named}: {key}") for key, spec in known.items()}
+    return PatchEffect(name, (joint,), numbers, place=place)
+
+
+def _mapping(entry: Mapping[str, Any], key: str, place: str) -> dict[str, Any]:
+    """Return a copy of a mapping that an entry may leave out."""
+    value = entry.get(key) or {}
+    if not isinstance(value, Mapping):
+        raise InputError(f"{place}: {key} = {value!r}: expected a mapping")
+    return dict(value)
+
+
+def _number(value: Any, spec: EffectParameter, place: str) -> float:
+    number = finite_number(spec.neutral if value is None and spec.optional else value)
+    if number is None or not spec.low <= number <= spec.high:
+        raise InputError(f"{place} = {value!r}: expected a number in {range_in_words(spec.low, spec.high, spec.unit)}")
+    return number

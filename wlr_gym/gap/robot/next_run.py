@@ -28,8 +28,7 @@ from wlr_gym.data.read import Run, read_run
 from wlr_gym.data.record import motion_of, record_simulation
 from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95
 from wlr_gym.gap.problem import Setting
-from wlr_gym.gap.report.entries import AdequacyEntry, Result
-from wlr_gym.gap.report.explanations import NOTHING, Explanation
+from wlr_gym.gap.report.result import NOTHING, AdequacyEntry, Explanation, Result
 from wlr_gym.gap.robot.candidates import shown_by
 from wlr_gym.gap.robot.problem import RobotProblem
 from wlr_gym.physics.effects import EFFECTS, PatchEffect, Source

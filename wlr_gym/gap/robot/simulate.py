@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 from wlr_gym.base.threads import in_threads
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.gap.robot.clock import CLOCK, Anchors, RunClock
-from wlr_gym.gap.robot.loop import follower
-from wlr_gym.gap.robot.recorder import POSE_TICKS, Recorder, Replays
-from wlr_gym.gap.robot.schedule import WrittenSetpoints
+from wlr_gym.gap.robot.replay_loop import POSE_TICKS, Recorder, Replays, WrittenSetpoints, follower
+from wlr_gym.gap.robot.windows import CLOCK, Anchors, RunClock
 from wlr_gym.physics.plants import drive, ground, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, Sensors, standing_state
 from wlr_gym.physics.plants.forces import Force
@@ -75,7 +73,7 @@ def replay_batch(
         backend: the simulator.
         forces: formula forces.
         constants: (settings, constants of all forces one after the other); None = the forces' own.
-        with_truth: keep the columns of :data:`wlr_gym.gap.robot.recorder.TRUTH` too.
+        with_truth: keep the columns of :data:`wlr_gym.gap.robot.replay_loop.TRUTH` too.
         threads: worker threads; the result does not depend on it.
     """
     order = sorted(range(len(clocks)), key=lambda r: -clocks[r].ticks)  # a run that is over need not be simulated any further

@@ -14,10 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.threads import in_threads
-from wlr_gym.gap.estimation.fit import Fit, cheapest, fit
-from wlr_gym.gap.estimation.least_squares import constrained_step, equations_by_run
-from wlr_gym.gap.estimation.likelihood import estimate_noise, minus_two_log_likelihood
-from wlr_gym.gap.estimation.model import FittedModel, moved, on_bounds, scaled_numbers, total_cost, untouched
+from wlr_gym.gap.estimation.fit import Fit, cheapest, constrained_step, equations_by_run, fit
+from wlr_gym.gap.estimation.model import (
+    FittedModel,
+    estimate_noise,
+    minus_two_log_likelihood,
+    moved,
+    on_bounds,
+    scaled_numbers,
+    total_cost,
+    untouched,
+)
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, asked_of, least_gain

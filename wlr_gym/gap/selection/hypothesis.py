@@ -1,16 +1,25 @@
-"""A candidate effect after its fit, and whether it may be what is missing."""
+"""A candidate effect after its fit: whether it may be what is missing, how probable it is, and what explains the data as well.
+
+Probabilities are Bayesian model evidence (Laplace's approximation), with "none of these" among the models. Minus two log
+evidence of a model is its cost, which holds the prior's exponent, plus the log determinant of its curvature, less that of its
+prior. What all models share cancels: beside the model without a further effect an effect has its gain, less what its unknowns
+could have been and are not (Occam's factor): ``ln det(1 + I / P)`` with the information I that the data hold of them,
+calibrated parameters projected out, and the precision P of their prior. Likelihood and prior are tempered as in the fit. Kass
+and Raftery (1995) is the review.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.likelihood import Noise
-from wlr_gym.gap.estimation.model import FittedModel
+from wlr_gym.gap.estimation.model import FittedModel, Noise
 from wlr_gym.gap.problem import Candidate, Problem, Unknown
+from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, asked_of
 
 Array = NDArray[np.float64]
 
@@ -36,7 +45,7 @@ class Hypothesis:
         base, base_residuals: the model without the effect, refitted as long.
         cross_validated: whether runs are replayed better by a fit to the other runs (checked for finalists only).
         tolerable: whether the tolerances of calibrated parameters allow as much.
-        occam: what its unknowns cost beside its gain (:func:`wlr_gym.gap.selection.evidence.occam`).
+        occam: what its unknowns cost beside its gain (:func:`wlr_gym.gap.selection.hypothesis.occam`).
     """
 
     candidate: Candidate
@@ -111,3 +120,123 @@ def within_tolerance(problem: Problem, model: FittedModel) -> bool:
 def fall_by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -> Array:
     """Fall of the weighted squares in each run."""
     return np.array([np.nansum((b * b - a * a) * noise.weight) for b, a in zip(before, after, strict=True)])
+
+
+# ---- probability -----------------------------------------------------------------------------------------------------
+
+
+#: Prior probability that nothing is missing; the names share the rest, and the places of a name share its part.
+NOTHING = 0.5
+#: Probability of the set of names that the data do not distinguish.
+CREDIBLE = 0.95
+#: Least precision of a prior, of amplitudes in probes: a direction that hardly moves an unknown is not unbounded.
+LEAST_PRECISION = 1e-3
+
+
+def occam(score: Score, tempering: float) -> float:
+    """Return by how much a candidate's unknowns are known better by the data than beforehand: ``ln det(1 + I / P)``."""
+    start, unknowns, size = score.start, score.candidate.unknowns, len(score.information)
+    if len(start.directions) != size:  # it was scored with another start
+        size = min(size, len(start.directions))
+    nothing = np.array(start.values(np.zeros(len(start.directions))))
+    slopes = np.stack([np.array(start.values(own)) - nothing for own in np.eye(len(start.directions))[:size]], axis=1)
+    precision = tempering * np.array([4.0 / (u.high - u.low) ** 2 for u in unknowns])
+    prior = slopes.T @ (precision[:, None] * slopes) + LEAST_PRECISION * np.eye(size)
+    data = 0.5 * (score.information + score.information.T)[:size, :size]
+    return float(np.linalg.slogdet(prior + data)[1] - np.linalg.slogdet(prior)[1])
+
+
+def probabilities(hypotheses: Sequence[Hypothesis], scores: Sequence[Score]) -> tuple[list[float], float]:
+    """Return the probability of each hypothesis, and that of none of them.
+
+    Args:
+        hypotheses: refitted; what tolerances allow is no effect and has none.
+        scores: of all candidates of the round: how many names and places there are.
+    """
+    places = Counter(score.candidate.name for score in scores)
+    logs = [np.log(NOTHING)]
+    for one in hypotheses:
+        shared = (1.0 - NOTHING) / max(len(places), 1) / max(places[one.candidate.name], 1)
+        logs.append(-np.inf if one.tolerable else np.log(shared) + 0.5 * one.evidence)
+    weights = np.exp(np.array(logs) - max(logs))
+    shares = (weights / weights.sum()).tolist()
+    return shares[1:], shares[0]
+
+
+def credible_names(hypotheses: Sequence[Hypothesis], shares: Sequence[float]) -> list[str]:
+    """Return the smallest set of names that together have :data:`CREDIBLE` of what all names have, most probable first."""
+    total: dict[str, float] = {}
+    for one, share in zip(hypotheses, shares, strict=True):
+        total[one.candidate.name] = total.get(one.candidate.name, 0.0) + share
+    found, reached, whole = [], 0.0, sum(total.values())
+    for name in sorted(total, key=lambda name: -total[name]):
+        if reached >= CREDIBLE * whole:
+            break
+        found.append(name)
+        reached += total[name]
+    return found
+
+
+# ---- bootstrap and equivalence ---------------------------------------------------------------------------------------
+
+
+#: Bootstrap samples of the runs.
+SAMPLES = 500
+#: Two effects are equivalent if the second improves the fit by at least this share of what the first does.
+EQUIVALENT = 0.93
+#: A rival that improves the fit by this share is equivalent unless the runs agree that it is worse ...
+RIVAL = 0.75
+#: ... by so many standard errors.
+AGREED = 2.0
+
+
+def selection_frequency(selected: Hypothesis, others: Sequence[Hypothesis], threshold: float = LEAST_GAIN) -> float:
+    """Return the share of bootstrap samples of the runs in which the selected effect is accepted and no other fits better.
+
+    A run counts by its part in the gain, as fitted to all runs: no sample is refitted. ``threshold``: see
+    :func:`wlr_gym.gap.selection.screening.asked_of`.
+    """
+    rng = np.random.default_rng(0)
+    rivals = [other for other in others if other.candidate.name != selected.candidate.name and not other.tolerable]
+    picks = rng.integers(0, len(selected.by_run), (SAMPLES, len(selected.by_run)))
+    parts = _parts(selected)[picks]
+    gains = parts.sum(axis=1)
+    agreed = -parts.clip(max=0.0).sum(axis=1) <= MOST_HARM * parts.clip(min=0.0).sum(axis=1)
+    wins = agreed & (gains >= asked_of(selected.candidate, threshold))
+    for rival in rivals:
+        wins &= gains >= _parts(rival)[picks].sum(axis=1)
+    return float(wins.mean())
+
+
+def _parts(hypothesis: Hypothesis) -> Array:
+    """The runs' parts (runs) in the gain of a hypothesis: their falls of squares, scaled to it."""
+    total = float(hypothesis.by_run.sum())
+    return hypothesis.by_run * (hypothesis.gain / total) if total > 0.0 < hypothesis.gain else hypothesis.by_run
+
+
+def equivalents(selected: Hypothesis, others: Sequence[Hypothesis], credible: Sequence[str] = ()) -> list[Hypothesis]:
+    """Return the best hypothesis of every other name that the data cannot distinguish from the selected one.
+
+    ``credible``: names that cannot be left out of a set with 95 % of the probability.
+    """
+    found: dict[str, Hypothesis] = {}
+    for other in others:
+        name = other.candidate.name
+        possible = not other.at_bound and not other.tolerable
+        if (
+            name != selected.candidate.name
+            and possible
+            and name not in found
+            and (name in credible or _as_good(selected, other))
+        ):
+            found[name] = other
+    return list(found.values())
+
+
+def _as_good(selected: Hypothesis, other: Hypothesis) -> bool:
+    """Whether another hypothesis improves the fit by nearly as much, or the runs do not agree that it does by less."""
+    if other.gain > EQUIVALENT * selected.gain or selected.gain - other.gain < 0.25 * LEAST_GAIN:
+        return True
+    ahead = selected.by_run - other.by_run
+    spread = float(ahead.std(ddof=1)) / np.sqrt(len(ahead)) if len(ahead) > 1 else 0.0
+    return bool(other.gain > RIVAL * selected.gain and ahead.mean() < AGREED * spread)

@@ -9,13 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.threads import in_threads
-from wlr_gym.gap.estimation.fit import CONVERGED, Fit, fit
-from wlr_gym.gap.estimation.least_squares import channel_products, constrained_step, cross_products
-from wlr_gym.gap.estimation.likelihood import Noise, estimate_noise
-from wlr_gym.gap.estimation.model import FittedModel, moved, scaled_numbers, total_cost, untouched
+from wlr_gym.gap.estimation.fit import CONVERGED, Fit, channel_products, constrained_step, cross_products, fit
+from wlr_gym.gap.estimation.model import FittedModel, Noise, estimate_noise, moved, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem, Setting
-from wlr_gym.gap.selection.evidence import occam
-from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
+from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, occam, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
 
 Array = NDArray[np.float64]

@@ -1,26 +1,53 @@
-"""Score every candidate at once, to first order: by how much would it improve the fit, all calibrated parameters refitted?
+"""Score every candidate to first order: by how much would it improve the fit, all calibrated parameters refitted?
 
-This is the score test with nuisance parameters projected out. One simulation per probe serves all candidates; a candidate that
-is confounded with calibrated parameters within their tolerances scores nothing.
+**First** by the score test with nuisance parameters projected out (:func:`screen`): one simulation per probe serves all
+candidates; a candidate that is confounded with calibrated parameters within their tolerances scores nothing.
+
+**Then** under the alternative (:func:`rescored`): with the level, autocorrelation time and scatter that each candidate would
+leave. What an effect leaves unexplained lasts as long as the effect does: judged by the residuals of the model without it, a
+constant error of any size counts as few readings. So the fitted numbers and the candidate move together to first order, the
+noise of what is then left is estimated, and both are repeated. The model without the candidate is refitted under that same
+noise, and the two likelihoods are compared. All of it is sums of products that are formed once; only autocorrelation needs the
+residuals themselves.
+
+**What chance gives** (:func:`largest_by_chance`) sets the threshold on each data set: the residuals that the best candidate
+leaves are cut into blocks longer than their autocorrelation, and each block's sign is drawn anew (wild block bootstrap; Wu
+1986, Liu 1988): what an effect would do alike in all blocks is gone, while size, autocorrelation, and covariance of the
+channels stay those of these data. Every candidate is scored on every draw, and the largest improvement of each draw is taken.
+
+The best candidates are refitted (:func:`shortlist`); :func:`detectable` says what the data would have shown.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.threads import in_threads
-from wlr_gym.gap.estimation.fit import Fit
-from wlr_gym.gap.estimation.least_squares import bounded_minimum, normal_equations
-from wlr_gym.gap.estimation.model import prior_tightness, room, scaled_nominal, scaled_numbers
+from wlr_gym.gap.analysis import Detectable
+from wlr_gym.gap.estimation.fit import Fit, bounded_minimum, by_channel, normal_equations
+from wlr_gym.gap.estimation.model import (
+    Noise,
+    channel_costs,
+    estimate_noise,
+    prior_tightness,
+    room,
+    run_scatter,
+    scaled_nominal,
+    scaled_numbers,
+    series_times,
+)
 from wlr_gym.gap.problem import Candidate, Probe, Problem, Setting, Start
 
 Array = NDArray[np.float64]
 
-#: Fall of minus two log posterior below which no effect is accepted; see :mod:`wlr_gym.gap.selection.threshold`.
+#: Fall of minus two log posterior below which no effect is accepted; see :mod:`wlr_gym.gap.selection.screening`.
 LEAST_GAIN = 16.0
 #: By how much more an effect must improve the fit for every unknown beyond the first.
 PER_UNKNOWN = 3.0
@@ -205,3 +232,504 @@ def shortened(candidate: Candidate, start: Start, amplitude: Array, shares: Sequ
         if all(low - 1e-12 <= value <= high + 1e-12 for (low, high), value in pairs):
             return values, share
     return candidate.kept(start.values(0.0 * amplitude)), 0.0
+
+
+# ---- under the alternative -------------------------------------------------------------------------------------------
+
+
+#: Times that the noise follows the candidate.
+ROUNDS = 2
+#: Candidates that explain most squares, whatever their autocorrelation, and are scored under the alternative.
+SCORED = 32
+#: The same for each group of signals.
+SCORED_PER_GROUP = 4
+#: Shares of an amplitude beyond the plausible range that are tried.
+ALTERNATIVE_SHARES = (1.0, 0.85, 0.7, 0.5, 0.3, 0.15, 0.05, 0.0)
+
+
+def rescored(
+    problem: Problem, fit: Fit, found: Responses, products: Products, scores: Sequence[Score]
+) -> tuple[list[Score], list[Score]]:
+    """Score candidates under the alternative.
+
+    Args:
+        problem: the system.
+        fit: the model without the candidates.
+        found: responses of its numbers and of the candidates' probes.
+        products: of both.
+        scores: to first order, under the noise of ``fit``.
+
+    Returns:
+        All scores, best first, with gain and values under the alternative; a candidate that explains too little to be
+        scored gains nothing. And for each group of signals the candidate that explains it best if all other signals are
+        left out: where a response has a kink, as where motors reach the voltage of their supply, the first order may speak
+        against the right effect in the other signals, and only a refit can decide.
+    """
+    if not scores:
+        return [], []
+    system = _System(problem, fit, found, products, np.arange(len(products.rows)))
+    best, rest = system.best(scores, SCORED)
+    everywhere = sorted([*best, *(replace(s, gain=min(s.gain, 0.0)) for s in rest)], key=lambda score: -score.gain)
+    groups: dict[str, list[int]] = {}
+    for channel, signal in enumerate(problem.signals):
+        if products.rows[channel]:
+            groups.setdefault(signal.group, []).append(channel)
+    here = replace(found, away=np.zeros_like(found.away))  # numbers that a group says nothing about stay
+    alone = [
+        replace(system, found=here, channels=np.array(channels)).best(scores, SCORED_PER_GROUP)[0][0]
+        for channels in groups.values()
+    ]
+    return everywhere, sorted(alone, key=lambda score: -score.gain)
+
+
+@dataclass(frozen=True, eq=False)
+class Products:
+    """Products of columns and residuals, channel by channel.
+
+    Attributes:
+        by_run: (runs, channels, columns, columns) of columns.
+        by_run_known: (runs, channels, numbers x numbers) of the fitted numbers' columns alone.
+        push_by_run: (runs, channels, columns) of columns and residuals.
+        gram, push: the sums over the runs.
+        square: (channels) of the residuals.
+        rows: (channels) measured.
+        columns: one (channels, columns, rows) array per run.
+    """
+
+    by_run: NDArray[np.float32]
+    by_run_known: NDArray[np.float32]
+    push_by_run: Array
+    gram: Array
+    push: Array
+    square: Array
+    rows: Array
+    columns: list[NDArray[np.float32]] = field(repr=False)
+
+    @staticmethod
+    def of(fit: Fit, found: Responses, threads: int = 1) -> Products:
+        """Form the products of a fit's residuals with all columns of the responses."""
+
+        def of_one(run: tuple[NDArray[np.float32], Array]) -> tuple[NDArray[np.float32], NDArray[np.float32], Array, Array]:
+            column, residual = run
+            own = by_channel(column, residual.shape[1])
+            known = np.nan_to_num(residual).T
+            push = (own @ known.astype(np.float32)[:, :, None])[:, :, 0].astype(np.float64)
+            return own, own @ own.transpose(0, 2, 1), push, (known * known).sum(axis=1)
+
+        parts = in_threads(threads, of_one, zip(found.columns, fit.residuals, strict=True))
+        columns = [own for own, *_ in parts]
+        by_run, push_by_run = np.stack([gram for _, gram, *_ in parts]), np.stack([push for *_, push, _ in parts])
+        square = np.sum([square for *_, square in parts], axis=0)
+        rows = np.sum([np.isfinite(r).sum(axis=0) for r in fit.residuals], axis=0)
+        gram, push = by_run.sum(axis=0, dtype=np.float64), push_by_run.sum(axis=0)
+        known = len(found.tight)
+        by_run_known = by_run[:, :, :known, :known].reshape(*by_run.shape[:2], -1)
+        return Products(by_run, by_run_known, push_by_run, gram, push, np.asarray(square), rows, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """What candidates are scored with; ``channels``: the signals that count."""
+
+    problem: Problem
+    fit: Fit
+    found: Responses
+    products: Products
+    channels: NDArray[np.intp]
+
+    @property
+    def known(self) -> int:
+        """Number of fitted numbers."""
+        return len(self.found.tight)
+
+    @cached_property
+    def rows(self) -> Array:
+        """Measured rows (channels)."""
+        return self.products.rows[self.channels]
+
+    @cached_property
+    def square(self) -> Array:
+        """Squares of the residuals (channels)."""
+        return self.products.square[self.channels]
+
+    @cached_property
+    def push(self) -> Array:
+        """Products of columns and residuals (channels, columns)."""
+        return self.products.push[self.channels]
+
+    @cached_property
+    def gram(self) -> Array:
+        """Products of columns (channels, columns, columns)."""
+        return self.products.gram[self.channels]
+
+    @cached_property
+    def residuals(self) -> list[Array]:
+        """Residuals (channels, rows) of each run."""
+        return [np.ascontiguousarray(residual.T[self.channels]) for residual in self.fit.residuals]
+
+    @cached_property
+    def columns(self) -> list[NDArray[np.float32]]:
+        """Columns (channels, columns, rows) of each run."""
+        every = len(self.channels) == len(self.products.rows)
+        return self.products.columns if every else [columns[self.channels] for columns in self.products.columns]
+
+    @cached_property
+    def gram_known(self) -> Array:
+        """The same of the fitted numbers (channels, numbers, numbers)."""
+        return np.ascontiguousarray(self.gram[:, : self.known, : self.known])
+
+    def best(self, scores: Sequence[Score], count: int) -> tuple[list[Score], list[Score]]:
+        """Return the candidates that explain most squares, or gain most under the noise of the model without them, best
+        first, scored under the alternative; and the rest. A vector and its components take one place of ``count``.
+        """
+        threads = self.problem.threads
+        starts = [start for score in scores for start in score.candidate.starts]
+        edges = np.cumsum([0, *(len(score.candidate.starts) for score in scores)])
+        rough = np.maximum.reduceat(self._rough(starts), edges[:-1])
+        labels = [score.candidate.label for score in scores]
+        lasting = dict.fromkeys(labels[k] for k in np.argsort(rough)[::-1])
+        leading = dict.fromkeys(labels[k] for k in np.argsort([score.gain for score in scores])[::-1])
+        chosen = {*list(lasting)[:count], *list(leading)[: count // 2]}
+        best = in_threads(threads, self._scored, [s for s in scores if s.candidate.label in chosen])
+        return sorted(best, key=lambda score: -score.gain), [s for s in scores if s.candidate.label not in chosen]
+
+    def _rough(self, starts: Sequence[Start]) -> Array:
+        """Improvement by each start if every row were independent: what orders candidates before their noise is known."""
+        weight, known = self._white().weight, self.known
+        whole, push = np.tensordot(weight, self.gram, 1), weight @ self.push
+        own, gradient = with_tolerances(whole[:known, :known].copy(), push[:known].copy(), self.found)
+        following = -np.linalg.solve(own, np.column_stack([gradient, whole[:known]]))  # how the fitted numbers follow
+        steps = np.zeros((len(starts) + 1, len(push)))  # the last one is that of the model without any
+        steps[:, :known] = following[:, 0]
+        for step, start in zip(steps, starts, strict=False):
+            mix = directions(start, self.found)
+            border, corner = mix @ whole[:, :known], mix @ whole @ mix.T
+            corner[np.diag_indices(len(mix))] += stiffness(np.diag(corner))
+            amplitude = -np.linalg.solve(corner + border @ (following[:, 1:] @ mix.T), mix @ push + border @ following[:, 0])
+            step += amplitude @ mix
+            step[:known] += following[:, 1:] @ (amplitude @ mix)
+        after = channel_costs(np.maximum(self._squares(steps), 0.0) / np.maximum(self.rows, 1)) @ self.rows
+        return after[-1] - after[:-1]
+
+    def _squares(self, steps: Array) -> Array:
+        """Squares of the residuals (steps, channels) after steps of all columns (steps, columns)."""
+        curved = in_threads(self.problem.threads, lambda gram: np.einsum("sm,sm->s", steps @ gram, steps), self.gram)
+        return self.square + 2.0 * steps @ self.push.T + np.stack(curved, axis=1)
+
+    def _white(self) -> Noise:
+        """The noise of the model without a candidate, every row independent."""
+        noise = self.fit.noise
+        return Noise(noise.square[self.channels], np.full(len(self.channels), noise.scatter), self.rows, noise.scatter)
+
+    def _parts(self, start: Start) -> _Directions:
+        """Products of the fitted numbers and of the directions of a start."""
+        mix, known = directions(start, self.found), self.known
+        used = np.flatnonzero(mix.any(axis=0))
+        own, own_gram, pushed = mix[:, used], self.gram[:, used], self.push
+        border = (own @ own_gram[:, :, :known]).transpose(0, 2, 1)
+        corner = own @ own_gram[:, :, used] @ own.T
+        push = np.concatenate([pushed[:, :known], pushed[:, used] @ own.T], axis=1)
+        return _Directions(self.gram_known, border, corner, push, self.square, self.rows)
+
+    def _scored(self, score: Score) -> Score:
+        """The candidate's best start, under the alternative."""
+        tried = [(*self._under_alternative(score.candidate, start), start) for start in score.candidate.starts]
+        gain, values, step, start = max(tried, key=lambda one: one[0])
+        return replace(score, gain=gain, values=values, start=start, step=step)
+
+    def _under_alternative(self, candidate: Candidate, start: Start) -> tuple[float, tuple[float, ...], Array]:
+        """Improvement of the fit by one start of a candidate, the values it leads to, and the step of the fitted numbers."""
+        parts, found, known = self._parts(start), self.found, self.known
+        noise = self._white() if len(self.channels) < len(self.products.rows) else self.fit.noise
+        for _ in range(ROUNDS):
+            x, _ = _step(parts, noise, found, candidate, start)
+            noise = self._noise_after(parts, start, x)
+        x, values = _step(parts, noise, found, candidate, start)
+        matrix, gradient = with_tolerances(*parts.normal(noise.weight), found)
+        bare = np.zeros(len(x))
+        bare[:known] = bounded_minimum(matrix[:known, :known], gradient[:known], found.low, found.high)
+        before, after = (channel_costs(parts.mean_squares(step)) for step in (bare, x))
+        priors = [float(found.tight @ (found.away + step[:known]) ** 2) for step in (bare, x)]
+        ranges = [2.0 * (v - u.neutral) / (u.high - u.low) for u, v in zip(candidate.unknowns, values, strict=True)]
+        improved = float((self.rows / noise.autocorrelation_time) @ (before - after))
+        return improved + priors[0] - priors[1] - float(np.square(ranges).sum()), values, x[:known]
+
+    def _noise_after(self, parts: _Directions, start: Start, x: Array) -> Noise:
+        """Noise of what is left after a step, the scatter of the runs under it included."""
+        known, mix = self.known, directions(start, self.found)
+        used = np.flatnonzero(mix.any(axis=0))
+        steps, change = x[:known].astype(np.float32), (x[known:] @ mix[:, used]).astype(np.float32)
+        left = [
+            residual + steps @ columns[:, :known] + change @ columns[:, used]
+            for residual, columns in zip(self.residuals, self.columns, strict=True)
+        ]
+        own = series_times(left)
+        scatter = self.fit.noise.scatter
+        noise = Noise(parts.mean_squares(x), scatter * own, parts.rows, scatter)
+        if len(self.channels) == len(self.products.rows):
+            scatter = min(scatter, self._scatter(noise, start, x))
+        return Noise(noise.square, scatter * own, parts.rows, scatter)
+
+    def _scatter(self, noise: Noise, start: Start, x: Array) -> float:
+        """Scatter of the runs after a step; see :func:`wlr_gym.gap.estimation.fit.widened`."""
+        products, known, mix = self.products, self.known, directions(start, self.found)
+        used = np.flatnonzero(mix.any(axis=0))
+        which, own = np.concatenate([np.arange(known), used]), mix[:, used]
+        rows = np.zeros((len(x), len(which)))
+        rows[np.arange(known), np.arange(known)] = 1.0
+        rows[known:, known:] = own
+        border = products.by_run[:, :, used][:, :, :, which]  # symmetric
+        inner = noise.weight.astype(np.float32) @ products.by_run_known
+        grams = np.zeros((len(border), len(which), len(which)))
+        grams[:, :known, :known] = inner.reshape(len(border), known, known)
+        grams[:, :, known:] = np.einsum("c,rcmn->rnm", noise.weight, border)
+        grams[:, known:, :known] = grams[:, :known, known:].transpose(0, 2, 1)
+        matrices = rows @ grams @ rows.T
+        vectors = np.einsum("c,rcm->rm", noise.weight, products.push_by_run[:, :, which]) @ rows.T + matrices @ x
+        differ = run_scatter(matrices, vectors)
+        return np.inf if differ is None else max(self.problem.tempering * noise.scatter * differ, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Directions:
+    """The products of the fitted numbers and a candidate's directions (channels, ...); see :class:`Products`.
+
+    Attributes:
+        known: of the fitted numbers' columns.
+        border: of those and the directions.
+        corner: of the directions.
+        push, square, rows: of all columns and the residuals; of the residuals; measured rows.
+    """
+
+    known: Array
+    border: Array
+    corner: Array
+    push: Array
+    square: Array
+    rows: Array
+
+    def normal(self, weight: Array) -> tuple[Array, Array]:
+        """Normal equations under weights (channels)."""
+        known, border, corner = (np.tensordot(weight, part, 1) for part in (self.known, self.border, self.corner))
+        return np.block([[known, border], [border.T, corner]]), weight @ self.push
+
+    def mean_squares(self, x: Array) -> Array:
+        """Mean squares (channels) of the residuals after a step (numbers)."""
+        known, own = np.split(x, [self.known.shape[1]])
+        both = (self.known @ known) @ known + 2.0 * (self.border @ own) @ known + (self.corner @ own) @ own
+        total = self.square + 2.0 * self.push @ x + both
+        return np.maximum(total, 0.0) / np.maximum(self.rows, 1)
+
+
+def _step(
+    parts: _Directions, noise: Noise, found: Responses, candidate: Candidate, start: Start
+) -> tuple[Array, tuple[float, ...]]:
+    """Where fitted numbers and directions go together, within bounds and the candidate's plausible range; its values there."""
+    known = len(found.tight)
+    matrix, gradient = with_tolerances(*parts.normal(noise.weight), found)
+    free = np.full(len(gradient) - known, np.inf)
+    x = bounded_minimum(matrix, gradient, np.concatenate([found.low, -free]), np.concatenate([found.high, free]))
+    values, share = shortened(candidate, start, x[known:], ALTERNATIVE_SHARES)
+    if share < 1.0:
+        x[known:] *= share
+        pull = gradient[:known] + matrix[:known, known:] @ x[known:]
+        x[:known] = bounded_minimum(matrix[:known, :known], pull, found.low, found.high)
+    return x, values
+
+
+# ---- what chance gives -----------------------------------------------------------------------------------------------
+
+
+#: Draws of the signs.
+DRAWS = 200
+#: s; length of a block.
+BLOCK = 2.0
+#: Share of the draws whose largest improvement lies below the threshold.
+QUANTILE = 0.98
+
+
+def acceptance_threshold(cost: float, by_chance: Array) -> float:
+    """Return by how much an effect with one unknown must improve the fit.
+
+    Args:
+        cost: minus two log posterior of the model without it.
+        by_chance: (draws) of :func:`largest_by_chance`; may be empty.
+    """
+    return max(LEAST_GAIN, LEAST_SHARE * cost, chance(by_chance) if by_chance.size else 0.0)
+
+
+def chance(by_chance: Array) -> float:
+    """Return what :data:`QUANTILE` of the draws do not exceed; NaN where there are none."""
+    return float(np.quantile(by_chance, QUANTILE)) if by_chance.size else math.nan
+
+
+def largest_by_chance(
+    problem: Problem, runs: Sequence[int], fit: Fit, found: Responses, products: Products, scores: Sequence[Score]
+) -> Array:
+    """Return the largest improvement (:data:`DRAWS`) of any candidate where only the signs of blocks of residuals are random.
+
+    Nothing where there is no candidate. What further unknowns of a candidate cost is taken off, so that all compare with one
+    threshold.
+
+    Args:
+        problem, runs: what is fitted.
+        fit: the model without the candidates.
+        found: responses of its numbers and of the candidates' probes.
+        products: of both.
+        scores: of the candidates, best first.
+    """
+    if not scores:
+        return np.zeros(0)
+    left = _left_by(scores[0], fit, found)
+    noise = estimate_noise(left, scatter=fit.noise.scatter)
+    known = len(found.tight)
+    response = np.tensordot(noise.weight, products.gram, 1)
+    follow = np.linalg.solve(response[:known, :known] + np.diag(found.tight), response[:known])
+    information = response - response[:known].T @ follow  # the calibrated parameters follow each column
+    pushes = _block_pushes(problem, runs, left, noise.weight, found)
+    drawn = np.random.default_rng(0).choice((-1.0, 1.0), (DRAWS, len(pushes))) @ pushes
+    own = drawn - drawn[:, :known] @ follow
+    largest = np.zeros(DRAWS)
+    for score in scores:
+        for start in score.candidate.starts:
+            mix = directions(start, found)
+            inner = mix @ information @ mix.T + np.diag(LEAST_OWN * np.diag(mix @ response @ mix.T) + 1e-9)
+            push = own @ mix.T
+            improved = (push * np.linalg.solve(inner, push.T).T).sum(axis=1)
+            np.maximum(largest, improved - PER_UNKNOWN * (len(score.candidate.unknowns) - 1), out=largest)
+    return largest
+
+
+def _left_by(best: Score, fit: Fit, found: Responses) -> list[Array]:
+    """Residuals (rows, channels) per run that a candidate would leave, to first order: without it they are no noise."""
+    mix = directions(best.start, found)
+    rows = np.vstack([np.eye(len(found.tight), len(found.push)), mix])
+    matrix, gradient = with_tolerances(rows @ found.response @ rows.T, rows @ found.push, found)
+    moves = (-np.linalg.solve(matrix, gradient) @ rows).astype(np.float32)
+    return [r + (moves @ column).reshape(r.shape) for r, column in zip(fit.residuals, found.columns, strict=True)]
+
+
+def _block_pushes(problem: Problem, runs: Sequence[int], left: Sequence[Array], weight: Array, found: Responses) -> Array:
+    """Weighted products (blocks of all runs, columns) of columns and residuals."""
+    blocks = []
+    for run, column, residual in zip(runs, found.columns, left, strict=True):
+        t = problem.times(run)
+        inner = np.linspace(t[0], t[-1], max(1, round(float(t[-1] - t[0]) / BLOCK)) + 1)[1:-1]
+        weighted = (np.nan_to_num(residual) * weight).astype(np.float32)
+        shaped = column.reshape(len(column), *residual.shape)
+        for first, last in itertools.pairwise((0, *np.searchsorted(t, inner).tolist(), len(t))):
+            blocks.append(shaped[:, first:last].reshape(len(column), -1) @ weighted[first:last].ravel())
+    return np.stack(blocks).astype(np.float64)
+
+
+# ---- what is refitted ------------------------------------------------------------------------------------------------
+
+
+#: Hypotheses that are refitted in one round for their scores, at most.
+SHORTLIST = 8
+#: The same per name.
+PER_NAME = 3
+#: Share of what is asked below which a first score is not worth a refit.
+LEAST_WORTH = 0.25
+#: The best of so many names that the shortlist lacks are refitted too: the first order says little where a response has a kink.
+MORE_NAMES = 3
+#: A candidate that explains a group of signals is refitted too if it improves their fit by this many times what is accepted ...
+PROPOSED = 1.5
+#: ... and so many at most.
+MOST_PROPOSED = 3
+
+
+def one_per_label(scores: Sequence[Score]) -> list[Score]:
+    """Of a vector and its components the one that improves the fit by most beyond what is asked; order kept.
+
+    The whole vector where none improves it by much: it is what these runs would show or not.
+    """
+    much = {score.candidate.label for score in scores if score.gain > LEAST_WORTH * LEAST_GAIN}
+
+    def rank(score: Score) -> float:
+        own = score.candidate
+        return asked_of(own) - score.gain if own.label in much else -len(own.unknowns)
+
+    best: dict[str, Score] = {}
+    for score in sorted(scores, key=rank):
+        best.setdefault(score.candidate.label, score)
+    return [score for score in scores if best[score.candidate.label] is score]
+
+
+def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Score]:
+    """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a share of the threshold.
+
+    The improvement predicted to first order may be :data:`LEAST_WORTH` of the actual one. The best of :data:`MORE_NAMES`
+    further effects follow.
+    """
+    chosen: list[Score] = []
+    more: dict[str, Score] = {}
+    for score in scores:
+        if score.gain <= LEAST_WORTH * threshold:
+            break
+        name = score.candidate.name
+        same = sum(other.candidate.name == name for other in chosen)
+        if len(chosen) < SHORTLIST and same < PER_NAME:
+            chosen.append(score)
+        elif not same:
+            more.setdefault(name, score)
+    return [*chosen, *list(more.values())[:MORE_NAMES]]
+
+
+def with_proposals(chosen: Sequence[Score], alone: Sequence[Score]) -> list[Score]:
+    """Return the shortlist with the best of the candidates that explain a group of signals well; ``alone``: best first."""
+    had = {score.candidate.label for score in chosen}
+    more = {score.candidate.label: score for score in reversed(alone) if score.gain > PROPOSED * least_gain(len(score.values))}
+    new = sorted((score for label, score in more.items() if label not in had), key=lambda score: -score.gain)
+    return [*chosen, *new[:MOST_PROPOSED]]
+
+
+# ---- what the data would have shown ----------------------------------------------------------------------------------
+
+
+def detectable(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> dict[str, Detectable]:
+    """Return the smallest severity of every effect that would have been accepted, at the place where it is hardest to see.
+
+    Of an effect with directions of its own (x, y, z of a displaced mass) it is the one that shows best: in another it may hide
+    at any size. First order: the gain of an effect grows with the square of its severity. Where no plausible size would show,
+    its size is NaN. Formulas are left out: their laws have no size in common. ``threshold``: see
+    :func:`wlr_gym.gap.selection.screening.asked_of`.
+    """
+    found: dict[str, tuple[float, Detectable]] = {}
+    for score in scores:
+        if len(score.candidate.where) > 1 or score.candidate.formula:
+            continue
+        start = score.start
+        shown = np.diag(score.information)
+        which = max((k for k in _sizes(score.candidate) if k < len(shown)), key=lambda k: float(shown[k]))
+        amplitude = least_amplitude(score.candidate, score.information, which, threshold)
+        steps = np.zeros(len(start.directions))
+        steps[min(which, len(steps) - 1)] = amplitude
+        entry = _largest(score.candidate, start.values(steps))
+        if not score.visible:
+            amplitude, entry = np.inf, replace(entry, value=np.nan)
+        if score.candidate.name not in found or amplitude > found[score.candidate.name][0]:
+            found[score.candidate.name] = (amplitude, entry)
+    return {name: entry for name, (_, entry) in sorted(found.items())}
+
+
+def _sizes(candidate: Candidate) -> list[int]:
+    """Which unknowns are sizes in the vocabulary; all where none is in it, as of a wave's sine and cosine."""
+    own, unknowns = candidate.vocabulary, candidate.unknowns
+    return [k for k, u in enumerate(unknowns) if u.name in own and own[u.name].is_size] or list(range(len(unknowns)))
+
+
+def _largest(candidate: Candidate, values: Sequence[float]) -> Detectable:
+    """The size that is farthest from neutral, in units of its range."""
+    parameters, own = candidate.parameters(values), candidate.vocabulary
+    unknowns = {unknown.name: unknown for unknown in candidate.unknowns}
+
+    def distance(name: str) -> float:
+        if name not in own:
+            unknown = unknowns[name]
+            return abs(parameters[name] - unknown.neutral) / (unknown.high - unknown.low)
+        neutral, (low, high) = own[name].neutral, own[name].prior
+        return abs(parameters[name] - (unknowns[name].neutral if isinstance(neutral, str) else neutral)) / (high - low)
+
+    name = max((key for key in parameters if (own.get(key) or unknowns[key]).is_size), key=distance)
+    return Detectable(name, parameters[name], (own.get(name) or unknowns[name]).unit)

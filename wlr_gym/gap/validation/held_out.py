@@ -9,23 +9,23 @@ fitted model itself made, with the same sensors (:func:`noise_floor`).
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
-from wlr_gym.gap.estimation.likelihood import level, mean_of_runs, mean_squares
-from wlr_gym.gap.estimation.model import FittedModel
+from wlr_gym.gap.estimation.model import FittedModel, level, mean_of_runs, mean_squares
 from wlr_gym.gap.estimation.uncertainty import two_sided_95
 from wlr_gym.gap.problem import Problem, Setting
 from wlr_gym.gap.selection.cross_validation import improvement
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.screening import LEAST_GAIN
 from wlr_gym.gap.selection.search import SearchResult, without_each
-from wlr_gym.gap.validation.worse import worse_channels
 
 Array = NDArray[np.float64]
 
@@ -188,3 +188,75 @@ def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, flo
     if not math.isfinite(whole + half):
         return math.nan, math.nan
     return min(whole, 1.0) - half, min(whole + half, 1.0)
+
+
+# ---- channels that effects make worse --------------------------------------------------------------------------------
+
+
+#: s; length of a block.
+BLOCK = 2.0
+#: Bootstrap samples of the blocks.
+SAMPLES = 2000
+#: Share by which a channel's mean square must rise.
+LEAST_RISE = 0.02
+#: Share of the samples in which it must rise.
+CONFIDENCE = 0.99
+
+
+def worse_channels(
+    problem: Problem, runs: Sequence[int], calibrated: Sequence[Array], after: Sequence[Array]
+) -> NDArray[np.bool_]:
+    """Return which channels (signals) the effects make significantly worse in these runs.
+
+    The mean square rises by more than :data:`LEAST_RISE`, and rises in :data:`CONFIDENCE` of the samples of blocks of 2 s,
+    drawn with replacement: residuals within a block depend on each other.
+
+    Args:
+        problem: the system.
+        runs: whose residuals these are: the held-out ones.
+        calibrated, after: residuals (rows, signals) per run without and with the effects.
+    """
+    before = np.concatenate([_block_squares(problem, r, e) for r, e in zip(runs, calibrated, strict=True)])
+    rise = np.concatenate([_block_squares(problem, r, e) for r, e in zip(runs, after, strict=True)]) - before
+    picks = np.random.default_rng(0).integers(0, len(rise), (SAMPLES, len(rise)))
+    counts = np.stack([np.bincount(pick, minlength=len(rise)) for pick in picks])
+    certain = np.quantile(counts @ rise, 1.0 - CONFIDENCE, axis=0) > 0.0
+    return certain & (rise.sum(axis=0) > LEAST_RISE * before.sum(axis=0))
+
+
+def _block_squares(problem: Problem, run: int, residual: Array) -> Array:
+    """Sums of squares (blocks, signals) of one run; what is beyond the problem's cap counts as that."""
+    t = problem.times(run)
+    inner = np.linspace(t[0], t[-1], max(1, round(float(t[-1] - t[0]) / BLOCK)) + 1)[1:-1]
+    squares = np.nan_to_num(np.minimum(residual**2, problem.cap**2))
+    edges = (0, *np.searchsorted(t, inner).tolist(), len(t))
+    return np.stack([squares[first:last].sum(axis=0) for first, last in itertools.pairwise(edges)])
+
+
+# ---- runs that are replayed worst ------------------------------------------------------------------------------------
+
+
+class RunError(Protocol):
+    """Error of one run, as in an analysis or in a result file."""
+
+    @property
+    def run(self) -> str: ...
+
+    @property
+    def heldout(self) -> bool: ...
+
+    @property
+    def after(self) -> float | None: ...
+
+
+def most_left(fitted: float | None, runs: Iterable[RunError]) -> tuple[float, str]:
+    """Return the largest error, and of which held-out run it is; "" = of the fitted runs together.
+
+    Fitted runs count together, as the fit sees them. Held-out ones count one by one: a single motion may show what is missing.
+    """
+    return max([(fitted or 0.0, ""), *((one.after or 0.0, one.run) for one in runs if one.heldout)], key=lambda one: one[0])
+
+
+def most_in(channels: Iterable[ChannelGap]) -> str:
+    """Return the channel of which most noise units are left in the held-out runs."""
+    return max((one for one in channels if math.isfinite(one.after)), key=lambda one: one.after).channel

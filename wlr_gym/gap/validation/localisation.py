@@ -1,4 +1,4 @@
-"""Where the gap is: which channels, and in which states of the robot."""
+"""Where the gap is: which channels, in which states of the robot, and traces of held-out runs that show it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.analysis import HeatMap, Place
-from wlr_gym.gap.estimation.likelihood import Noise
+from wlr_gym.gap.analysis import HeatMap, Place, Trace
+from wlr_gym.gap.estimation.model import FittedModel, Noise
 from wlr_gym.gap.problem import Problem
 
 Array = NDArray[np.float64]
@@ -111,3 +111,44 @@ def _heat_map(problem: Problem, rows: Array, channels: Sequence[int], name: str,
             if np.isfinite(inside).any():
                 cells[k, b] = np.sqrt(np.nanmean(np.minimum(inside**2, problem.cap**2)))
     return HeatMap(tuple(problem.signals[c].name for c in channels), _labels(edges), cells, name)
+
+
+# ---- traces ----------------------------------------------------------------------------------------------------------
+
+
+#: Traces of an analysis.
+MOST = 6
+#: Shown where nothing stands out.
+USUAL = ("gyro_z", "cam_x", "eff_leg_lf", "vel_wheel_lf", "position")
+
+
+def informative_traces(
+    problem: Problem, heldout: Sequence[int], models: Sequence[FittedModel], places: Sequence[Place]
+) -> tuple[Trace, ...]:
+    """Return measured and replayed traces of held-out runs, channels in the order of their share of the gap.
+
+    Args:
+        problem: the system.
+        heldout: runs.
+        models: as its file says; calibrated; with the effects.
+        places: where the gap is.
+    """
+    names = [signal.name for signal in problem.signals]
+    wanted = [place.name for place in places] + [name for name in USUAL if name in names]
+    chosen = list(dict.fromkeys(wanted))[:MOST]
+    settings = [model.setting for model in models]
+    replayed = problem.simulate(settings, heldout)
+    residuals = problem.residuals(settings[1:], heldout)
+    found = []
+    for name in chosen:
+        c = names.index(name)
+        sizes = [float(np.nan_to_num(np.nansum(r[0][:, c] ** 2))) for r in residuals]
+        k = int(np.argmax(sizes))
+        measured = problem.measured(heldout[k])[:, c]
+        if not np.isfinite(measured).any():
+            continue
+        lines = [replayed[k][m][:, c] for m in range(3)]
+        errors = [residuals[k][m][:, c] * problem.signals[c].noise for m in range(2)]
+        run, unit = problem.runs[heldout[k]], problem.signals[c].unit
+        found.append(Trace(run, name, unit, problem.times(heldout[k]), measured, *lines, *errors))
+    return tuple(found)

@@ -11,8 +11,7 @@ from typing import Any
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.envs.tasks.randomization import load_randomization
-from wlr_gym.gap.report.entries import EffectEntry, Result
-from wlr_gym.gap.report.explanations import NOTHING, Explanation, explanations
+from wlr_gym.gap.report.result import NOTHING, EffectEntry, Explanation, Result, explanations
 from wlr_gym.gap.report.text import listed, plain
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Patch, PatchEffect, save_patch
 from wlr_gym.robot import Robot

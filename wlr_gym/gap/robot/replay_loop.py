@@ -1,23 +1,105 @@
-"""What the sensors of a replayed batch would have read at the rows' times."""
+"""One compiled loop replays a batch tick by tick: recorded setpoints arrive at the servos, robots move, readings are taken.
+
+On the engine all of it is one compiled loop that other threads run beside: from Python a tick of 25 robots takes longer
+around the engine than in it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cache
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
+from numba import njit, typeof, types
 from numpy.typing import NDArray
 
 from wlr_gym.base.compiled import compiled
+from wlr_gym.base.errors import InputError
+from wlr_gym.base.snapshot import RowStore
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.gap.robot.clock import CLOCK, RunClock
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, Sensors, Truth
+from wlr_gym.gap.robot.windows import CLOCK, RunClock
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Plant, PlantState, Sensors, Truth
+from wlr_gym.physics.plants.gibbs_appell.plant import CompiledTick, GibbsAppellPlant
+from wlr_gym.physics.plants.sensors import measure_rows
 from wlr_gym.robot import FIRST_WHEEL, WHEEL_SLICE, WHEELS
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
+
+
+class Schedule(NamedTuple):
+    """Setpoints of runs, and where a batch is in them.
+
+    Attributes:
+        times: (rows of all runs, one more of each that never arrives) when setpoints were written, s.
+        goals: (the same rows, 8) the setpoints.
+        delay: (robots, 8) s; how much later each joint has them.
+        rows: (robots, 8) which one each joint has.
+        newer, older, wait: (robots, 8) of the present tick: the two setpoints and the time between, s.
+    """
+
+    times: Array
+    goals: Array
+    delay: Array
+    rows: NDArray[np.int64]
+    newer: Array
+    older: Array
+    wait: Array
+
+
+class WrittenSetpoints:
+    """Setpoints that arrive at their measured times, each joint's late by its own ``command.delay``."""
+
+    given = True
+
+    def __init__(self, clocks: Sequence[RunClock], run_of: NDArray[np.intp], delay: Array) -> None:
+        rows = [len(clock.t) for clock in clocks]
+        start = np.concatenate([[0], np.cumsum([n + 1 for n in rows])])[:-1]
+        times = np.concatenate([np.append(clock.t - clock.begin, np.inf) for clock in clocks])
+        goals = np.concatenate([np.vstack([clock.setpoints, clock.setpoints[-1:]]) for clock in clocks])
+        buffers = (np.zeros(delay.shape) for _ in range(3))
+        self.schedule: Schedule = Schedule(times, goals, delay, np.repeat(start[run_of][:, None], 8, axis=1), *buffers)
+        self._tick = 0
+
+    def reset(self, rows: NDArray[np.intp], state: PlantState, parameters: Parameters) -> None:
+        """Nothing: the setpoints are given."""
+
+    def set_delays(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
+        """Nothing: the delays are given."""
+
+    def stores(self) -> dict[str, RowStore]:
+        """Refuse: the setpoints are those of a recorded run."""
+        raise InputError("a plant that follows recorded setpoints cannot be saved and set back")
+
+    def push(self, setpoints: Array) -> tuple[Array, Array, Array]:
+        """Return the newer setpoints, the older setpoints and the time between (s) of the present tick; see SetpointHistory.
+
+        The next call overwrites them.
+        """
+        arrive(self._tick * CLOCK, self.schedule)
+        self._tick += 1
+        return self.schedule.newer, self.schedule.older, self.schedule.wait
+
+
+@compiled
+def arrive(now: Any, schedule: Any) -> None:
+    """Fill the setpoints of the tick that begins at ``now`` (s) and move the rows on to those that have arrived."""
+    rows, goals = schedule.rows, schedule.goals
+    for i in range(len(rows)):
+        for j in range(8):
+            schedule.older[i, j] = goals[rows[i, j], j]
+            due = schedule.times[rows[i, j] + 1] + schedule.delay[i, j] - now
+            schedule.wait[i, j] = 0.0
+            if due < CLOCK:
+                rows[i, j] += 1
+                schedule.wait[i, j] = max(due, 0.0)
+            schedule.newer[i, j] = goals[rows[i, j], j]
+
+
+# ---- what is read ----------------------------------------------------------------------------------------------------
+
 
 #: Ticks between two stored poses, from which the camera's are interpolated.
 POSE_TICKS = 3
@@ -288,3 +370,91 @@ def _pose(stored: Any, offset: Any, out: Any) -> None:
     out[3] = stored[2] + 2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c
     out[2] = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     out[4] = np.arcsin(min(max(2 * (w * y - x * z), -1.0), 1.0))
+
+
+# ---- the loop --------------------------------------------------------------------------------------------------------
+
+
+#: First tick, last tick, which motors are on.
+Follow: TypeAlias = Callable[[int, int, NDArray[np.bool_] | None], None]
+
+
+def follower(plant: Plant, schedule: Schedule, recorder: Recorder, readings: Sensors) -> Follow:
+    """Return what moves a batch from a tick to another and records what is read before each.
+
+    Args:
+        plant: the robots; its setpoints are those of ``schedule``.
+        schedule: the setpoints.
+        recorder: what takes the readings.
+        readings: of the plant, which it overwrites.
+
+    Returns:
+        Function of first and last tick, and (robots, 8) which motors are on; None = all.
+    """
+    if not isinstance(plant, GibbsAppellPlant):
+        idle = np.zeros((plant.count, 8))
+
+        def step(first: int, last: int, torque_on: NDArray[np.bool_] | None) -> None:
+            for tick in range(first, last):
+                recorder.see(tick, readings, plant.truth())
+                plant.step(idle, torque_on)
+
+        return step
+    loop = _loop(*plant.compiled_tick(), schedule, recorder.tape)
+
+    def go(first: int, last: int, torque_on: NDArray[np.bool_] | None) -> None:
+        function, batch = plant.compiled_tick()  # fewer robots, where runs are over
+        batch.torque_on[...] = 1.0 if torque_on is None else torque_on
+        loop(function, batch, schedule, recorder.tape, first, last)
+
+    return go
+
+
+def _loop(function: Any, batch: CompiledTick, schedule: Schedule, tape: Tape) -> Any:
+    """The compiled loop, and the engine's function compiled for its arguments."""
+    moved = (batch.lanes, batch.constants, schedule.newer, schedule.older, schedule.wait, batch.torque_on)
+    moved = (*moved, batch.formula_values, batch.memory, batch.truth, batch.raw, 0, batch.tiles, batch.robots, batch.step)
+    signature = types.void(*(typeof(argument) for argument in (*moved, batch.substeps, batch.sweeps)))
+    function.compile(signature.args)
+    return _compiled(signature, typeof(batch), typeof(schedule), typeof(tape))
+
+
+@cache
+def _compiled(signature: Any, batch: Any, schedule: Any, tape: Any) -> Any:
+    """The loop for arguments of these types: one for all engine functions, which are called by their address.
+
+    numba keeps it with the sensor model compiled in (``measure_rows``), and looks at this file only to tell whether it is old.
+    """
+    arguments = (types.FunctionType(signature), batch, schedule, tape, types.int64, types.int64)
+    return compiled(_ticks, types.void(*arguments))
+
+
+def _ticks(function: Any, batch: Any, schedule: Any, tape: Any, first: int, last: int) -> None:
+    moved = min(batch.tiles * batch.width, batch.robots)
+    for tick in range(first, last):
+        take(tick, batch.readings, batch.truth, tape)
+        arrive(tick * CLOCK, schedule)
+        if batch.has_formulas:
+            for i in range(batch.robots):
+                batch.memory[i // batch.width, 0, i % batch.width] = batch.time[i]
+        function(
+            batch.lanes,
+            batch.constants,
+            schedule.newer,
+            schedule.older,
+            schedule.wait,
+            batch.torque_on,
+            batch.formula_values,
+            batch.memory,
+            batch.truth,
+            batch.raw,
+            0,
+            batch.tiles,
+            batch.robots,
+            batch.step,
+            batch.substeps,
+            batch.sweeps,
+        )
+        measure_rows(batch.raw, batch.seeds, batch.ticks, batch.settings, batch.states, batch.readings, 0, moved)
+        for i in range(batch.robots):
+            batch.time[i] += batch.period

@@ -1,0 +1,727 @@
+"""Whether measured runs can be used, before anything is fitted: :data:`CHECKS`, one after the other, in seconds.
+
+Thresholds come from the robot file, the resolution of its sensors and its kinematics; each stands with its reason before the
+checks that use it. What is no run at all is refused when it is read (:mod:`wlr_gym.data.check`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.data.check import increments
+from wlr_gym.data.format import COMMANDS
+from wlr_gym.data.read import Run
+from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.physics import servo
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.robot.description import Motor
+
+# ---- a check ---------------------------------------------------------------------------------------------------------
+
+
+Array = NDArray[np.float64]
+
+
+class Sound(Enum):
+    """A channel without the fault."""
+
+    YES = "the run shows that the channel is right"
+    UNDECIDED = "the run does not excite the channel enough to tell"
+
+
+@dataclass(frozen=True)
+class ChannelFault:
+    """What is wrong with one channel of one run.
+
+    Attributes:
+        row: first row that shows it; None = the whole run.
+        text: what was seen.
+        expected: what would be right.
+        remedy: what to do.
+    """
+
+    row: int | None
+    text: str
+    expected: str
+    remedy: str
+
+
+Outcome = ChannelFault | Sound
+
+#: Channels that stand for the run as a whole: clock, setpoints, encoders.
+WHOLE = ("t", "cmd", "pos")
+
+
+@dataclass(frozen=True)
+class IntakeCheck:
+    """One check.
+
+    Attributes:
+        kind: of the findings.
+        channels: that are looked at, one by one; of :data:`WHOLE` the run as a whole.
+        look: (run, channel, robot) -> fault, or sound. It gets channels that the run has, with finite values.
+    """
+
+    kind: str
+    channels: tuple[str, ...]
+    look: Callable[[Run, str, Robot], Outcome]
+
+
+def findings_of(runs: Sequence[Run], checks: Sequence[IntakeCheck], robot: Robot) -> list[IntakeFinding]:
+    """Return what the checks find, run by run.
+
+    What stands at one place (a joint's encoder, its rate and effort) is not looked at further once a check has found a fault
+    there: later checks compare with it, and the first fault counts. Nor is anything else of a run with a fault as a whole. A
+    run in which a channel cannot be judged has the fault of the others if no run shows that the channel is right: a unit, a
+    sign and a broken wire are the recording's, not the run's.
+    """
+    outcomes = [_of_one(run, checks, robot) for run in runs]
+    found = []
+    for run, outcome in zip(runs, outcomes, strict=True):
+        told = set[str]()
+        for (check, channel), seen in outcome.items():
+            fault = _shared(runs, outcomes, check, channel) if seen is Sound.UNDECIDED else seen
+            if channel not in told and isinstance(fault, ChannelFault):
+                told.add(channel)
+                found.append(_finding(run, check.kind, channel, fault))
+    return found
+
+
+def _shared(
+    runs: Sequence[Run], outcomes: Sequence[dict[tuple[IntakeCheck, str], Outcome]], check: IntakeCheck, channel: str
+) -> ChannelFault | None:
+    """The fault that a run which does not show it has like the others; None where one shows that the channel is right."""
+    first = _only_faults(runs, outcomes, check, channel)
+    if first is None:
+        return None
+    text = f"the run does not show whether it is right, and it is {check.kind} in {first[0]}"
+    return ChannelFault(None, text, first[1].expected, first[1].remedy)
+
+
+def _of_one(run: Run, checks: Sequence[IntakeCheck], robot: Robot) -> dict[tuple[IntakeCheck, str], Outcome]:
+    outcomes: dict[tuple[IntakeCheck, str], Outcome] = {}
+    bad: set[str] = set()
+    for check in checks:
+        for channel in check.channels:
+            if place(channel) in bad or bad.intersection(WHOLE) or not _is_measured(run, channel):
+                continue
+            outcomes[check, channel] = check.look(run, channel, robot)
+            if isinstance(outcomes[check, channel], ChannelFault):
+                bad.add(place(channel))
+    return outcomes
+
+
+def _only_faults(
+    runs: Sequence[Run], outcomes: Sequence[dict[tuple[IntakeCheck, str], Outcome]], check: IntakeCheck, channel: str
+) -> tuple[str, ChannelFault] | None:
+    """The first run with a fault that a check found, and the fault; None where a run shows that the channel is right."""
+    seen = [(run.name, outcome.get((check, channel))) for run, outcome in zip(runs, outcomes, strict=True)]
+    if any(one is Sound.YES for _, one in seen):
+        return None
+    return next(((name, one) for name, one in seen if isinstance(one, ChannelFault)), None)
+
+
+def _is_measured(run: Run, channel: str) -> bool:
+    return channel in WHOLE or (channel in run and bool(np.isfinite(run[channel]).any()))
+
+
+def _finding(run: Run, kind: str, channel: str, fault: ChannelFault) -> IntakeFinding:
+    time = None if fault.row is None else float(run["t"][fault.row] - run["t"][0])
+    return IntakeFinding(run.name, channel, kind, fault.text, True, time, fault.expected, fault.remedy)
+
+
+def place(channel: str) -> str:
+    """Return the joint of a channel, or the channel itself."""
+    joint = channel.partition("_")[2]
+    return joint if joint in JOINTS else channel
+
+
+def moving(run: Run) -> NDArray[np.bool_]:
+    """Return in which rows (rows,) some joint's encoder reads another count than in the row before."""
+    steps = np.stack([np.diff(run[f"pos_{joint}"], prepend=run[f"pos_{joint}"][0]) != 0.0 for joint in JOINTS])
+    return np.any(steps, axis=0)
+
+
+def correlation(a: Array, b: Array) -> tuple[float, float, float]:
+    """Return the standard deviations of two series (rows,), and their correlation (0 where one is constant)."""
+    a, b = a - a.mean(), b - b.mean()
+    sizes = float(np.std(a)), float(np.std(b))
+    return *sizes, float(a @ b) / (len(a) * sizes[0] * sizes[1]) if min(sizes) > 0.0 else 0.0
+
+
+def rate_of(run: Run, joint: str) -> Array:
+    """Return a joint's rate (rows,), rad/s: the servo's own reading, else the change of its angle."""
+    name = f"vel_{joint}"
+    if name in run and np.isfinite(run[name]).all():
+        return run[name]
+    return np.gradient(run[f"pos_{joint}"], run["t"])
+
+
+# ---- the run as a whole ----------------------------------------------------------------------------------------------
+
+
+#: s; shorter runs hold no window to compare.
+LEAST_SECONDS = 3.0
+#: s without a row. Of what was written to the servos meanwhile nothing is known, and the replay would hold the setpoints from
+#: before: a robot goes 0.2 m in this time.
+LONGEST_HOLE = 1.0
+#: rad/s, root of the sum of squares over the joints, from which on angles show how much time has passed: at this speed the
+#: encoders' rounding (0.4 mrad) is 2 ms.
+SHOWS_TIME = 0.5
+#: s that a row's time may differ from what the angles say. Encoders and their rates agree to 1.4 ms on all data at hand,
+#: backlash of 35 mrad to 3.5; a logger that stamps rows late is off by some ms.
+LATE = 0.030
+#: rad by which every single joint may differ from where its rate leads, for a step of the clock to be called a jump.
+MISSED = 0.03
+#: Share by which the clock may run faster or slower than the servos' rates say.
+CLOCK_RATE = 0.2
+#: rad that a joint must turn to show its rate.
+RATE_SHOWN = 0.2
+#: rad; legs that stay within this (13 counts) stand, and so do wheels that stay within 3.4 mm of travel.
+LEG_STANDS, WHEEL_STANDS = 0.02, 0.1
+
+
+def too_short(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a run is long enough for a window to be compared."""
+    seconds = float(run["t"][-1] - run["t"][0])
+    if seconds >= LEAST_SECONDS:
+        return Sound.YES
+    expected = f"at least {LEAST_SECONDS:g} s, better 15 to 25 s"
+    return ChannelFault(None, f"the run is {seconds:.2f} s long", expected, "record a longer run")
+
+
+def clock_jumps(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether time steps where the motion does not, or the other way round.
+
+    Angles go on by their rates times the true time between two rows. Where that says the usual period and the clock another
+    step, the clock has jumped; where rows were lost both say the same.
+    """
+    time = run["t"]
+    steps = np.diff(time)
+    passed, missed, speed = _time_by_angles(run)
+    late = (np.abs(passed - steps) > LATE) & (speed > SHOWS_TIME) & (missed < MISSED)
+    late &= np.abs(passed - np.median(steps)) < LATE  # else rows were lost, in which the rates may have changed
+    hole = steps > LONGEST_HOLE
+    if not (late | hole).any():
+        return Sound.YES
+    row = int(np.argmax(late | hole))
+    step, count = f"{steps[row]:.3g} s from row {row} to the next", int((late | hole).sum())
+    text = (
+        f"{step}, in which the joints moved as in {1e3 * passed[row]:.0f} ms" if late[row] else f"{step}, nothing between them"
+    )
+    text = f"{text} ({count} times in the run)" if count > 1 else text
+    expected = "a monotonic clock, rows 20 ms apart; single lost rows do no harm"
+    return ChannelFault(row, text, expected, "split the run there into two files, or record it again with a monotonic clock")
+
+
+def clock_rate(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether the clock runs as fast as the servos' rates say; one joint alone would be its rate's fault."""
+    turning = [joint for joint in JOINTS if f"vel_{joint}" in run and np.ptp(run[f"pos_{joint}"]) > RATE_SHOWN]
+    if not turning:
+        return Sound.UNDECIDED
+    rate = float(np.median([_angle_over_rate(run, joint) for joint in turning]))
+    if not abs(rate - 1.0) > CLOCK_RATE:
+        return Sound.YES
+    text = f"by the servos' rates {rate:.2f} times as much time passes between rows as the clock says"
+    return ChannelFault(0, text, "seconds", "write the time at which each row was read, in s")
+
+
+def _angle_over_rate(run: Run, joint: str) -> float:
+    """Slope of a joint's turning over the integral of its rate, over half a second each."""
+    rate = run[f"vel_{joint}"]
+    rows = np.isfinite(rate)
+    turned, measured = increments(run["t"][rows], run[f"pos_{joint}"][rows], rate[rows])
+    return float(turned @ measured) / max(float(measured @ measured), 1e-12)
+
+
+def _time_by_angles(run: Run) -> tuple[Array, Array, Array]:
+    """Time between rows (rows - 1,) by what the joints turn, s; the largest angle it leaves unexplained, rad; speed, rad/s."""
+    angles = np.stack([np.diff(run[f"pos_{joint}"]) for joint in JOINTS])
+    rates = np.stack([0.5 * (rate[1:] + rate[:-1]) for rate in (rate_of(run, joint) for joint in JOINTS)])
+    squares = np.sum(rates**2, axis=0)
+    passed = np.sum(rates * angles, axis=0) / np.maximum(squares, 1e-12)
+    return passed, np.max(np.abs(angles - rates * passed), axis=0), np.sqrt(squares)
+
+
+def motors_off(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether no motor was on in the whole run."""
+    if np.isfinite(np.stack([run[name] for name in COMMANDS])).any():
+        return Sound.YES
+    text = "no motor was on in the whole run: nothing to replay"
+    return ChannelFault(None, text, "setpoints in the columns cmd_*", "record the setpoints; NaN is for motors that are off")
+
+
+def stands_still(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether no joint moves: such a run shows nothing of the model, and as held-out run proves nothing."""
+    for joint in JOINTS:
+        if np.ptp(run[f"pos_{joint}"]) > (LEG_STANDS if joint in LEGS else WHEEL_STANDS):
+            return Sound.YES
+    text = f"no leg moves by more than {LEG_STANDS:g} rad and no wheel by more than {WHEEL_STANDS:g} rad in the whole run"
+    expected = "a robot that drives or moves its legs"
+    return ChannelFault(None, text, expected, "switch the motors on and record motions made for it: wlr record --list")
+
+
+# ---- joints ----------------------------------------------------------------------------------------------------------
+
+
+#: Rows that a correlation needs.
+LEAST_ROWS = 100
+#: Share of the time of half a turn at no-load speed in which no joint gets half a turn further, be it dragged.
+TOO_QUICK = 0.5
+#: rad; a joint that is asked to move more than this ...
+ASKED = 0.2
+#: ... and moves less than this share of it is dead.
+SHOWN = 0.02
+#: s for which an encoder that is stuck reads one and the same count; no delay or profile holds a joint so long.
+STUCK = 0.3
+#: Share of the stall torque that the controller asks for meanwhile: 3.6 N m of a leg, 0.75 N m of a wheel, more than any
+#: friction of gears or floor.
+PUSHED = 0.5
+#: Encoder counts of lag that a leg's effort must change by without the encoder: 12 mrad, 0.4 N m; sound data reach 2.
+LEAST_COUNTS = 8
+#: Rows for which a leg's encoder is held, for its effort to tell: the noise of the effort is 0.3 mrad of lag.
+LEAST_HELD = 25
+#: Measured effort over what the controller asks for, from which on the servo does see its joint held: the joint is blocked or
+#: its motor limp, which is no fault of the data.
+SEES = 0.5
+#: Ratio of measured to commanded wheel motion that means a turned sign.
+MIRRORED = -0.5
+#: rad in half a second by which an angle and its rate both must turn, one sigma.
+TURNED = 0.02
+#: Correlation of a rate with its angle's turning that means a turned sign.
+OPPOSITE = -0.8
+#: Mean product of a leg's effort and its lag behind the goal, over the product of their rms, that means a turned sign of the
+#: effort. A servo pushes towards its goal: with the right sign 0.99 in the median, and 0.10 with 0.35 N m of dry friction.
+PUSHES_AWAY = -0.5
+#: Partial correlation of a wheel's effort with the voltage its controller asks for, beside its rate, below which the effort
+#: does not answer the controller. With the right sign 0.95 to 1.00 on all data at hand.
+ANSWERS = 0.5
+#: V, rms, of that voltage beside what goes with the rate: less is the noise of the rates.
+ASKED_VOLTAGE = 0.1
+
+
+def wrapped(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether an angle starts anew after a turn: no joint gets half a turn further between rows so close together."""
+    longest = TOO_QUICK * np.pi / _motor(robot, place(channel)).no_load_speed
+    jumps = np.flatnonzero((np.abs(np.diff(run[channel])) > np.pi) & (np.diff(run["t"]) < longest))
+    if not len(jumps):
+        return Sound.YES
+    row = int(jumps[0]) + 1
+    text = f"jumps {len(jumps)} times, first by {run[channel][row] - run[channel][row - 1]:.3g} rad in row {row}"
+    return ChannelFault(row, text, "angles that go on past a turn", "numpy.unwrap mends it")
+
+
+def dead(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a joint shows nothing of what it is asked to do, in the whole run."""
+    joint = place(channel)
+    asked, shown = _motions(run, joint)
+    if not len(asked) or _size(joint, asked) < ASKED:
+        return Sound.YES if np.ptp(run[channel]) > 0.0 else Sound.UNDECIDED
+    if _size(joint, shown) >= SHOWN * _size(joint, asked) or _sees(run, joint, robot, slice(None)):
+        return Sound.YES
+    text = f"commanded to move by {_size(joint, asked):.2g} rad and shows {_size(joint, shown):.2g} rad"
+    return ChannelFault(_first_asked(run, joint), text, *_FOLLOWS)
+
+
+_FOLLOWS = "an encoder that follows", "dead encoder, or the motor is not on: check its cable and its torque switch"
+
+
+def stuck(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether an encoder reads one and the same count while the controller pushes harder than any friction can hold.
+
+    Or, of a leg, while its effort changes: that is gain times lag, so that an effort cannot change unless the angle does.
+    """
+    joint = place(channel)
+    held = np.diff(run[channel], prepend=np.nan) == 0.0
+    pushed = np.abs(asked_torque(run, joint, robot)) > PUSHED * _motor(robot, joint).stall_torque
+    for start, end in _stretches(pushed & held):
+        rows = slice(start, end)
+        if run["t"][end - 1] - run["t"][start] > STUCK and not _sees(run, joint, robot, rows):
+            return ChannelFault(start, f"{_reads(run, channel, start, end)} while its setpoint is elsewhere", *_FOLLOWS)
+    for start, end in _stretches(held) if joint in LEGS else ():
+        lag = _unseen_lag(run, joint, robot, slice(start, end))
+        if lag > LEAST_COUNTS * robot.sensors.encoder.position:
+            text = f"{_reads(run, channel, start, end)} while its effort changes by what takes a lag of {1e3 * lag:.0f} mrad"
+            return ChannelFault(start, text, *_FOLLOWS)
+    return Sound.YES
+
+
+def _reads(run: Run, channel: str, start: int, end: int) -> str:
+    return f"reads {run[channel][start]:.4g} rad for {run['t'][end - 1] - run['t'][start]:.2f} s"
+
+
+def _unseen_lag(run: Run, joint: str, robot: Robot, rows: slice) -> float:
+    """Change of a leg's lag, rad, that a change of its effort takes beyond that of its setpoint; of 19 rows in 20."""
+    effort = run[f"eff_{joint}"][rows] if f"eff_{joint}" in run else np.zeros(0)
+    lag = run[f"cmd_{joint}"][rows] - run[f"pos_{joint}"][rows]
+    if len(effort) < LEAST_HELD or not np.isfinite(effort).all() or not np.isfinite(lag).all():
+        return 0.0
+    motor, supply = robot.servo.leg, robot.servo.supply_voltage
+    stiffness = motor.kp * motor.stall_torque / supply
+    return float(np.ptp(np.quantile(effort, (0.025, 0.975)))) / stiffness - float(np.ptp(lag))
+
+
+def mirrored(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a joint moves against its command."""
+    joint = place(channel)
+    asked, shown = _motions(run, joint)
+    if not len(asked) or _size(joint, asked) < ASKED:
+        return Sound.UNDECIDED
+    slope = float(asked @ shown / max(float(asked @ asked), 1e-12))
+    if slope >= MIRRORED:
+        return Sound.YES
+    text = f"moves against its command (ratio {slope:.2f})"
+    return ChannelFault(_first_asked(run, joint), text, "a ratio near 1", "check the sign in the hardware file")
+
+
+def rate_against_angle(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a servo's rate is against the turning of its angle, over half a second each."""
+    angle = f"pos_{place(channel)}"
+    rows = np.isfinite(run[channel])
+    if rows.sum() < LEAST_ROWS:
+        return Sound.UNDECIDED
+    turned, measured, together = correlation(*increments(run["t"][rows], run[angle][rows], run[channel][rows]))
+    if min(turned, measured) < TURNED:
+        return Sound.UNDECIDED
+    if together > OPPOSITE:
+        return Sound.YES
+    text = f"turns against {angle} (correlation {together:.2f}): one of the two has the wrong sign"
+    row = int(np.argmax(np.abs(np.nan_to_num(run[channel]))))
+    return ChannelFault(row, text, "a correlation near 1", "check the sign in the hardware file")
+
+
+def without_signal(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a rate or effort never changes although its motor is on and its joint turns."""
+    joint = place(channel)
+    on = np.isfinite(run[f"cmd_{joint}"]) & np.isfinite(run[channel])
+    if on.sum() < LEAST_ROWS or np.ptp(run[f"pos_{joint}"][on]) < ASKED:
+        return Sound.UNDECIDED
+    if np.ptp(run[channel][on]) > 0.0:
+        return Sound.YES
+    text = f"reads {run[channel][on][0]:g} throughout while the joint turns by {np.ptp(run[f'pos_{joint}'][on]):.2g} rad"
+    return ChannelFault(
+        int(np.argmax(on)), text, "readings that change with the motion", "leave the column out, or record it again"
+    )
+
+
+def leg_effort_against(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a leg's effort points away from its goal."""
+    lag, effort = run[f"cmd_{place(channel)}"] - run[f"pos_{place(channel)}"], run[channel]
+    rows = np.isfinite(lag) & np.isfinite(effort)
+    size = float(np.linalg.norm(lag[rows]) * np.linalg.norm(effort[rows]))
+    if rows.sum() < LEAST_ROWS or size == 0.0:
+        return Sound.UNDECIDED
+    together = float(lag[rows] @ effort[rows]) / size
+    if together >= PUSHES_AWAY:
+        return Sound.YES if together > -PUSHES_AWAY else Sound.UNDECIDED
+    text = f"pushes away from its goal (correlation with the lag {together:.2f})"
+    row = int(np.argmax(np.abs(np.where(rows, effort, 0.0))))
+    return ChannelFault(row, text, "a sign that goes with the leg's angle", "turn the sign of the column")
+
+
+def wheel_effort_against(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a wheel's effort is against the voltage that its controller asks for.
+
+    effort = (K/R) (voltage - K rate), and the voltage follows from setpoint, rate and angle. Effort times rate shows no sign:
+    a wheel that is a little larger than the others is dragged by them, and brakes for whole runs.
+    """
+    joint = place(channel)
+    voltage, rate, effort = wheel_voltage(run, joint, robot), rate_of(run, joint), run[channel]
+    rows = np.isfinite(voltage) & np.isfinite(effort) & np.isfinite(rate)
+    if rows.sum() < LEAST_ROWS:
+        return Sound.UNDECIDED
+    known = np.stack([rate[rows], np.ones(rows.sum())], axis=1)
+    beside = [values - known @ np.linalg.lstsq(known, values, rcond=None)[0] for values in (voltage[rows], effort[rows])]
+    asked, _, together = correlation(*beside)
+    if asked < ASKED_VOLTAGE or abs(together) < ANSWERS:
+        return Sound.UNDECIDED
+    if together > 0.0:
+        return Sound.YES
+    text = f"is against the voltage that the wheel's controller asks for (correlation {together:.2f})"
+    row = int(np.flatnonzero(rows)[np.argmax(np.abs(beside[1]))])
+    return ChannelFault(row, text, "positive where the motor drives the wheel forward", "turn the sign of the column")
+
+
+# ---- what the servo asks for -----------------------------------------------------------------------------------------
+
+
+def asked_torque(run: Run, joint: str, robot: Robot) -> Array:
+    """Motor torque (rows,), N m, that the servo's law asks for by the joint's own readings; NaN while it is off."""
+    motor, supply = _motor(robot, joint), robot.servo.supply_voltage
+    constant, resistance = servo.motor_constants(motor.stall_torque, motor.no_load_speed, supply)
+    rate = np.gradient(run[f"pos_{joint}"], run["t"])
+    if joint in LEGS:
+        voltage = np.clip(motor.kp * (run[f"cmd_{joint}"] - run[f"pos_{joint}"]), -supply, supply)
+    else:
+        voltage = wheel_voltage(run, joint, robot)
+    return servo.motor_torque(constant, resistance, voltage, rate)
+
+
+def wheel_voltage(run: Run, wheel: str, robot: Robot) -> Array:
+    """Voltage (rows,), V, that a wheel's controller asks for: its profile and its integral, from row to row; NaN while off."""
+    motor, supply = robot.servo.wheel, robot.servo.supply_voltage
+    _, acceleration = servo.profile_limits([0.0] * 8, [run.meta.profile.wheel_acceleration] * 8)
+    limit = float(acceleration[-1])
+    steps, goals = np.diff(run["t"]).tolist(), run[f"cmd_{wheel}"].tolist()
+    angles, rates = run[f"pos_{wheel}"].tolist(), rate_of(run, wheel).tolist()
+    voltage = np.full(len(angles), np.nan)
+    reference = None
+    for row, (step, goal) in enumerate(zip(steps, goals, strict=False)):
+        if goal != goal:  # torque off
+            reference = None
+            continue
+        position, velocity = reference or (angles[row], rates[row])
+        position, velocity, _, _ = servo.wheel_profile_step(
+            position, velocity, goal, limit, step, angles[row], motor.kp, supply
+        )
+        reference = float(position), float(velocity)
+        voltage[row + 1] = servo.controller_voltage(motor.kp, motor.kd, *reference, angles[row + 1], rates[row + 1], supply)
+    return voltage
+
+
+def _sees(run: Run, joint: str, robot: Robot, rows: slice) -> bool:
+    """Whether the measured effort is what the servo's law asks for by these readings: then the servo saw the same."""
+    if f"eff_{joint}" not in run:
+        return False
+    asked, effort = asked_torque(run, joint, robot)[rows], run[f"eff_{joint}"][rows]
+    both = np.isfinite(asked) & np.isfinite(effort)
+    return bool(asked[both] @ effort[both] > SEES * (asked[both] @ asked[both]) > 0.0)
+
+
+def _motor(robot: Robot, joint: str) -> Motor:
+    return robot.servo.leg if joint in LEGS else robot.servo.wheel
+
+
+def _motions(run: Run, joint: str) -> tuple[Array, Array]:
+    """How a joint was asked to move and moved while on: a wheel from row to row, a leg about its mean, rad."""
+    command, position = run[f"cmd_{joint}"], run[f"pos_{joint}"]
+    on = np.isfinite(command) & np.isfinite(position)
+    if on.sum() < LEAST_ROWS // 2:
+        return np.zeros(0), np.zeros(0)
+    if joint in LEGS:
+        return command[on] - command[on].mean(), position[on] - position[on].mean()
+    return command[on][:-1] * np.diff(run["t"][on]), np.diff(position[on])
+
+
+def _size(joint: str, motion: Array) -> float:
+    return float(np.ptp(motion) if joint in LEGS else np.abs(motion).sum())
+
+
+def _first_asked(run: Run, joint: str) -> int:
+    """First row whose setpoint asks the joint to move."""
+    command = run[f"cmd_{joint}"]
+    rest = command[np.isfinite(command)][0] if joint in LEGS else 0.0
+    return int(np.argmax(np.abs(np.nan_to_num(command - rest)) > 0.0))
+
+
+def _stretches(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First row and end of every run of chosen rows."""
+    edges = np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+# ---- inertial sensors ------------------------------------------------------------------------------------------------
+
+
+#: Turning by the gyroscope over turning by another sensor that means degrees per second: 57.3 against a true reference. Wheels
+#: that slip in a turn show two to three times the turn, and accelerations more tilt than there is: 17 to 57. Sound: 0.2 to 1.
+IN_DEGREES = 8.0
+#: Correlation of the two from which on they tell of the same motion.
+TOGETHER = 0.8
+#: rad in half a second, one sigma, by which the reference must turn: wheels' rounding is 0.0003, the tilt's noise 0.0014.
+LEAST_TURN = 0.004
+#: Noise of the gyroscope at rest over the robot file's that means degrees per second: within a factor of four of 57. Below
+#: :data:`IN_DEGREES` it is in rad/s; sound data have 0.5 to 1.1.
+NOISE_IN_DEGREES = (15.0, 230.0)
+#: s over which accelerations are averaged to show a tilt.
+AVERAGED = 0.2
+#: m/s2; the accelerometer's z reads about +9.8 at rest, so that half of all readings below this hang upside down.
+UPSIDE_DOWN = -5.0
+#: Rows at rest that show a sensor's noise.
+LEAST_AT_REST = 15
+#: Standard deviation of a normal variable over the median of its magnitude.
+NORMAL = 1.4826
+#: Rows at a channel's extreme that mean a range that ends there: noise repeats no value so often.
+AT_END = 6
+#: Rows there over rows at the levels next to it. A sensor of coarse resolution has fewer at its extreme than inside.
+PILED_UP = 5.0
+#: s for which a noisy sensor must repeat one value to be stuck.
+IMU_STUCK = 0.5
+
+IMU = ("gyro_x", "gyro_y", "gyro_z", "acc_x", "acc_y", "acc_z")
+
+
+def in_degrees(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether the gyroscope is in degrees per second, by what else shows the turning, else by its noise at rest."""
+    for name, angle in _references(run, channel, robot):
+        turned, measured, together = _turning(run, channel, angle)
+        if turned < LEAST_TURN or abs(together) < TOGETHER:
+            continue
+        if measured < IN_DEGREES * turned:
+            return Sound.YES
+        text = f"turns {measured / turned:.0f} times as much as {name} (correlation {together:.2f})"
+        return _degrees(int(np.argmax(np.abs(np.nan_to_num(run[channel])))), text)
+    noise = _noise_at_rest(run, channel) / robot.sensors.imu.gyro_noise
+    if 0.0 < noise < IN_DEGREES:
+        return Sound.YES
+    if NOISE_IN_DEGREES[0] < noise < NOISE_IN_DEGREES[1]:
+        return _degrees(0, f"its noise at rest is {noise:.0f} times the robot file's")
+    return Sound.UNDECIDED
+
+
+def _degrees(row: int, text: str) -> ChannelFault:
+    return ChannelFault(row, f"{text}: degrees per second?", "rad/s", "multiply by pi/180 = 0.017453")
+
+
+def _turning(run: Run, channel: str, angle: Array) -> tuple[float, float, float]:
+    """How far an angle and a gyroscope turn in half a second (standard deviations, rad), and their correlation."""
+    finite = np.isfinite(run[channel]) & np.isfinite(angle)
+    if finite.sum() < LEAST_ROWS:
+        return 0.0, 0.0, 0.0
+    return correlation(*increments(run["t"][finite], np.unwrap(angle[finite]), run[channel][finite]))
+
+
+def _references(run: Run, channel: str, robot: Robot) -> list[tuple[str, Array]]:
+    """What else shows how far the body turned about an axis, the best first: names and angles (rows,), rad."""
+    camera = {"gyro_z": "cam_yaw", "gyro_y": "cam_pitch"}.get(channel, "")
+    seen = [(camera, run[camera])] if camera in run and np.isfinite(run[camera]).sum() >= LEAST_ROWS else []
+    return [*seen, *_references_on_board(run, channel, robot)]
+
+
+def _references_on_board(run: Run, channel: str, robot: Robot) -> list[tuple[str, Array]]:
+    if channel == "gyro_z":
+        return [("the wheels", _yaw_of_wheels(run, robot))]
+    across = "acc_y" if channel == "gyro_x" else "acc_x"
+    if not all(name in run and np.isfinite(run[name]).sum() >= LEAST_ROWS for name in (across, "acc_z")):
+        return []
+    tilt = np.arctan2(_averaged(run, across), _averaged(run, "acc_z"))
+    return [("gravity in the accelerometer", tilt if channel == "gyro_x" else -tilt)]
+
+
+def _yaw_of_wheels(run: Run, robot: Robot) -> Array:
+    """Heading (rows,), rad, of a body whose wheels roll without slip: spins in the body's frame, legs included."""
+    travel = {w: run[f"pos_{w}"] + run[f"pos_{leg}"] for w, leg in zip(WHEELS, LEGS, strict=True)}
+    right = travel["wheel_rf"] + travel["wheel_rr"]
+    left = travel["wheel_lf"] + travel["wheel_lr"]
+    return (right - left) * (robot.wheel.radius / (4.0 * robot.hip_position.y))
+
+
+def _averaged(run: Run, channel: str) -> Array:
+    """A channel (rows,) averaged over :data:`AVERAGED` seconds."""
+    known = np.isfinite(run[channel])
+    values = np.interp(run["t"], run["t"][known], run[channel][known])
+    half = max(1, round(0.5 * AVERAGED / float(np.median(np.diff(run["t"])))))
+    padded = np.pad(values, half, mode="edge")
+    return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), mode="valid")
+
+
+def _noise_at_rest(run: Run, channel: str) -> float:
+    """Noise (one sigma), from rows in which nothing has moved since the row before; NaN where they are too few."""
+    changes = np.diff(run[channel])[~moving(run)[1:]]
+    changes = changes[np.isfinite(changes)]
+    return float(np.median(np.abs(changes))) * NORMAL / math.sqrt(2.0) if len(changes) >= LEAST_AT_REST else math.nan
+
+
+def gyro_against(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether the gyroscope turns against the camera, or where that shows nothing against wheels or gravity."""
+    remedy = "check the mounting in the hardware file, and the camera's axes"
+    for name, angle in _references(run, channel, robot):
+        turned, measured, together = _turning(run, channel, angle)
+        if min(turned, measured) < LEAST_TURN or abs(together) < TOGETHER:
+            continue
+        if together > OPPOSITE:
+            return Sound.YES
+        text = f"turns against {name} (correlation {together:.2f})"
+        return ChannelFault(int(np.argmax(np.abs(np.nan_to_num(run[channel])))), text, "a correlation near 1", remedy)
+    return Sound.UNDECIDED
+
+
+def upside_down(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether the accelerometer shows gravity itself, or its z axis points down."""
+    middle = float(np.nanmedian(run[channel]))
+    if middle > UPSIDE_DOWN:
+        return Sound.YES
+    expected = "+9.8 at rest, the push of the floor"
+    return ChannelFault(None, f"reads {middle:.1f} m/s2 (median)", expected, "check its mounting in the hardware file")
+
+
+def imu_saturated(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether readings pile up, bit-equal, at a channel's extreme while the robot moves: its range ends there."""
+    rows = np.isfinite(run[channel]) & moving(run)
+    levels, counts = np.unique(run[channel][rows], return_counts=True)
+    if len(levels) < AT_END:
+        return Sound.YES
+    for end, inside in ((0, slice(1, 6)), (-1, slice(-6, -1))):
+        if counts[end] >= AT_END and counts[end] > PILED_UP * float(np.mean(counts[inside])):
+            text = f"{counts[end]} rows at its extreme of {levels[end]:.4g}, bit for bit"
+            row = int(np.argmax(rows & (run[channel] == levels[end])))
+            return ChannelFault(
+                row, text, "a range that the motion does not reach", "set a wider range of the sensor and record again"
+            )
+    return Sound.YES
+
+
+def imu_without_signal(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a sensor that has noise repeats one value while the robot moves.
+
+    A simulation without noise may do so rightly: a run whose other channels repeat themselves at rest is left alone.
+    """
+    if not _has_noise(run):
+        return Sound.UNDECIDED
+    same = (np.diff(run[channel], prepend=np.nan) == 0.0) | ~np.isfinite(run[channel])
+    first, longest = _longest(same)
+    seconds = float(run["t"][first + longest - 1] - run["t"][first]) if longest else 0.0
+    if seconds < IMU_STUCK or not moving(run)[first : first + longest].any() or np.isnan(run[channel][first]):
+        return Sound.YES
+    text = f"reads {run[channel][first]:.4g} for {seconds:.2f} s while the robot moves"
+    return ChannelFault(first, text, "noise at least", "leave the column out, or record it again: check the sensor's cable")
+
+
+def _has_noise(run: Run) -> bool:
+    """Whether any inertial channel changes from row to row while nothing moves; yes where something always moves."""
+    still = ~moving(run)
+    if still.sum() < LEAST_AT_REST:
+        return True
+    names = [name for name in IMU if name in run]
+    return any(len(np.unique(run[name][still][np.isfinite(run[name][still])])) > 0.5 * still.sum() for name in names)
+
+
+def _longest(chosen: NDArray[np.bool_]) -> tuple[int, int]:
+    """First row and length of the longest stretch of chosen rows."""
+    edges = np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0))
+    if not len(edges):
+        return 0, 0
+    lengths = edges[1::2] - edges[::2]
+    return int(edges[::2][np.argmax(lengths)]), int(lengths.max())
+
+
+# ---- all checks ------------------------------------------------------------------------------------------------------
+
+
+#: In the order in which they are made: what a check compares with has been checked before.
+CHECKS: tuple[IntakeCheck, ...] = (
+    IntakeCheck("short", ("t",), too_short),
+    IntakeCheck("missing", ("cmd",), motors_off),
+    IntakeCheck("still", ("pos",), stands_still),
+    IntakeCheck("wrap", tuple(f"pos_{joint}" for joint in JOINTS), wrapped),
+    IntakeCheck("clock", ("t",), clock_rate),
+    IntakeCheck("clock", ("t",), clock_jumps),
+    IntakeCheck("dead", tuple(f"pos_{joint}" for joint in JOINTS), dead),
+    IntakeCheck("mirrored", tuple(f"pos_{joint}" for joint in JOINTS), mirrored),
+    IntakeCheck("dead", tuple(f"pos_{joint}" for joint in JOINTS), stuck),
+    IntakeCheck("mirrored", tuple(f"vel_{joint}" for joint in JOINTS), rate_against_angle),
+    IntakeCheck("dead", tuple(f"{kind}_{joint}" for kind in ("vel", "eff") for joint in JOINTS), without_signal),
+    IntakeCheck("mirrored", tuple(f"eff_{leg}" for leg in LEGS), leg_effort_against),
+    IntakeCheck("mirrored", tuple(f"eff_{wheel}" for wheel in WHEELS), wheel_effort_against),
+    IntakeCheck("saturated", IMU, imu_saturated),
+    IntakeCheck("dead", IMU, imu_without_signal),
+    IntakeCheck("mirrored", ("acc_z",), upside_down),
+    IntakeCheck("units", ("gyro_z", "gyro_y", "gyro_x"), in_degrees),
+    IntakeCheck("mirrored", ("gyro_z", "gyro_y", "gyro_x"), gyro_against),
+)
