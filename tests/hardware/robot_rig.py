@@ -90,7 +90,7 @@ def machine_of(core: Any) -> Any:
 
 def emulated_imu(link: Any, port: ImuPort) -> ImuStream:
     """The IMU of an emulated robot's link, read with other ranges or another calibration."""
-    return ImuStream(port, link.clock.now, lambda *_: MemoryDevice(link.clock, "imu"))
+    return ImuStream(port, link.clock.now, lambda *_: MemoryDevice(link.clock.machine, "imu"))
 
 
 class Rig:

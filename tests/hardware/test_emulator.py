@@ -464,7 +464,7 @@ def test_imu_streams_gravity_at_its_rate():
     machine = make()
     machine.advance(0.1)
     parser = FrameParser(IMU_FRAMES)
-    frames = [frame for emission in machine.take_output()["imu"] for frame in parser.feed(emission.data)]
+    frames = parser.feed(machine.arrived("imu"))
     assert [frame[0] for frame in frames] == list(range(1, 21))
     assert [b[1] - a[1] for a, b in pairwise(frames)] == [5000] * 19
     gravity = accel_per_count(4) * np.array(frames[-1][2:5])
@@ -572,7 +572,7 @@ def test_same_seed_same_bytes():
         for _ in range(20):
             machine.advance(0.005)
             out += b"".join(e.data for e in machine.lines["legs"].receive(protocol.sync_read(124, 12, LEG_IDS), machine.time))
-        return out + b"".join(e.data for e in machine.take_output()["imu"])
+        return out + machine.arrived("imu")
 
     assert run() == run()
 

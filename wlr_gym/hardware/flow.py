@@ -196,31 +196,6 @@ class FlowReader:
         return ""
 
 
-class Flow(Protocol):
-    """A connected flow sensor. One thread owns it."""
-
-    @property
-    def statistics(self) -> FlowStatistics:
-        """What came since it was opened."""
-        ...
-
-    def open(self) -> None:
-        """Connect and set up.
-
-        Raises:
-            InputError: nothing there, or not what the hardware file says.
-        """
-        ...
-
-    def close(self) -> None:
-        """Disconnect."""
-        ...
-
-    def read(self) -> FlowReading:
-        """Return the reading of this control step; never waits and never fails: why there is none stands in it."""
-        ...
-
-
 # ---- behind a microcontroller ----
 
 
@@ -253,7 +228,11 @@ class FlowStream:
         return found
 
     def open(self) -> None:
-        """Open the port; see :meth:`wlr_gym.hardware.serial_frames.FrameStream.open`."""
+        """Open the port and throw away what piled up in it.
+
+        Raises:
+            InputError: it is not there, cannot be opened, or another program has it.
+        """
         self._stream.open()
         self._reader = FlowReader(self._port, self._sensor, self._clock())
 
@@ -547,14 +526,12 @@ class ChipPoller:
             self._frame_at = now
 
 
-def make_flow(robot: Robot, hardware: Hardware, clock: Callable[[], float] = time.monotonic) -> Flow | None:
-    """Return the flow sensor that the hardware file names, not yet connected; None = it names none.
+#: A connected flow sensor. One thread owns it.
+Flow = FlowStream | ChipPoller
 
-    Args:
-        robot: whose file has the sensor's numbers.
-        hardware: port, axes, calibration.
-        clock: s; what ages are told by.
-    """
+
+def make_flow(robot: Robot, hardware: Hardware, clock: Callable[[], float] = time.monotonic) -> Flow | None:
+    """Return the flow sensor that the hardware file names, not yet connected; None = it names none. ``clock``: s."""
     port, sensor = hardware.flow, robot.sensors.flow
     if port is None or sensor is None:
         return None

@@ -120,32 +120,6 @@ class Conversion:
         return to_counts(force, self._accel_count), to_counts(rate, self._gyro_count)
 
 
-class Imu(Protocol):
-    """A connected IMU. One thread owns it."""
-
-    statistics: ImuStatistics
-
-    def open(self) -> None:
-        """Connect and set up.
-
-        Raises:
-            InputError: nothing there, or not what the hardware file says.
-        """
-        ...
-
-    def close(self) -> None:
-        """Disconnect."""
-        ...
-
-    def read(self) -> ImuReading | None:
-        """Return the newest reading without waiting for one; None = nothing has come yet.
-
-        Raises:
-            ImuGoneError: the port is gone.
-        """
-        ...
-
-
 class ImuStream:
     """The IMU behind a microcontroller.
 
@@ -174,7 +148,11 @@ class ImuStream:
         self._newest: tuple[Sequence[int], float] | None = None
 
     def open(self) -> None:
-        """Open the port; see :meth:`wlr_gym.hardware.serial_frames.FrameStream.open`."""
+        """Open the port and throw away what piled up in it.
+
+        Raises:
+            InputError: it is not there, cannot be opened, or another program has it.
+        """
         self._begin()
         self._stream.open()
 
@@ -183,7 +161,11 @@ class ImuStream:
         self._stream.close()
 
     def read(self) -> ImuReading | None:
-        """Return the newest frame; see :class:`Imu`. None also while nobody knows how old it is."""
+        """Return the newest reading without waiting for one; None = nothing has come yet, or nobody knows how old it is.
+
+        Raises:
+            ImuGoneError: the port is gone.
+        """
         try:
             frames = self._stream.read()
         except ConnectionError as error:
@@ -351,9 +333,12 @@ class Mpu6050:
             self._bus = None
 
     def read(self) -> ImuReading | None:
-        """Read the chip; see :class:`Imu`.
+        """Return the newest reading; None = there was none yet.
 
         A failed burst is repeated once. A chip that has nothing new (it fell asleep in a brown-out) shows as growing age.
+
+        Raises:
+            ImuGoneError: it has not answered for long.
         """
         burst = self._burst()
         now = self._clock()
@@ -386,11 +371,10 @@ class Mpu6050:
         return None
 
 
-def make_imu(port: ImuPort, clock: Callable[[], float] = time.monotonic) -> Imu:
-    """Return the IMU the hardware file names, not yet connected.
+#: A connected IMU. One thread owns it.
+Imu = ImuStream | Mpu6050
 
-    Args:
-        port: driver, device, ranges, calibration.
-        clock: s; what ages are told by.
-    """
+
+def make_imu(port: ImuPort, clock: Callable[[], float] = time.monotonic) -> Imu:
+    """Return the IMU the hardware file names, not yet connected; ``clock`` (s) tells ages."""
     return Mpu6050(port, clock) if port.driver == "i2c" else ImuStream(port, clock)

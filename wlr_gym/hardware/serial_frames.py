@@ -65,27 +65,13 @@ def is_pseudo_terminal(path: str) -> bool:
 
 
 class Device(Protocol):
-    """An open serial device, real or emulated. Failures are ``OSError``."""
+    """An open serial device: :class:`SerialDevice`, or an emulated one. Failures are ``OSError``."""
 
-    def received(self) -> bytes:
-        """Return all bytes that have come; does not wait."""
-        ...
-
-    def wait(self, seconds: float) -> bytes:
-        """Return bytes as soon as there are some; none when the time is over."""
-        ...
-
-    def write(self, data: bytes) -> int:
-        """Send bytes; return how many the device took. Does not wait until it would take more."""
-        ...
-
-    def reset_input_buffer(self) -> None:
-        """Throw away what has come."""
-        ...
-
-    def close(self) -> None:
-        """Close it."""
-        ...
+    def received(self) -> bytes: ...
+    def wait(self, seconds: float) -> bytes: ...
+    def write(self, data: bytes) -> int: ...
+    def reset_input_buffer(self) -> None: ...
+    def close(self) -> None: ...
 
 
 class SerialDevice:
@@ -120,7 +106,7 @@ class SerialDevice:
             raise InputError(f"{name} {path}: cannot be opened: {reason}{hint}") from None
 
     def received(self) -> bytes:
-        """Return all bytes that have come; see :class:`Device`."""
+        """Return all bytes that have come; does not wait."""
         data = b""
         for _ in range(_LARGEST_BACKLOG):
             part = self.wait(0.0)
@@ -130,7 +116,7 @@ class SerialDevice:
         return data
 
     def wait(self, seconds: float) -> bytes:
-        """Return bytes as soon as there are some; see :class:`Device`."""
+        """Return bytes as soon as there are some; none when the time is over."""
         number = self._number()
         if not select.select([number], [], [], seconds)[0]:
             return b""
@@ -139,7 +125,7 @@ class SerialDevice:
         raise OSError("it is ready and has nothing: disconnected, or another program reads it")
 
     def write(self, data: bytes) -> int:
-        """Send bytes; a full buffer is an ``OSError``, a nearly full one takes a part. See :class:`Device`."""
+        """Send bytes; a full buffer is an ``OSError``, a nearly full one takes a part."""
         return os.write(self._number(), data)
 
     def reset_input_buffer(self) -> None:

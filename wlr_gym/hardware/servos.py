@@ -1,4 +1,7 @@
-"""The eight servos in SI units and joint order, over however many buses: counts, mounting signs and zeros end here."""
+"""The eight servos in SI units and joint order, over however many buses: counts, mounting signs and zeros end here.
+
+New servos: :func:`find_servos` finds them at any baud rate, :func:`set_up` gives them their id, registers and baud rate.
+"""
 
 from __future__ import annotations
 
@@ -142,7 +145,7 @@ class Servos:
     """All servos of a robot.
 
     Use as a context manager, or :meth:`open` and :meth:`close`. Nothing here decides what is safe: callers other than the
-    command limiter read only.
+    command limiter read only. Errors are those of :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
 
     Args:
         robot: its ``dynamixel_ids``.
@@ -181,11 +184,7 @@ class Servos:
             self._health[name] = Block(table, *_HEALTH)
 
     def open(self) -> None:
-        """Open all ports, or none.
-
-        Raises:
-            InputError: a port is not there, or cannot be opened.
-        """
+        """Open all ports, or none."""
         with contextlib.ExitStack() as stack:
             for group in self.groups.values():
                 group.open()
@@ -212,11 +211,7 @@ class Servos:
     # ---- reading ----
 
     def supervise(self) -> None:
-        """Have the servos' registers read with every :meth:`read` from here on. Torque must be off.
-
-        Raises:
-            NoAnswerError, RefusedError: a servo did not take its indirect addresses.
-        """
+        """Have the servos' registers read with every :meth:`read` from here on. Torque must be off."""
         for joint in JOINTS:
             block = self._supervised[self._bus_of[joint]]
             _persist(self._group(joint).point, self._id(joint), block)
@@ -227,11 +222,7 @@ class Servos:
         self._is_supervised = False
 
     def read(self) -> JointReadings:
-        """Read all joints; the buses work at the same time.
-
-        Raises:
-            BusGoneError: a port is gone.
-        """
+        """Read all joints; the buses work at the same time."""
         readings = self._read(self._supervised if self._is_supervised else self._motion)
         items = (*_STATE, *_REGISTERS) if self._is_supervised else _STATE
         rows = [_row(readings.get(id), items) for id in self._ids]
@@ -250,11 +241,7 @@ class Servos:
         return sum(group.statistics.crc_errors for group in self.groups.values())
 
     def read_health(self) -> tuple[Array, Array]:
-        """Return supply voltages (8,) in V and temperatures (8,) in degC; NaN where a servo did not answer.
-
-        Raises:
-            BusGoneError: a port is gone.
-        """
+        """Return supply voltages (8,) in V and temperatures (8,) in degC; NaN where a servo did not answer."""
         readings = self._read(self._health)
         values = np.full((2, len(JOINTS)), np.nan)
         for k, id in enumerate(self._ids):
@@ -286,11 +273,7 @@ class Servos:
         _persist(self._group(joint).write, self._id(joint), item, count)
 
     def get_all(self, item: str) -> dict[str, int]:
-        """Return joint -> count of an item, of the joints that answered; the buses work at the same time.
-
-        Raises:
-            BusGoneError: a port is gone.
-        """
+        """Return joint -> count of an item, of the joints that answered; the buses work at the same time."""
         tables = {name: next(iter(group.servos.values())) for name, group in self.groups.items()}
         readings = self._read({name: Block(table, item, item) for name, table in tables.items()})
         return {joint: readings[id].counts[item] for joint, id in zip(JOINTS, self._ids, strict=True) if id in readings}
@@ -313,21 +296,13 @@ class Servos:
         """Write setpoints (8,): leg angles in rad, wheel speeds in rad/s.
 
         Nothing is acknowledged; a servo ignores a setpoint out of its range.
-
-        Raises:
-            InputError: wrong shape, or a setpoint that is not finite.
-            BusGoneError: a port is gone.
         """
         counts = self.joint_map.setpoint_counts(setpoints).tolist()
         self.write_item("goal_position", dict(zip(LEGS, counts[LEG_SLICE], strict=True)))
         self.write_item("goal_velocity", dict(zip(WHEELS, counts[WHEEL_SLICE], strict=True)))
 
     def write_item(self, item: str, counts: Mapping[str, int]) -> None:
-        """Write joint -> count of one item, all joints of a bus in one packet. Not acknowledged.
-
-        Raises:
-            BusGoneError: a port is gone.
-        """
+        """Write joint -> count of one item, all joints of a bus in one packet. Not acknowledged."""
         for name, group in self.groups.items():
             here = {self._ids[JOINTS.index(joint)]: count for joint, count in counts.items() if self._bus_of[joint] == name}
             if here:
@@ -383,7 +358,7 @@ def _persist(ask: Callable[..., Any], *arguments: Any) -> Any:
     return ask(*arguments)
 
 
-# --- new servos: find them at any baud rate, give them their id, registers and baud rate ------------------------------
+# ---- new servos ----
 
 
 #: bit/s of a servo out of the box.

@@ -1,8 +1,9 @@
 """The process that takes frames and finds poses in them: ``python -m wlr_gym.hardware.camera.process``.
 
-It reads one line of JSON (camera, robot, files), answers ``ready`` once the camera gives a frame, or ``error: why``, and writes
-a reading for each frame into the slot until its standard input ends. A process of its own: neither a slow picture nor a driver
-that hangs can hold up a control step, and it runs at a lower priority than the loop.
+It reads one line of JSON (camera, robot, feed), answers ``ready`` once the camera gives a frame, or ``error: why``, and then
+writes a packed reading for each frame, until its standard input ends. A process of its own: neither a slow picture nor a driver
+that hangs can hold up a control step, and it runs at a lower priority than the loop. It never waits for the loop, either: what
+the pipe has no room for is lost.
 """
 
 from __future__ import annotations
@@ -19,8 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.hardware.camera.live import Slot
-from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, SIZE, CameraFile, StampClock, pack, reading_of
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, CameraFile, StampClock, pack, reading_of
 from wlr_gym.hardware.camera.rendered import PoseFeed, RenderedCamera
 from wlr_gym.perception.markers.detection import Image
 from wlr_gym.perception.vision.tracking import PoseFinder, VideoFrame
@@ -121,7 +121,7 @@ def frames_of_film(file: CameraFile) -> Iterator[Taken | None]:
         number = max(number + 1, int(time.monotonic() * rate))
 
 
-def serve(frames: Iterator[Taken | None], file: CameraFile, slot: Slot) -> None:
+def serve(frames: Iterator[Taken | None], file: CameraFile) -> None:
     """Find poses and hand them on until the standard input ends.
 
     Raises:
@@ -137,9 +137,12 @@ def serve(frames: Iterator[Taken | None], file: CameraFile, slot: Slot) -> None:
         number += 1
         moment = clock.time(taken.stamp, taken.arrival)
         sample = finder(VideoFrame(number, moment, taken.image))
-        slot.write(pack(reading_of(sample, number, taken.arrival, time.monotonic())))
+        reading = reading_of(sample, number, taken.arrival, time.monotonic())
         if number == 1:
             _answer(f"ready {clock.source}")
+            os.set_blocking(sys.stdout.fileno(), False)
+        with contextlib.suppress(BlockingIOError):
+            os.write(sys.stdout.fileno(), pack(reading))  # shorter than PIPE_BUF: whole, or not at all
 
 
 def main() -> int:
@@ -154,14 +157,13 @@ def main() -> int:
 
         cv2.setNumThreads(1)
         file = CameraFile.model_validate(spec["camera"])
-        slot = Slot(Path(spec["slot"]), SIZE)
         if file.is_film:
             frames = frames_of_film(file)
         elif spec.get("feed"):
             frames = rendered_frames(file, Robot.model_validate(spec["robot"]), PoseFeed(Path(spec["feed"])))
         else:
             frames = frames_of_device(file)
-        serve(frames, file, slot)
+        serve(frames, file)
     except InputError as error:
         _answer(f"error: {error}")
         return 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-import zlib
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,9 +129,8 @@ Array = NDArray[np.float64]
 #: Status by its number in a packed reading.
 STATUSES = (OK, PARTIAL, *MEANINGS)
 _NUMBERS = struct.Struct("<QdddB6d36d")
-_CHECKSUM = struct.Struct("<I")
 #: Bytes of a packed reading.
-SIZE = _NUMBERS.size + _CHECKSUM.size
+SIZE = _NUMBERS.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,24 +192,16 @@ def reading_of(sample: Sample, number: int, arrival: float, found: float) -> Cam
 
 
 def pack(reading: CameraReading) -> bytes:
-    """Return a reading as :data:`SIZE` bytes that show whether they are whole."""
-    status = STATUSES.index(reading.status)
-    times = (reading.time, reading.arrival, reading.found)
-    data = _NUMBERS.pack(reading.number, *times, status, *reading.pose, *reading.covariance.ravel())
-    return data + _CHECKSUM.pack(zlib.crc32(data))
+    """Return a reading as :data:`SIZE` bytes."""
+    times, status = (reading.time, reading.arrival, reading.found), STATUSES.index(reading.status)
+    return _NUMBERS.pack(reading.number, *times, status, *reading.pose, *reading.covariance.ravel())
 
 
-def unpack(data: bytes) -> CameraReading | None:
-    """Return the reading in packed bytes; None where they are not whole, or empty."""
-    body, (checksum,) = data[: _NUMBERS.size], _CHECKSUM.unpack(data[_NUMBERS.size : SIZE])
-    if zlib.crc32(body) != checksum:
-        return None
-    number, time, arrival, found, status, *values = _NUMBERS.unpack(body)
-    if number == 0:
-        return None
-    return CameraReading(
-        number, time, arrival, found, STATUSES[status], np.array(values[:6]), np.array(values[6:]).reshape(6, 6)
-    )
+def unpack(data: bytes) -> CameraReading:
+    """Return the reading in packed bytes."""
+    number, time, arrival, found, status, *values = _NUMBERS.unpack(data)
+    pose, covariance = np.array(values[:6]), np.array(values[6:]).reshape(6, 6)
+    return CameraReading(number, time, arrival, found, STATUSES[status], pose, covariance)
 
 
 # --- when a frame was exposed, on this computer's clock: from the driver's time stamp, or from its arrival ------------

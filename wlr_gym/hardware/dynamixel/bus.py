@@ -1,4 +1,4 @@
-"""Items of a control table that are read together: neighbours, or from anywhere through Indirect Data."""
+"""Servos on serial ports: reading and writing control table items by name, one bus group per port."""
 
 from __future__ import annotations
 
@@ -89,9 +89,6 @@ class BlockReading:
     restarted: bool = False
 
 
-# --- a servo's own clock against ours ---------------------------------------------------------------------------------
-
-
 #: Part by which a servo's clock may run slow.
 CLOCK_TOLERANCE = 0.02
 #: Age at which a reading is stale, s.
@@ -138,9 +135,6 @@ class TickClock:
         return (0.0 if restarted else age), restarted
 
 
-# --- servos on serial ports: reading and writing control table items by name, one bus group per port ------------------
-
-
 #: s an answer may take beyond its bytes' time on the wire: adapter's latency timer (1 ms) twice, and the scheduler.
 PATIENCE = 0.005
 #: Data bytes of a ping's answer: model number and firmware version.
@@ -172,7 +166,12 @@ class Statistics:
 
 
 class BusGroup:
-    """Servos on one port.
+    """Servos on one port. One thread owns it.
+
+    Nothing here decides what is safe to send, and nothing retries but :meth:`torque_off`. What talks to servos raises
+    :class:`wlr_gym.hardware.dynamixel.protocol.BusGoneError` where the port is gone, :class:`NoAnswerError` where a servo that
+    was asked is silent, :class:`RefusedError` where it refuses (values out of range, the EEPROM while torque is on), and
+    :class:`InputError` for an unknown id or item, or a count that does not fit.
 
     Args:
         name: for messages.
@@ -216,11 +215,7 @@ class BusGroup:
         self._asked_at = 0.0
 
     def open(self) -> None:
-        """Open the port.
-
-        Raises:
-            InputError: it is not there, or cannot be opened.
-        """
+        """Open the port."""
         self.port.openPort()
 
     def close(self) -> None:
@@ -241,11 +236,7 @@ class BusGroup:
     # ---- one servo ----
 
     def ping(self, id: int) -> tuple[int, int]:
-        """Return model number and firmware version.
-
-        Raises:
-            NoAnswerError: the servo is silent.
-        """
+        """Return model number and firmware version."""
         status = self._ask(id, protocol.ping(id), _PING_DATA, "ping")
         return _identity(status)
 
@@ -262,31 +253,17 @@ class BusGroup:
         return dict(sorted(found.items()))
 
     def read(self, id: int, item: str) -> int:
-        """Return the count an item holds.
-
-        Raises:
-            NoAnswerError, RefusedError: see there.
-            InputError: unknown id or item.
-        """
+        """Return the count an item holds."""
         row = self._table(id)[item]
         return row.decode(self._ask(id, protocol.read(id, row.address, row.size), row.size, f"read {item}").data)
 
     def write(self, id: int, item: str, count: int) -> None:
-        """Write a count and have it acknowledged.
-
-        Raises:
-            NoAnswerError, RefusedError: see there; refused are values out of range and the EEPROM while torque is on.
-            InputError: unknown id or item, or a count that does not fit.
-        """
+        """Write a count and have it acknowledged."""
         row = self._table(id)[item]
         self._ask(id, protocol.write(id, row.address, row.encode(count)), 0, f"write {item} = {count}")
 
     def point(self, id: int, block: IndirectBlock) -> None:
-        """Make a servo's Indirect Data stand for the items of a block, and see that they do. A reboot undoes it.
-
-        Raises:
-            NoAnswerError, RefusedError: see there. NoAnswerError also where it holds something else afterwards.
-        """
+        """Make a servo's Indirect Data stand for the items of a block, and see that they do. A reboot undoes it."""
         address = self._table(id)["indirect_address_1"].address
         self._ask(id, protocol.write(id, address, block.pointers), 0, "write indirect addresses")
         raw = protocol.read(id, address, len(block.pointers))
@@ -316,11 +293,7 @@ class BusGroup:
     # ---- all servos ----
 
     def ask_all(self, block: Block) -> None:
-        """Send the read of a block from every servo; :meth:`answers` collects. Several groups can be asked at once.
-
-        Raises:
-            BusGoneError: the port is gone.
-        """
+        """Send the read of a block from every servo; :meth:`answers` collects. Several groups can be asked at once."""
         self._asked, self._asked_at = block, self._clock()
         count = len(self.servos)
         self.port.send_packet(protocol.sync_read(block.address, block.length, self._order, self.fast), is_answered=True)
@@ -330,9 +303,6 @@ class BusGroup:
         """Return id -> reading of the servos that answered :meth:`ask_all`; who is missing, is missing.
 
         A fast read that brings nothing is repeated as an ordinary one; after three in a row only ordinary ones are tried.
-
-        Raises:
-            BusGoneError: the port is gone.
         """
         block = self._asked
         assert block is not None, "ask_all comes first"
@@ -372,12 +342,7 @@ class BusGroup:
         return BlockReading(counts, status.alert, age, restarted)
 
     def write_all(self, item: str, counts: Mapping[int, int]) -> None:
-        """Write id -> count in one packet. Nobody acknowledges it, and a servo ignores a count out of range: clamp before.
-
-        Raises:
-            BusGoneError: the port is gone.
-            InputError: unknown id or item, or a count that does not fit.
-        """
+        """Write id -> count in one packet. Nobody acknowledges it, and a servo ignores a count out of range: clamp before."""
         data = {id: self._table(id)[item].encode(count) for id, count in counts.items()}
         row = self._table(next(iter(counts)))[item]
         self.port.send_packet(protocol.sync_write(row.address, data), is_answered=False)
@@ -390,9 +355,6 @@ class BusGroup:
         Args:
             retries: times that a servo is asked.
             ids: which; None = all.
-
-        Raises:
-            BusGoneError: the port is gone.
         """
         left = set(self.servos if ids is None else ids)
         for _ in range(retries):

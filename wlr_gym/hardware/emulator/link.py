@@ -6,13 +6,12 @@ pass. Everything above the serial device is the code that drives a real robot; t
 
 from __future__ import annotations
 
-import heapq
 from functools import partial
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.hardware.camera.reading import CameraFile
 from wlr_gym.hardware.config import FlowPort, Hardware
-from wlr_gym.hardware.emulator.line import NO_TIME, Emission
+from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
 from wlr_gym.hardware.flow import FlowStream
 from wlr_gym.hardware.imu import ImuStream
@@ -25,7 +24,7 @@ from wlr_gym.robot.parameters import Parameters
 
 
 class EmulatedWorld:
-    """A machine, the bytes on their way, and the clock that passes when somebody waits.
+    """A machine as a clock that passes when somebody waits; see :class:`wlr_gym.hardware.timing.Clock`.
 
     Args:
         machine: the robot.
@@ -33,10 +32,6 @@ class EmulatedWorld:
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
-        self._plugged = dict.fromkeys([*machine.hardware.buses, *machine.sensors], True)
-        self._sockets = dict.fromkeys(self._plugged, 0)
-        self._due: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in self._plugged}
-        self._sent = 0
 
     def now(self) -> float:
         """Return emulated time, s."""
@@ -45,57 +40,14 @@ class EmulatedWorld:
     def wait_until(self, moment: float) -> None:
         """Let emulated time pass until ``moment`` (s)."""
         while self.machine.time < moment - 1e-9:
-            self.step()
-
-    def step(self) -> None:
-        """Let one tick pass."""
-        self.machine.step()
-        for name, emissions in self.machine.take_output().items():
-            self.queue(name, emissions)
-        if not self.machine.faults.any and all(self._plugged.values()):
-            return
-        for name, was in self._plugged.items():
-            self._plugged[name] = self.machine.plugged(name)
-            if was and not self._plugged[name]:
-                self._sockets[name] += 1
-                self._due[name].clear()
-                if name in self.machine.lines:
-                    self.machine.lines[name].forget()
-
-    def queue(self, name: str, emissions: list[Emission]) -> None:
-        """Send bytes on their way to the host."""
-        for emission in emissions:
-            self._sent += 1  # keeps bytes of one moment in order
-            heapq.heappush(self._due[name], (emission.time, self._sent, emission.data))
-
-    def connect(self, name: str) -> int:
-        """Return a connection to the adapter of a bus, or of a sensor.
-
-        Raises:
-            InputError: it is unplugged.
-        """
-        if not self.machine.plugged(name):
-            raise InputError(f"port of {name}: cannot be opened: the emulated adapter is unplugged")
-        return self._sockets[name]
-
-    def require(self, name: str, connection: int) -> None:
-        """Raise :class:`OSError` when the adapter was pulled out since it was connected."""
-        if self._sockets[name] != connection or not self._plugged[name]:
-            raise OSError("the emulated adapter is unplugged")
-
-    def arrived(self, name: str) -> bytes:
-        """Take the bytes that have reached the host."""
-        queue, data = self._due[name], b""
-        while queue and queue[0][0] <= self.machine.time + 1e-9:
-            data += heapq.heappop(queue)[2]
-        return data
+            self.machine.step()
 
 
 class MemoryDevice:
     """A serial device of the emulated robot; see :class:`wlr_gym.hardware.serial_frames.Device`.
 
     Args:
-        world: the robot.
+        machine: the robot.
         name: of a bus or a sensor.
         baud_rate: bit/s, of a bus.
 
@@ -103,29 +55,30 @@ class MemoryDevice:
         InputError: it is unplugged.
     """
 
-    def __init__(self, world: EmulatedWorld, name: str, baud_rate: int = 0) -> None:
-        self._world, self._name, self._baud_rate = world, name, baud_rate
-        self._connection = world.connect(name)
+    def __init__(self, machine: Machine, name: str, baud_rate: int = 0) -> None:
+        if not machine.plugged(name):
+            raise InputError(f"port of {name}: cannot be opened: the emulated adapter is unplugged")
+        self._machine, self._name, self._baud_rate = machine, name, baud_rate
+        self._pulls = machine.pulls[name]
 
     def received(self) -> bytes:
         """Return what has come."""
-        self._world.require(self._name, self._connection)
-        return self._world.arrived(self._name)
+        self._require()
+        return self._machine.arrived(self._name)
 
     def wait(self, seconds: float) -> bytes:
         """Return what came in, waiting up to ``seconds``, and a tick at least when there is nothing."""
-        world, end = self._world, self._world.now() + seconds
+        machine, end = self._machine, self._machine.time + seconds
         while not (data := self.received()):
-            world.step()
-            if world.now() > end - 1e-9:
+            machine.step()
+            if machine.time > end - 1e-9:
                 return self.received()
         return data
 
     def write(self, data: bytes) -> int:
         """Send bytes to the servos."""
-        self._world.require(self._name, self._connection)
-        machine = self._world.machine
-        self._world.queue(self._name, machine.lines[self._name].receive(data, machine.time, self._baud_rate))
+        self._require()
+        self._machine.receive(self._name, data, self._machine.time, self._baud_rate)
         return len(data)
 
     def reset_input_buffer(self) -> None:
@@ -134,6 +87,11 @@ class MemoryDevice:
 
     def close(self) -> None:
         """Disconnect."""
+
+    def _require(self) -> None:
+        """Raise :class:`OSError` when the adapter was pulled out since it was connected."""
+        if self._machine.pulls[self._name] != self._pulls or not self._machine.is_plugged[self._name]:
+            raise OSError("the emulated adapter is unplugged")
 
 
 def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
@@ -153,13 +111,13 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     names = {bus.port: name for name, bus in hardware.buses.items()}
 
     def make_port(path: str, baud_rate: int, patience: float) -> DynamixelPort:
-        return DynamixelPort(names[path], baud_rate, patience, world.now, partial(MemoryDevice, world))
+        return DynamixelPort(names[path], baud_rate, patience, world.now, partial(MemoryDevice, machine))
 
     servos = Servos(robot, hardware, hardware.safety.patience, world.now, make_port)
-    imu = ImuStream(hardware.imu, world.now, lambda *_: MemoryDevice(world, "imu"))
+    imu = ImuStream(hardware.imu, world.now, lambda *_: MemoryDevice(machine, "imu"))
     flow = eye = None
     if hardware.flow is not None and robot.sensors.flow is not None:
-        flow = FlowStream(hardware.flow, robot.sensors.flow, world.now, lambda *_: MemoryDevice(world, "flow"))
+        flow = FlowStream(hardware.flow, robot.sensors.flow, world.now, lambda *_: MemoryDevice(machine, "flow"))
     if camera is not None:
         from wlr_gym.hardware.emulator.camera import EmulatedCamera
 

@@ -6,8 +6,9 @@
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -100,6 +101,7 @@ class Machine:
         coupling: of the servos and the plant.
         lines: bus name -> line.
         faults: what is wrong right now.
+        is_plugged, pulls: bus or sensor -> its adapter was in its socket at the last tick; times that it was pulled out.
         watchers: called at the end of every tick (what looks at the robot from outside: a camera).
 
     Raises:
@@ -134,7 +136,10 @@ class Machine:
         port, sensor = hardware.flow, robot.sensors.flow
         has_flow = port is not None and sensor is not None
         self._flow = EmulatedFlow(port, sensor, self.faults, self.options.tick) if has_flow else None
-        self._output: dict[str, list[Emission]] = {name: [] for name in self.sensors}
+        self.is_plugged: dict[str, bool] = dict.fromkeys([*hardware.buses, *self.sensors], True)
+        self.pulls: dict[str, int] = dict.fromkeys(self.is_plugged, 0)
+        self._due: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in self.is_plugged}
+        self._sent = 0
         self._imu = Conversion(hardware.imu)
         self._frames = 0
         self._paused = 0.0
@@ -190,7 +195,9 @@ class Machine:
         while self.time >= (self._frames + 1) / self.hardware.imu.rate - 1e-9:
             self._read_imu()
         if self._flow is not None:
-            self._output["flow"] += self._flow.step(self.time, self._paused, self.coupling.sensors)
+            self._send("flow", self._flow.step(self.time, self._paused, self.coupling.sensors))
+        if self.faults.any or not all(self.is_plugged.values()):
+            self._pull_and_plug()
         for watcher in self.watchers:
             watcher()
 
@@ -235,12 +242,43 @@ class Machine:
             self._imu_frame = IMU_FRAMES.encode((self._frames, round(stamp * 1e6), *force, _IMU_TEMPERATURE, *rate))
         raw, delay = self.faults.mangle(self.time, self._imu_frame, ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
-            self._output["imu"].append(Emission(self.time + delay, raw))
+            self._send("imu", [Emission(self.time + delay, raw)])
 
-    def take_output(self) -> dict[str, list[Emission]]:
-        """Return the frames that the sensors sent since the last call, by their ports."""
-        output, self._output = self._output, {name: [] for name in self.sensors}
-        return output
+    # ---- the adapters ----
+
+    def receive(self, bus: str, data: bytes, now: float, baud_rate: int | None) -> None:
+        """Take bytes that the host sent to a bus at ``now`` (s); see :meth:`BusLine.receive`."""
+        self._send(bus, self.lines[bus].receive(data, now, baud_rate))
+
+    def arrived(self, port: str, now: float | None = None) -> bytes:
+        """Take the bytes of a bus or a sensor that have reached the host at ``now`` (s); None = at emulated time."""
+        queue, data = self._due[port], b""
+        while queue and queue[0][0] <= (self.time if now is None else now) + 1e-9:
+            data += heapq.heappop(queue)[2]
+        return data
+
+    @property
+    def next_arrival(self) -> float:
+        """Time (s) at which the next bytes reach the host; infinite = none are on their way."""
+        return min((queue[0][0] for queue in self._due.values() if queue), default=math.inf)
+
+    def _send(self, port: str, emissions: Iterable[Emission]) -> None:
+        for emission in emissions:
+            self._sent += 1  # keeps bytes of one moment in order
+            heapq.heappush(self._due[port], (emission.time, self._sent, emission.data))
+
+    def plugged(self, port: str) -> bool:
+        """Whether the adapter of a bus, or of a sensor, is in its socket now."""
+        return self.faults.active(self.time, "unplug", [port]) is None
+
+    def _pull_and_plug(self) -> None:
+        for name, was in self.is_plugged.items():
+            self.is_plugged[name] = self.plugged(name)
+            if was and not self.is_plugged[name]:
+                self.pulls[name] += 1
+                self._due[name].clear()
+                if name in self.lines:
+                    self.lines[name].forget()
 
     # ---- faults ----
 
@@ -258,10 +296,6 @@ class Machine:
         """End all faults, or those of one kind; servos without power come back rebooted."""
         self.faults.clear(kind)
         self._apply_faults()
-
-    def plugged(self, port: str) -> bool:
-        """Whether the adapter of a bus, or of a sensor, is in its socket."""
-        return self.faults.active(self.time, "unplug", [port]) is None
 
     def _apply_faults(self) -> None:
         """Let the faults that hold now act on servos and supply."""

@@ -7,7 +7,6 @@ Linux and macOS. One thread does everything, so emulated time and bytes are in o
 from __future__ import annotations
 
 import contextlib
-import heapq
 import os
 import re
 import select
@@ -133,8 +132,6 @@ class Server:
         self._wake, self._waker = os.pipe()
         self._requests: list[tuple[Callable[[], object], Future[object]]] = []
         self._lock = threading.Lock()
-        self._due: list[tuple[float, int, str, bytes]] = []
-        self._sent = 0
         self._thread: threading.Thread | None = None
         self._running = False
         self.origin = 0.0
@@ -236,9 +233,7 @@ class Server:
         sockets = [s for s in (self._control, *self._clients) if s is not None]
         timeout = None
         if self._real_time:
-            due = self.machine.time + self.machine.options.tick
-            if self._due:
-                due = min(due, self._due[0][0])
+            due = min(self.machine.time + self.machine.options.tick, self.machine.next_arrival)
             timeout = max(0.0, due - self._now())
         ready, _, _ = select.select([*watched, *sockets], [], [], timeout)
         if self._wake in ready:
@@ -272,41 +267,26 @@ class Server:
 
     def _step(self) -> None:
         self.machine.step()
-        for name, emissions in self.machine.take_output().items():
-            self._queue(name, emissions)
-        if self.machine.faults.any or not all(port.plugged for port in self._ports.values()):
-            self._replug()
-
-    def _replug(self) -> None:
         for name, port in self._ports.items():
-            plugged = self.machine.plugged(name)
-            if port.plugged and not plugged:
+            if port.plugged and not self.machine.is_plugged[name]:
                 port.unplug()
-                if name in self.machine.lines:
-                    self.machine.lines[name].forget()
-                self._due = [entry for entry in self._due if entry[2] != name]
-                heapq.heapify(self._due)
-            elif plugged and not port.plugged:
+            elif self.machine.is_plugged[name] and not port.plugged:
                 port.plug()
 
     def _listen(self, names: list[str]) -> None:
         for name in names:
-            port, line = self._ports[name], self.machine.lines.get(name)
+            port = self._ports[name]
             data = port.read() if port.plugged else b""
-            if data and line is not None:  # the microcontrollers of the sensors take no orders
+            if data and name in self.machine.lines:  # the microcontrollers of the sensors take no orders
                 self._slip(ANSWER_LAG)
-                self._queue(name, line.receive(data, self._now(), port.baud_rate()))
-
-    def _queue(self, name: str, emissions: list) -> None:
-        for emission in emissions:
-            self._sent += 1  # keeps bytes of one moment in order
-            heapq.heappush(self._due, (emission.time, self._sent, name, emission.data))
+                self.machine.receive(name, data, self._now(), port.baud_rate())
 
     def _emit(self) -> None:
-        while self._due and self._due[0][0] <= self._now():
-            _, _, name, data = heapq.heappop(self._due)
-            if self._ports[name].plugged:
-                self._ports[name].write(data)
+        now = self._now()
+        for name, port in self._ports.items():
+            data = self.machine.arrived(name, now)
+            if data and port.plugged:
+                port.write(data)
 
     # ---- commands ----
 
