@@ -125,7 +125,10 @@ class SerialDevice:
         raise OSError("it is ready and has nothing: disconnected, or another program reads it")
 
     def write(self, data: bytes) -> int:
-        """Send bytes; a full buffer is an ``OSError``, a nearly full one takes a part."""
+        """Send bytes, and return how many the device took; does not wait until it would take more.
+
+        A full buffer is an ``OSError``, a nearly full one takes a part.
+        """
         return os.write(self._number(), data)
 
     def reset_input_buffer(self) -> None:

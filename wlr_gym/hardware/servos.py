@@ -145,7 +145,8 @@ class Servos:
     """All servos of a robot.
 
     Use as a context manager, or :meth:`open` and :meth:`close`. Nothing here decides what is safe: callers other than the
-    command limiter read only. Errors are those of :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
+    command limiter read only. Errors are those of :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`; switching torque off raises
+    none: a bus that is gone does not keep the others.
 
     Args:
         robot: its ``dynamixel_ids``.
@@ -184,7 +185,11 @@ class Servos:
             self._health[name] = Block(table, *_HEALTH)
 
     def open(self) -> None:
-        """Open all ports, or none."""
+        """Open all ports, or none.
+
+        Raises:
+            InputError: a port is not there, or cannot be opened.
+        """
         with contextlib.ExitStack() as stack:
             for group in self.groups.values():
                 group.open()
@@ -296,6 +301,9 @@ class Servos:
         """Write setpoints (8,): leg angles in rad, wheel speeds in rad/s.
 
         Nothing is acknowledged; a servo ignores a setpoint out of its range.
+
+        Raises:
+            InputError: wrong shape, or a setpoint that is not finite.
         """
         counts = self.joint_map.setpoint_counts(setpoints).tolist()
         self.write_item("goal_position", dict(zip(LEGS, counts[LEG_SLICE], strict=True)))

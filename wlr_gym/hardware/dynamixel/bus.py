@@ -168,10 +168,12 @@ class Statistics:
 class BusGroup:
     """Servos on one port. One thread owns it.
 
-    Nothing here decides what is safe to send, and nothing retries but :meth:`torque_off`. What talks to servos raises
-    :class:`wlr_gym.hardware.dynamixel.protocol.BusGoneError` where the port is gone, :class:`NoAnswerError` where a servo that
-    was asked is silent, :class:`RefusedError` where it refuses (values out of range, the EEPROM while torque is on), and
-    :class:`InputError` for an unknown id or item, or a count that does not fit.
+    Nothing here decides what is safe to send, and nothing retries but :meth:`torque_off`.
+
+    Every exchange raises :class:`wlr_gym.hardware.dynamixel.protocol.BusGoneError` where the port is gone, and
+    :class:`InputError` for an unknown id or item, or a count that does not fit. What asks one servo (ping, read, write, point)
+    raises :class:`NoAnswerError` where it is silent, and :class:`RefusedError` where it refuses: values out of range, the EEPROM
+    while torque is on. What asks all of them raises neither.
 
     Args:
         name: for messages.
@@ -215,7 +217,11 @@ class BusGroup:
         self._asked_at = 0.0
 
     def open(self) -> None:
-        """Open the port."""
+        """Open the port.
+
+        Raises:
+            InputError: it is not there, or cannot be opened.
+        """
         self.port.openPort()
 
     def close(self) -> None:
@@ -263,7 +269,11 @@ class BusGroup:
         self._ask(id, protocol.write(id, row.address, row.encode(count)), 0, f"write {item} = {count}")
 
     def point(self, id: int, block: IndirectBlock) -> None:
-        """Make a servo's Indirect Data stand for the items of a block, and see that they do. A reboot undoes it."""
+        """Make a servo's Indirect Data stand for the items of a block, and see that they do. A reboot undoes it.
+
+        Raises:
+            NoAnswerError: also where it holds something else afterwards.
+        """
         address = self._table(id)["indirect_address_1"].address
         self._ask(id, protocol.write(id, address, block.pointers), 0, "write indirect addresses")
         raw = protocol.read(id, address, len(block.pointers))

@@ -34,11 +34,7 @@ def camera_fault(machine: Machine, kind: str) -> float | None:
 
 
 class EmulatedCamera:
-    """See :class:`wlr_gym.hardware.camera.reading.CameraReader`. Its machine calls :meth:`look` at every tick.
-
-    Args:
-        machine: the robot. file: the camera.
-    """
+    """See :class:`wlr_gym.hardware.camera.reading.CameraReader`. Its machine calls :meth:`look` at every tick."""
 
     def __init__(self, machine: Machine, file: CameraFile) -> None:
         self.machine, self.file = machine, file

@@ -24,11 +24,7 @@ from wlr_gym.robot.parameters import Parameters
 
 
 class EmulatedWorld:
-    """A machine as a clock that passes when somebody waits; see :class:`wlr_gym.hardware.timing.Clock`.
-
-    Args:
-        machine: the robot.
-    """
+    """A machine as a clock that passes when somebody waits; see :class:`wlr_gym.hardware.timing.Clock`."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine = machine

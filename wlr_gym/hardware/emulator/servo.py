@@ -252,9 +252,6 @@ class MotorDrive:
 class EncoderFrame:
     """From the encoder's frame to Present Position: direction, turns counted, Homing Offset.
 
-    Args:
-        table: of the servo.
-
     Attributes:
         direction: 1, or -1 where Drive Mode reverses it.
     """
