@@ -172,8 +172,8 @@ class BusGroup:
 
     Every exchange raises :class:`wlr_gym.hardware.dynamixel.protocol.BusGoneError` where the port is gone, and
     :class:`InputError` for an unknown id or item, or a count that does not fit. What asks one servo (ping, read, write, point)
-    raises :class:`NoAnswerError` where it is silent, and :class:`RefusedError` where it refuses: values out of range, the EEPROM
-    while torque is on. What asks all of them raises neither.
+    raises :class:`NoAnswerError` where it is silent, and :class:`RefusedError` where it refuses: values out of range, the
+    EEPROM while torque is on. What asks all of them raises neither.
 
     Args:
         name: for messages.
