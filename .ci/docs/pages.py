@@ -149,7 +149,7 @@ def command_page() -> str:
     for name in COMMANDS:
         parts += [f"## wlr {name}", "", _block(help_of(name))]
         own = options_of(name)
-        for word in own if isinstance(own, dict) else ():
+        for word in filter(None, own if isinstance(own, dict) else ()):
             parts += [f"### wlr {name} {word}", "", _block(help_of(name, word))]
     return "\n".join(parts)
 
@@ -159,7 +159,7 @@ def help_of(*words: str) -> str:
     from wlr_gym.cli import main
 
     text = io.StringIO()
-    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+    with contextlib.redirect_stdout(text):
         main([*words, "--help"])
     return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue()).rstrip()
 

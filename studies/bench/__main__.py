@@ -19,8 +19,7 @@ from wlr_gym.base.progress import progress
 from wlr_gym.base.text import tally
 from wlr_gym.cli import OK, run_program
 from wlr_gym.cli.options import ForceOption, JsonOption, ray_address
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from studies.bench.convergence import Deviation

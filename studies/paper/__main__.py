@@ -10,16 +10,15 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.progress import Tell, progress
 from wlr_gym.cli import run_program
-from wlr_gym.cli.options import ForceOption, JsonOption, settings_of
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import HardwareOption, confirm
+from wlr_gym.cli.options import ForceOption, JsonOption, RobotOption, settings_of
+from wlr_gym.cli.terminal import confirm, print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,14 +34,14 @@ _SHARES = {"tests": 0.15, "claims": 0.2, "search": 0.85, "decided": 0.9}
 
 
 @dataclass(frozen=True)
-class PaperOptions(JsonOption, ForceOption, HardwareOption):
+class PaperOptions(JsonOption, ForceOption, RobotOption):
     out: Path
     """Folder for the report; made if it is not there."""
     plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
     """Models to run the tests on: reduced (the nine-velocity model), gibbs_appell, mujoco, dynamixel (a robot)."""
     yes: bool = False
     """Do not ask before the robot moves."""
-    robot: str | None = None
+    robot: str | None = field(default=None, kw_only=True)
     """Robot file, or name in configs/robot/; default: the nominal one."""
     draws: int = 8
     """Search for what could explain the paper's slip: draws per combination at first; 0 = no search."""
@@ -145,7 +144,7 @@ def _drive_robot(options: PaperOptions, console: Console) -> dict[str, Record]:
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters
 
-    robot = load_robot(options.robot_name(options.robot))
+    robot = load_robot(options.robot_name())
     meta, records = RunMeta(robot=robot.name, profile=PROFILE, notes="the paper's tests"), {}
     for name, test in TESTS.items():
         if not (options.emulated or options.yes):
@@ -174,7 +173,7 @@ def _search(robot: Robot, options: PaperOptions, tell: Tell) -> list[SearchFindi
 
 def _show(console: Console, claims: Sequence[CheckedClaim]) -> None:
     from studies.paper.claims import FAILS
-    from wlr_gym.cli.tables import print_table
+    from wlr_gym.cli.terminal import print_table
 
     rows = [(str(claim.number), claim.text, claim.paper, claim.ours, claim.verdict) for claim in claims]
     styles = ["red" if claim.verdict == FAILS else "" for claim in claims]

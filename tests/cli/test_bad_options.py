@@ -24,7 +24,7 @@ def test_output_that_cannot_be_a_folder(tmp_path, capsys, arguments):
     [
         (["train", "--max-minutes", "-1"], "--max-minutes -1: expected more than 0"),
         (["train", "--total-steps", "64"], "--total-steps goes with --resume; of a new training: --set total_steps=64"),
-        (["evaluate", "do_nothing", "--seed", "-1"], "--seed -1: expected 0 to 4294967295"),
+        (["evaluate", "do_nothing", "--seed", "-1"], "--seed -1: expected a number from 0 to 4294967295"),
     ],
 )
 def test_numbers_out_of_range(tmp_path, capsys, arguments, words):
@@ -39,7 +39,7 @@ def test_numbers_out_of_range(tmp_path, capsys, arguments, words):
 )
 def test_a_seed_out_of_range(capsys, command, seed):
     assert main([*command.split(), "--seed", str(seed)]) == 2
-    assert f"--seed {seed}: expected 0 to 4294967295" in capsys.readouterr().err
+    assert f"--seed {seed}: expected a number from 0 to 4294967295" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,9 @@ def test_other_errors_are_not_swallowed(command):
 def test_bad_option_exits_with_2(command, capsys):
     command(0)
     assert cli.main(["probe", "--nonsense"]) == 2
-    assert capsys.readouterr().err == "wlr: unknown option '--nonsense'; see: wlr probe --help\n"
+    shown = capsys.readouterr().err
+    assert "Unrecognized options: --nonsense" in shown
+    assert "wlr probe --help" in shown
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
@@ -135,14 +137,6 @@ def test_ends_silently_when_nobody_reads(words, unbuffered):
             stdout=pipe, stderr=subprocess.PIPE, env=os.environ | {"PYTHONUNBUFFERED": unbuffered}, timeout=60, check=False,
         )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (cli.FAILED, b"")
-
-
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_every_command_explains_itself(name, capsys):
-    with pytest.raises(SystemExit) as caught:
-        cli.main([name, "--help"])
-    assert caught.value.code == 0
-    assert f"usage: wlr {name}" in capsys.readouterr().out
 
 
 def test_modules_are_imported_first(tmp_path, monkeypatch, capsys):

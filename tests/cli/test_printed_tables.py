@@ -3,7 +3,7 @@
 import pytest
 from rich.console import Console
 
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.terminal import print_table
 
 SCORES = ("0.276 ± 0.092", "0.578 ± 0.149", "12.3 ± 4.56")
 NAMES = ("velocity_slip_aware", "slip_compensating_no_camera", "pid")

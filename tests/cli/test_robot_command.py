@@ -8,7 +8,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import BAD_INPUT, FAILED, OK, main
-from wlr_gym.cli.robot_new import NewOptions, new_robot
+from wlr_gym.cli.robot import NewOptions, new_robot
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.outline import QUESTIONS, question_of
 from wlr_gym.robot.parameters import Parameters

@@ -9,7 +9,8 @@ from blocks import PAGES, ROOT, Block, blocks, program_of
 
 from studies.bench.__main__ import BenchOptions
 from studies.paper.__main__ import PaperOptions
-from wlr_gym.cli import COMMANDS, NESTED, parse, parsing
+from wlr_gym.cli import COMMANDS, parse_command
+from wlr_gym.cli.parsing import parse
 
 STUDIES = {"python -m studies.bench": BenchOptions, "python -m studies.paper": PaperOptions}
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]+)?\)")
@@ -40,15 +41,13 @@ def test_there_are_commands_to_check() -> None:
 def test_command_parses(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     program, (name, *arguments) = program_of(command)
     if program in STUDIES:
-        parsing.parse(STUDIES[program], program, [name, *arguments], "")
+        parse(STUDIES[program], program, [name, *arguments], "")
         return
     if name == "--import":
         _, name, *arguments = arguments
     assert name in COMMANDS, f"no command '{name}'"
-    if (name, *arguments[:1]) in NESTED:
-        name, arguments = f"{name}_{arguments[0]}", arguments[1:]
     try:
-        parse(name, arguments)
+        parse_command(name, arguments)
     except SystemExit:
         pytest.fail(capsys.readouterr().err or capsys.readouterr().out)
 

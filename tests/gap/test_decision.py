@@ -11,7 +11,7 @@ from rich.console import Console
 from waiting import wait_until
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.gap_decide import DecideOptions, ask, recorder_of
+from wlr_gym.cli.gap import DecideOptions, ask, recorder_of
 from wlr_gym.data.excitations import GENTLE, excite
 from wlr_gym.data.read import read_run
 from wlr_gym.data.record import record_simulation

@@ -12,9 +12,9 @@ import yaml
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import main
-from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
-from wlr_gym.cli.results import only_results
-from wlr_gym.cli.robot_options import WiredRobotOption
+from wlr_gym.cli.calibrate import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
+from wlr_gym.cli.options import WiredRobotOption
+from wlr_gym.cli.terminal import only_results
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.config import ImuCalibration, Mounting, load_hardware
 from wlr_gym.hardware.imu import to_body

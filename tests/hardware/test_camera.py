@@ -17,7 +17,7 @@ from camera_rig import FORWARD, TURN, CameraRig, small_camera
 from robot_rig import HARDWARE, ROBOT
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli.robot_status import camera_line, camera_state
+from wlr_gym.cli.deploy import camera_line, camera_state
 from wlr_gym.data.read import read_run
 from wlr_gym.hardware.camera import process
 from wlr_gym.hardware.camera.live import LiveCamera

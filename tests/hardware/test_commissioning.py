@@ -14,7 +14,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import main, run_command
 from wlr_gym.cli.commission import CommissionOptions, run
-from wlr_gym.cli.robot_options import HardwareOption
+from wlr_gym.cli.options import RobotOption
 from wlr_gym.data import read_dataset
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware import calibration as find
@@ -604,7 +604,7 @@ class SlowHuman(Human):
 
 
 def beside(monkeypatch, emulated):
-    monkeypatch.setattr(HardwareOption, "link_to", lambda self, robot, hardware, patch=None: emulated_link(emulated.machine))
+    monkeypatch.setattr(RobotOption, "link_to", lambda self, robot, hardware, patch=None: emulated_link(emulated.machine))
 
 
 @pytest.mark.slow

@@ -23,9 +23,8 @@ from robot_rig import HARDWARE, PERIOD, Phase, hardware_file, machine_of
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import FAILED, OK, run_command
-from wlr_gym.cli.deploy import DeployOptions, _emulator, busy_note
-from wlr_gym.cli.robot_options import wait_for_enter
-from wlr_gym.cli.robot_status import RobotView
+from wlr_gym.cli.deploy import DeployOptions, RobotView, _emulator, busy_note
+from wlr_gym.cli.terminal import wait_for_enter
 from wlr_gym.data.read import read_run
 from wlr_gym.data.replay import replay
 from wlr_gym.hardware.config import load_hardware, with_ports

@@ -10,7 +10,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError, MissingPackageError
 from wlr_gym.cli import doctor
-from wlr_gym.cli.robot_options import RobotOption
+from wlr_gym.cli.options import RobotOption
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.robot import load_robot
 

@@ -8,7 +8,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import record, replay
-from wlr_gym.cli.robot_options import HardwareOption
+from wlr_gym.cli.options import RobotOption
 from wlr_gym.data import read_run
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import COMMANDS
@@ -68,9 +68,9 @@ def test_another_robot_shows(run, tmp_path):
 
 
 def test_a_robot_that_stops_ends_it(run, tmp_path, monkeypatch, capsys):
-    machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
     machine.inject("dead wheel_lf after=2.5")
-    monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
+    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
     options = replay.ReplayOptions(run.path, tmp_path, backend="dynamixel", plots=False, emulated=True)
     assert replay.run(options) == 1
     assert "stopped: " in capsys.readouterr().out

@@ -13,7 +13,7 @@ from rich.console import Console
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import record, replay
-from wlr_gym.cli.robot_options import HardwareOption
+from wlr_gym.cli.options import RobotOption
 from wlr_gym.data import read_dataset, read_run, simulate_again
 from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import COMMANDS, Profile
@@ -88,8 +88,8 @@ def test_the_seed_of_the_motions_decides_the_noise_too(tmp_path):
 
 
 def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
-    machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
-    monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
+    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
     seen = []
     step = machine.step
 
@@ -105,9 +105,9 @@ def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
 
 
 def test_a_robot_that_stops_leaves_its_log_and_code_1(tmp_path, monkeypatch, capsys):
-    machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
     machine.inject("dead leg_rf after=2.5")
-    monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
+    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
     assert recorded(tmp_path, excitation=("straight", "turns"), seconds=6.0) == 1
     (run,) = read_dataset(tmp_path).runs
     assert 20 < len(run.table) < 300
@@ -120,8 +120,8 @@ def test_a_robot_that_stops_leaves_its_log_and_code_1(tmp_path, monkeypatch, cap
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_an_interrupted_record_says_what_it_did_not_drive(tmp_path, monkeypatch, capsys, name):
-    machine = Machine(ROBOT, HardwareOption().load_hardware(), MachineOptions(timing=NO_TIME))
-    monkeypatch.setattr(HardwareOption, "link_to", lambda *args: emulated_link(machine))
+    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
     step, signals = machine.step, [getattr(signal, name)]
 
     def interrupted_step():
@@ -292,10 +292,10 @@ class Operator:
 @pytest.fixture
 def emulated_as_real(monkeypatch):
     """What is connected is an emulated robot that the commands take for a real one."""
-    link_to = HardwareOption.link_to
+    link_to = RobotOption.link_to
     monkeypatch.setattr("wlr_gym.hardware.safety.preflight.require_ports", lambda hardware: None)
     monkeypatch.setattr(
-        HardwareOption, "link_to", lambda options, *given: link_to(replace(options, emulated=True, port=()), *given)
+        RobotOption, "link_to", lambda options, *given: link_to(replace(options, emulated=True, port=()), *given)
     )
 
 

@@ -7,11 +7,17 @@ numbers that are read otherwise. A ``place`` is how the user calls the value: ``
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from wlr_gym.base.errors import InputError, unknown_name
+
+#: Largest seed of commands and trainings: NumPy's older generator, which libraries seed too, takes no larger one.
+LARGEST_SEED = 2**32 - 1
+#: Largest seed of a simulator's noise, whose keys have 64 bits.
+LARGEST_NOISE_SEED = 2**64 - 1
 
 
 def check_number(
@@ -60,13 +66,56 @@ def stated(place: str, shown: str) -> str:
 
 
 def _range(above: float | None, least: float | None, most: float | None, below: float | None, whole: bool) -> str:
+    def bound(number: float) -> str:
+        return str(number) if isinstance(number, int) else f"{number:g}"
+
     kind = "a whole number" if whole else ""
-    upper = f"{most:g} at most" if most is not None else f"less than {below:g}" if below is not None else ""
     if least is not None and most is not None:
-        return f"{kind or 'a number'} from {least:g} to {most:g}"
-    lower = f"more than {above:g}" if above is not None else f"{least:g} or more" if least is not None else ""
+        return f"{kind or 'a number'} from {bound(least)} to {bound(most)}"
+    upper = f"{bound(most)} at most" if most is not None else f"less than {bound(below)}" if below is not None else ""
+    lower = f"more than {bound(above)}" if above is not None else f"{bound(least)} or more" if least is not None else ""
     bounds = " and ".join(filter(None, (lower, upper)))
     return ", ".join(filter(None, (kind, bounds))) or "a finite number"
+
+
+def require_seed(name: str, seed: int, largest: int = LARGEST_SEED) -> None:
+    """Raise :class:`InputError` for a seed out of range; the message begins with ``name``."""
+    if not 0 <= seed <= largest:
+        raise InputError(f"{name} {seed}: expected 0 to {largest}")
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Which numbers a field of a dataclass takes: ``Annotated[float, Interval("s", above=0.0)]``; see :func:`check_number`."""
+
+    unit: str = ""
+    above: float | None = None
+    least: float | None = None
+    most: float | None = None
+    below: float | None = None
+
+
+def check_ranges(options: Any, prefix: str = "--") -> None:
+    """Refuse the first number of a dataclass that is out of the range that its field declares; None = left open.
+
+    Args:
+        options: instance of the dataclass.
+        prefix: of the names of fields in messages; behind ``--`` a name has hyphens.
+
+    Raises:
+        InputError: naming field, value and range.
+    """
+    for name, hint in get_type_hints(type(options), include_extras=True).items():
+        value = getattr(options, name)
+        place = prefix + (name.replace("_", "-") if prefix == "--" else name)
+        for one in _ranges(hint) if value is not None else ():
+            check_number(place, value, **vars(one))
+
+
+def _ranges(hint: Any) -> Iterator[Interval]:
+    yield from (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Interval))
+    for part in get_args(hint):
+        yield from _ranges(part)
 
 
 def check_name(kind: str, name: Any, valid: Iterable[str], place: str = "") -> None:
@@ -90,12 +139,12 @@ def check_file(path: Path, place: str = "") -> None:
         raise InputError(f"{place and place + ' '}{path}: {found}; expected a file")
 
 
-def check_folder(path: Path, place: str = "") -> None:
-    """Refuse a path at which there is no folder.
+def check_folder(path: Path, place: str = "", of: str = "") -> None:
+    """Refuse a path at which there is no folder; ``of`` says what it is to hold.
 
     Raises:
         InputError: naming it, and what is there instead.
     """
     if not path.is_dir():
         found = "is a file" if path.is_file() else "no such folder"
-        raise InputError(f"{place and place + ' '}{path}: {found}; expected a folder")
+        raise InputError(f"{place and place + ' '}{path}: {found}; expected a folder{of and ' of '}{of}")

@@ -107,6 +107,21 @@ def require_ending(path: Path, endings: Iterable[str], option: str = "--out", *,
         raise InputError(f"{option} {path}: expected a file that ends in {', '.join(endings)}")
 
 
+def check_new_file(
+    path: Path, force: bool, option: str = "--out", endings: Iterable[str] = (), *, any_case: bool = False
+) -> None:
+    """Refuse, before the work, a file that cannot be the result: see :func:`require_ending` and :func:`refuse_existing`.
+
+    Raises:
+        InputError: as these, or its folder is not there.
+    """
+    if endings:
+        require_ending(path, endings, option, any_case=any_case)
+    refuse_existing(path, force, option)
+    if not path.parent.is_dir():
+        raise InputError(f"{option} {path}: folder {path.parent} does not exist")
+
+
 def resumes(folder: Path, file: str) -> bool:
     """Whether work in a folder for results resumes from its ``file``; otherwise the folder is new or empty, and is made.
 

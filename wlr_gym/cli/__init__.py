@@ -5,18 +5,25 @@ The options of ``wlr train`` are ``train.TrainOptions``, and so on.
 
 from __future__ import annotations
 
+import _thread
+import contextlib
 import gc
 import importlib
 import keyword
 import os
+import shutil
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError, MissingPackageError, nearest, unknown_name
-from wlr_gym.cli.interruption import interruptible
 
 #: Exit codes; an interrupted command ends as a shell reports SIGINT (128 + 2).
 OK = 0
@@ -53,9 +60,6 @@ COMMANDS = {
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults",
 }
 
-#: Words behind a command that name a module of their own (``vision_check``).
-NESTED = {("vision", "check")}
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``wlr`` and return its exit code: 0 done, 1 failed, 2 bad input, 130 interrupted."""
@@ -83,6 +87,8 @@ def _answered(dispatch: Callable[[list[str]], int], words: list[str]) -> int:
     try:
         with interruptible():
             return dispatch(words)
+    except SystemExit as end:  # of the parser: after help, or a mistake that it has told
+        return int(end.code or OK)
     except (InputError, MissingPackageError) as error:
         _say(str(error), "red")
         return BAD_INPUT
@@ -109,22 +115,20 @@ def _dispatch(words: list[str]) -> int:
         print(f"wlr_gym {__version__}")
         return OK
     if words[0] == "--completion":
-        print(_completion(words[1:]))
-        return OK
+        return _completion(words[1:])
     name, *rest = words
     if name not in COMMANDS:
         raise unknown_name("command", name, COMMANDS)
     return run_command(name, rest)
 
 
-def _completion(words: list[str]) -> str:
-    """Return the script that completes commands and options in a shell."""
-    from wlr_gym.cli import parsing
+def _completion(words: list[str]) -> int:
+    """Print the script that completes commands and options in a shell."""
+    from wlr_gym.cli.parsing import SHELLS, one_of, parse
 
-    if len(words) != 1 or words[0] not in parsing.SHELLS:
-        raise InputError(f"--completion: expected one of {', '.join(parsing.SHELLS)}, such as: wlr --completion bash")
-    nested = {(name, word): options_of(f"{name}_{word}") for name, word in NESTED}
-    return parsing.completion(words[0], "wlr", {name: options_of(name) for name in COMMANDS}, nested)
+    if len(words) != 1 or words[0] not in SHELLS:
+        raise InputError(f"--completion: expected one of {', '.join(SHELLS)}, such as: wlr --completion bash")
+    return parse(one_of({name: options_of(name) for name in COMMANDS}), "wlr", ["--tyro-print-completion", words[0]])
 
 
 def _import_modules(words: list[str]) -> list[str]:
@@ -144,15 +148,14 @@ def _import_modules(words: list[str]) -> list[str]:
 
 def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
-    if (name, *arguments[:1]) in NESTED:
-        name, arguments = f"{name}_{arguments[0]}", arguments[1:]
-    _check_word(name, arguments)
-    return run_options(parse(name, arguments), _module(name).run)
+    options, module = parse_command(name, arguments), _module(name)
+    own = (run for kind, run in getattr(module, "COMMANDS", {}).values() if type(options) is kind)
+    return run_options(options, next(own, None) or module.run)
 
 
 def run_options(options: Any, run: Callable[[Any], int]) -> int:
     """Run a command with its options; with ``--json`` only results are printed on the standard output."""
-    from wlr_gym.cli.results import only_results
+    from wlr_gym.cli.terminal import only_results
 
     with only_results(getattr(options, "json", False)):
         return run(options)
@@ -169,38 +172,45 @@ def run_program(program: str, kind: type, run: Callable[[Any], int], description
 
 def run_words(program: str, kind: type, run: Callable[[Any], int], description: str, words: Sequence[str]) -> int:
     """Parse the words of a program of one command and run it."""
-    from wlr_gym.cli import parsing
+    from wlr_gym.cli.parsing import parse
 
-    return run_options(parsing.parse(kind, program, words, description), run)
-
-
-def _check_word(name: str, arguments: Sequence[str]) -> None:
-    """Refuse a first word that is neither a file nor a command of this command, but nearly one of the latter."""
-    word = next(iter(arguments), "")
-    hint = nearest(word, [inner for outer, inner in NESTED if outer == name])
-    if hint and not Path(word).suffix and not Path(word).exists():
-        raise InputError(f"unknown word '{word}'{hint}; see: wlr {name} --help")
+    return run_options(parse(kind, program, words, description), run)
 
 
-def parse(name: str, arguments: Sequence[str]) -> Any:
-    """Return the options of one command; SystemExit after ``--help``.
+def parse_command(name: str, arguments: Sequence[str]) -> Any:
+    """Return the options of one command.
 
     Raises:
-        InputError: arguments that do not parse.
+        InputError, SystemExit: see :func:`wlr_gym.cli.parsing.parse`.
     """
-    from wlr_gym.cli import parsing
+    from wlr_gym.cli.parsing import one_of, parse
 
-    module, program = _module(name), f"wlr {name.replace('_', ' ')}"
-    kind = options_of(name)
-    if isinstance(kind, dict):
-        return parsing.chosen(program, kind, arguments, module.__doc__ or "")
-    return parsing.parse(kind, program, arguments, module.__doc__ or "")
+    program, kind, description = f"wlr {name}", options_of(name), _module(name).__doc__ or ""
+    if isinstance(kind, Mapping):
+        word, own = next(iter(arguments), ""), kind.get("")
+        if word and word in kind:
+            return parse(kind[word], f"{program} {word}", arguments[1:])
+        names = [one for one in kind if one]
+        if own is None and not word.startswith("-"):
+            raise (
+                unknown_name(f"command of {program}", word, names)
+                if word
+                else InputError(f"expected one of {', '.join(names)}; see: {program} --help")
+            )
+        hint = nearest(word, names)
+        if hint and not Path(word).suffix and not Path(word).exists():  # neither a file nor a command, but nearly the latter
+            raise InputError(f"unknown word '{word}'{hint}; see: {program} --help")
+        kind = own or one_of(kind)
+    return parse(kind, program, arguments, description)
 
 
 def options_of(name: str) -> Any:
-    """Return the options of one command, a dataclass; of one with commands of its own: name -> options and what it does."""
+    """Return a command's options, a dataclass; of one with commands of its own: name -> options, "" = those beside them."""
     module = _module(name)
-    return getattr(module, "COMMANDS", None) or getattr(module, f"{''.join(map(str.capitalize, name.split('_')))}Options")
+    own, commands = getattr(module, f"{name.capitalize()}Options", None), getattr(module, "COMMANDS", None)
+    if commands is None:
+        return own
+    return ({} if own is None else {"": own}) | {word: kind for word, (kind, _) in commands.items()}
 
 
 def _module(name: str) -> Any:
@@ -209,15 +219,18 @@ def _module(name: str) -> Any:
 
 
 def usage() -> str:
-    """Return the help text of ``wlr``."""
-    from wlr_gym.cli import parsing
-
-    hints = (
+    """Return the help text of ``wlr``, as wide as the terminal but 80 columns at most."""
+    width = min(80, shutil.get_terminal_size().columns)
+    lines = ["usage: wlr COMMAND [OPTIONS]", ""]
+    for name, text in COMMANDS.items():
+        lines += textwrap.wrap(text, width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
+    lines += [
+        "",
         "wlr COMMAND --help explains one; wlr --version",
-        "wlr --import MODULE COMMAND first imports what adds to the library",
-        "wlr --completion bash (or zsh, fish) prints what completes commands and options",
-    )
-    return "\n".join([parsing.usage("wlr", COMMANDS), "", *map(parsing.wrapped, hints)])
+        *textwrap.wrap("wlr --import MODULE COMMAND first imports what adds to the library", width),
+        *textwrap.wrap("wlr --completion bash (or zsh, fish) prints what completes commands and options", width),
+    ]
+    return "\n".join(lines)
 
 
 def _say(message: str, colour: str) -> None:
@@ -225,3 +238,67 @@ def _say(message: str, colour: str) -> None:
     from rich.text import Text
 
     Console(stderr=True).print(Text.assemble(("wlr: ", f"bold {colour}"), (message, colour)), soft_wrap=True)
+
+
+# ---- interruption -----------------------------------------------------------------------------------------------------
+
+#: s after which an interruption that could not end the command comes again.
+_AGAIN = 0.05
+#: s for which an import may hold one up.
+_PATIENCE = 10.0
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt for Ctrl-C in here, but after an import: some packages catch it there, and callbacks lose it."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    waiting: list[threading.Timer] = []
+    before, since = sys.unraisablehook, 0.0
+
+    def come_again() -> None:
+        waiting[:] = [threading.Timer(_AGAIN, _interrupt_main)]
+        waiting[0].daemon = True
+        waiting[0].start()
+
+    def interrupt(_: int, frame: FrameType | None) -> None:
+        nonlocal since
+        since = since or time.monotonic()
+        if not _imports(frame) or time.monotonic() > since + _PATIENCE:
+            raise KeyboardInterrupt
+        come_again()
+
+    def note(lost: Any) -> None:
+        if lost.exc_type is KeyboardInterrupt:  # in a callback, where Python can only complain
+            come_again()
+        else:
+            before(lost)
+
+    sys.unraisablehook = note
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = before
+        for timer in waiting:
+            timer.cancel()
+
+
+def _interrupt_main() -> None:
+    """Interrupt the main thread, also where it waits in a system call."""
+    if hasattr(signal, "pthread_kill") and (main := threading.main_thread().ident) is not None:
+        signal.pthread_kill(main, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Whether a module is being imported in this command."""
+    while frame is not None and frame.f_globals.get("__name__") != "wlr_gym.cli":
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            return True
+        frame = frame.f_back
+    return False

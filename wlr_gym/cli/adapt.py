@@ -19,15 +19,14 @@ import tyro
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption, PatchOption, SensorsOption, require_counts
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
+from wlr_gym.cli.options import Count, JsonOption, PatchOption, Seed, SensorsOption, port_pairs
+from wlr_gym.cli.terminal import print_json, wait_for_enter
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.learning.adaptation import Adapted
-    from wlr_gym.learning.adaptation.driving import RealRobot
+    from wlr_gym.learning.adaptation.robots import RealRobot
 
 
 @dataclass(frozen=True)
@@ -69,9 +68,9 @@ class AdaptOptions(JsonOption, PatchOption, SensorsOption):
     """Its learning rate at the start."""
     episodes: int = 256
     """Episodes of every family of the acceptance test."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of everything random."""
-    threads: int | None = None
+    threads: Count | None = None
     """Worker threads; default: one per core."""
 
 
@@ -84,7 +83,7 @@ def run(options: AdaptOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.learning.adaptation import adapt
-    from wlr_gym.learning.adaptation.state import NUMBERS_FILE
+    from wlr_gym.learning.adaptation.page import NUMBERS_FILE
 
     _check(options)
     console = Console(soft_wrap=True, highlight=False, file=sys.stderr if options.json else None)
@@ -133,7 +132,6 @@ def _check(options: AdaptOptions) -> None:
         raise InputError("--effects: a real robot has its own; they are for --emulated")
     if options.port and options.hardware is None:
         raise InputError("--port: it goes with --hardware")
-    require_counts(options, "threads")
 
 
 def _real(options: AdaptOptions, console: Console) -> RealRobot:
@@ -156,8 +154,8 @@ def _real(options: AdaptOptions, console: Console) -> RealRobot:
 
 def _print(found: Adapted, content: dict[str, Any], console: Console) -> None:
     from wlr_gym.base.text import duration
-    from wlr_gym.cli.tables import print_table
-    from wlr_gym.learning.adaptation.state import headline
+    from wlr_gym.cli.terminal import print_table
+    from wlr_gym.learning.adaptation.page import headline
 
     rows = [
         (name, duration(one.driving), duration(one.computing), one.said[0] if one.said else "")

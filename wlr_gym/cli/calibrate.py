@@ -1,121 +1,156 @@
-"""Calibrate what measures: the robot's ``joints``, ``imu``, ``flow``, a ``camera``; ``targets`` are its sheets to print."""
+"""Calibrate what measures: the robot's ``joints``, ``imu``, ``flow``, a ``camera``; ``targets`` are its sheets to print.
+
+``servo`` sets up a new servo. No motor is driven.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import datetime
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
-import tyro
+import numpy as np
+from tyro.conf import Positional
 
+from wlr_gym.base.checks import Interval, check_name
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.cli import OK
-from wlr_gym.cli.calibrate_flow import FlowOptions, calibrate_flow
-from wlr_gym.cli.calibrate_robot import ImuOptions, JointsOptions, ServoOptions, calibrate_imu, calibrate_joints, set_up_servo
-from wlr_gym.cli.options import ForceOption, JsonOption, require_counts
-from wlr_gym.cli.results import print_json
+from wlr_gym.base.files import check_new_file, make_output_folder, refuse_existing
+from wlr_gym.base.paths import find_config
+from wlr_gym.base.text import tally
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import Count, ForceOption, JsonOption, RobotOption, WiredRobotOption
+from wlr_gym.cli.terminal import NobodyThereError, ask_terminal, print_json
+from wlr_gym.robot import JOINTS, LEGS, full_name
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
-    from wlr_gym.perception.markers.calibration import Board, Readout
+    from wlr_gym.hardware.calibration import RestPose
+    from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
+    from wlr_gym.hardware.link import Link
+    from wlr_gym.hardware.servos import Servos
+    from wlr_gym.perception.markers.boards import Board
     from wlr_gym.perception.markers.camera import Camera
+    from wlr_gym.perception.markers.shutter import Readout
     from wlr_gym.perception.vision.video import Frames
+    from wlr_gym.robot import Robot
 
-
+#: Shows a text, waits for Enter, returns what was typed.
+Ask = Callable[[str], str]
+Result = TypeVar("Result")
+#: Squares of a board along a side.
+_Squares = Annotated[int, Interval(least=3)]
 #: Share of the time that looking for the board takes, about; the computation of the lens takes the rest.
 _SEARCH = 0.8
+#: Which side of the sensor points up, in the order of the poses.
+_UP = ("z up (as it stands)", "z down", "x up", "x down", "y up", "y down")
 
 
 @dataclass(frozen=True)
 class CameraOptions(JsonOption, ForceOption):
-    """Calibrate a camera from views of the printed board.
+    """Calibrate the lens of a camera from views of the printed board."""
 
-    Attributes:
-        images: folder of images, or a video, of the board: 15 or more views, tilted, in every corner of the image, sharp. In a
-            video a board that moves tells a rolling shutter.
-        out: camera file to write (YAML).
-        board: what it is: charuco (as written by wlr calibrate targets), charuco-legacy (as OpenCV drew them before 4.6), or
-            chessboard.
-        columns: squares of the board along its longer side.
-        rows: squares along its shorter side.
-        square: side of a square as measured on the print, m.
-        marker: side of a ChArUco board's markers, m; left out, 0.7 of a square.
-        dictionary: of a ChArUco board's markers, as OpenCV names it without DICT_.
-        every: use every n-th frame of a video.
-        readout: time from the first row's exposure to the last row's, s, where it is known; 0 = global shutter.
-    """
-
-    images: Annotated[str, tyro.conf.Positional]
+    images: Positional[str]
+    """Folder of images, or a video, of the board: 15 or more views, tilted, in every corner of the image, sharp. In a video a
+    board that moves tells a rolling shutter."""
     out: Path
+    """Camera file to write (YAML)."""
     board: Literal["charuco", "charuco-legacy", "chessboard"] = "charuco"
-    columns: int = 9
-    rows: int = 6
-    square: float = 0.028
+    """What it is: charuco (as written by wlr calibrate targets), charuco-legacy (as OpenCV drew them before 4.6), or
+    chessboard."""
+    columns: _Squares = 9
+    """Squares of the board along its longer side."""
+    rows: _Squares = 6
+    """Squares along its shorter side."""
+    square: Annotated[float, Interval("m, as measured on the print (28 mm = 0.028)", above=0.001, below=0.5)] = 0.028
+    """Side of a square as measured on the print, m."""
     marker: float | None = None
+    """Side of a ChArUco board's markers, m; left out, 0.7 of a square."""
     dictionary: str = "5X5_100"
-    every: int = 15
-    readout: float | None = None
+    """Dictionary of a ChArUco board's markers, as OpenCV names it without DICT_."""
+    every: Count = 15
+    """Use every n-th frame of a video."""
+    readout: Annotated[float, Interval("s (20 ms = 0.02)", above=-0.1, below=0.1)] | None = None
+    """Time from the first row's exposure to the last row's, s, where it is known; 0 = global shutter."""
 
 
 @dataclass(frozen=True)
 class TargetsOptions(JsonOption, ForceOption):
-    """Write the sheets to print, as PDF and SVG to scale: markers on the robot, markers on the floor, calibration board.
-
-    Attributes:
-        out: folder; made if it is not there.
-        markers: markers on the robot: name in configs/vision/ or path.
-        floor: markers on the floor: name in configs/vision/ or path.
-    """
+    """Write the sheets to print, as PDF and SVG to scale: markers on the robot, markers on the floor, calibration board."""
 
     out: Path
+    """Folder; made if it is not there."""
     markers: str = "body"
+    """Markers on the robot: name in configs/vision/ or path."""
     floor: str = "floor"
+    """Markers on the floor: name in configs/vision/ or path."""
 
 
-#: Command -> its options, and what it does.
-COMMANDS = {
-    "camera": (CameraOptions, "lens of a camera, from views of a board"),
-    "targets": (TargetsOptions, "sheets to print: markers and calibration board"),
-    "servo": (ServoOptions, "id and baud rate of a new servo"),
-    "joints": (JointsOptions, "sign and zero of each servo, by hand"),
-    "imu": (ImuOptions, "biases, scale and mounting of the IMU"),
-    "flow": (FlowOptions, "scale and mounting of the optical-flow sensor"),
-}
+@dataclass(frozen=True)
+class ServoOptions(JsonOption, WiredRobotOption):
+    """Give a new servo its id, registers and baud rate. Connect it alone, with power, to the adapter of its bus."""
+
+    joint: Positional[str]
+    """Which one it is to be."""
 
 
-def run(options: CameraOptions | TargetsOptions | ServoOptions | JointsOptions | ImuOptions | FlowOptions) -> int:
-    """Do what the sub-command says; 0 when done."""
-    if isinstance(options, ServoOptions):
-        return set_up_servo(options)
-    if isinstance(options, JointsOptions):
-        return calibrate_joints(options)
-    if isinstance(options, ImuOptions):
-        return calibrate_imu(options)
-    if isinstance(options, FlowOptions):
-        return calibrate_flow(options)
+@dataclass(frozen=True)
+class JointsOptions(JsonOption, WiredRobotOption):
+    """Find sign and zero of each servo by moving the robot by hand, torque off. Put it on a stand, wheels off the ground."""
+
+    out: Path
+    """Hardware file to write; may be the one of --hardware."""
+    only: tuple[str, ...] = ()
+    """Joints to calibrate; the others stay as they are."""
+
+
+@dataclass(frozen=True)
+class ImuOptions(JsonOption, RobotOption):
+    """Find biases, scale and mounting of the IMU of a robot that stands still."""
+
+    out: Path
+    """Hardware file to write; may be the one of --hardware."""
+    poses: int = 1
+    """1 = gyroscope's bias, and accelerometer's offset on a level floor; 6 = its offset and scale from six sides up."""
+    mounting: bool = False
+    """Find how the sensor is mounted, from a level pose and one with the nose down."""
+    seconds: Annotated[float, Interval("s", least=0.5, most=60.0)] = 3.0
+    """How long to listen per pose, s."""
+
+
+@dataclass(frozen=True)
+class FlowOptions(JsonOption):
+    """Find scale and mounting of the optical-flow sensor from a straight run on a floor that grips, driven or pushed.
+
+    Record it with: wlr record --excitation straight
+    """
+
+    run: Positional[Path]
+    """The run."""
+    out: Path
+    """Hardware file to write; may be the one of --hardware."""
+    hardware: str = "nominal"
+    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
+    robot: str | None = None
+    """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
+    distance: float | None = None
+    """Way straight ahead by a tape measure, m (negative: back); default: what the wheels rolled."""
+    yes: bool = False
+    """Do not ask before the file is written."""
+
+
+def calibrate_camera(options: CameraOptions) -> int:
+    """Find lens and shutter, and write the camera file."""
     require_package("cv2", "vision")
-    return _targets(options) if isinstance(options, TargetsOptions) else _camera(options)
-
-
-def _camera(options: CameraOptions) -> int:
-    from wlr_gym.base.files import refuse_existing
-    from wlr_gym.perception.markers.calibration import Board
+    from wlr_gym.perception.markers.boards import Board
     from wlr_gym.perception.markers.camera import save_camera
     from wlr_gym.perception.vision.video import Frames
 
-    if not 0.001 < options.square < 0.5:
-        raise InputError(f"--square {options.square:g}: expected metres, as measured on the print (28 mm = 0.028)")
-    require_counts(options, "columns", "rows", least=3)
-    require_counts(options, "every")
-    if options.readout is not None and not -0.1 < options.readout < 0.1:
-        raise InputError(f"--readout {options.readout:g}: expected seconds, less than 0.1 (20 ms = 0.02)")
-    if options.out.suffix not in {".yaml", ".yml"} or not options.out.parent.is_dir():
-        raise InputError(f"--out {options.out}: expected a .yaml file in a folder that exists")
-    refuse_existing(options.out, options.force)
+    check_new_file(options.out, options.force, endings=(".yaml", ".yml"))
     board = Board(options.columns, options.rows, options.square, options.board, options.marker, options.dictionary)
     frames = Frames(options.images)
     camera, told = _calibrated(options, frames, board)
@@ -143,7 +178,8 @@ def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[C
     from rich.console import Console
 
     from wlr_gym.base.progress import progress
-    from wlr_gym.perception.markers.calibration import Readout, calibrate, calibrate_film
+    from wlr_gym.perception.markers.calibration import calibrate, calibrate_film
+    from wlr_gym.perception.markers.shutter import Readout
 
     with progress(Console(highlight=False)) as tell:
         named = _named(options.images, frames, lambda doing, share: tell("", doing, share))
@@ -175,9 +211,10 @@ def _shutter(camera: Camera, told: Readout) -> str:
     return f"rolling shutter: {1e3 * camera.readout:.1f} ms from the first row to the last{known}"
 
 
-def _targets(options: TargetsOptions) -> int:
-    from wlr_gym.base.files import make_output_folder, refuse_existing
-    from wlr_gym.perception.markers.calibration import Board
+def write_targets(options: TargetsOptions) -> int:
+    """Write the sheets into a folder."""
+    require_package("cv2", "vision")
+    from wlr_gym.perception.markers.boards import Board
     from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 
@@ -193,3 +230,310 @@ def _targets(options: TargetsOptions) -> int:
     if options.json:
         print_json(paths)
     return OK
+
+
+def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
+    """Find the one servo that is connected, say what will be written, ask, write and look again; 1 when the operator stops.
+
+    Raises:
+        InputError: unknown joint, none or several servos, another model, a servo that does not take it.
+    """
+    from wlr_gym.hardware.dynamixel.tables import BAUD_RATES
+    from wlr_gym.hardware.servo_setup import FACTORY_RATE, check_new_servo, find_servos, set_up
+
+    check_name("joint", options.joint, JOINTS)
+    robot, hardware = options.load()
+    name, bus = next((name, bus) for name, bus in hardware.buses.items() if options.joint in bus.joints)
+    id = robot.dynamixel_ids[options.joint]
+    print(f"searching {bus.port} ...")
+    likely = (FACTORY_RATE, bus.baud_rate)
+    others = [rate for rate in BAUD_RATES if rate not in likely]
+    with _dialogue():
+        found = find_servos(name, bus.port, likely) or find_servos(name, bus.port, others)
+    servo = check_new_servo(found, bus, options.joint)
+    registers = tally(bus.eeprom)
+    print(f"found: {servo}\n{options.joint} gets id {id}, {bus.baud_rate} bit/s, {registers}")
+    try:
+        if not _yes(ask, "Write it?"):
+            return _stopped()
+    except _StoppedError:
+        return _stopped()
+    with _dialogue():
+        set_up(name, bus, servo, id)
+    print(f"done: id {id} answers at {bus.baud_rate} bit/s; put a label on it")
+    if options.json:
+        print_json({"joint": options.joint, "bus": name, "id": id, "baud_rate": bus.baud_rate, "registers": bus.eeprom})
+    return OK
+
+
+def calibrate_joints(options: JointsOptions, ask: Ask = ask_terminal) -> int:
+    """Ask for each joint, show what was found, and write the file; 1 when the operator stops.
+
+    Raises:
+        InputError: unknown joint or file, a servo that does not answer.
+    """
+    for joint in options.only:
+        check_name("joint", joint, JOINTS)
+    robot, hardware = options.load()
+    source = source_of(options.hardware, options.out)
+    link = options.link()
+    try:
+        with _dialogue():
+            link.servos.open()
+            return _calibrate_joints(options, robot, hardware, source, link, ask)
+    except _StoppedError:
+        return _stopped()
+    finally:
+        link.close()
+
+
+def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, source: Path, link: Link, ask: Ask) -> int:
+    from wlr_gym.hardware.calibration import with_mountings
+
+    _require_torque_off(link.servos, ask)
+    print("Put the robot on a stand, wheels off the ground. Enter continues, s skips a joint, q ends without a file.")
+    wanted = options.only or JOINTS
+    found = {joint: _calibrate(joint, robot, hardware, link.servos, ask) for joint in JOINTS if joint in wanted}
+    mountings = {joint: mounting for joint, mounting in found.items() if mounting is not None}
+    for joint, new in mountings.items():
+        old = hardware.joints[joint]
+        print(f"{joint:9} sign {old.sign:+d} -> {new.sign:+d}, zero {old.zero} -> {new.zero}")
+    note = f"Signs and zeros by wlr calibrate joints, {today()}: count = zero + sign * angle / (size of a count)."
+    code = save_calibration(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
+    if options.json and code == OK:
+        print_json({"hardware": options.out, "joints": {name: one.model_dump() for name, one in mountings.items()}})
+    return code
+
+
+def _require_torque_off(servos: Servos, ask: Ask) -> None:
+    """Have all motors off; what is on is switched off only when the operator holds the robot and says so."""
+    on = [joint for joint in JOINTS if servos.get(joint, "torque_enable")]
+    if not on:
+        return
+    if not _yes(ask, f"Motors are on: {', '.join(on)}. Off, the robot drops: hold it. Switch them off?"):
+        raise _StoppedError
+    if left := servos.torque_off():
+        raise InputError(f"{', '.join(left)}: torque does not go off; cut the supply")
+
+
+def _calibrate(joint: str, robot: Robot, hardware: Hardware, servos: Servos, ask: Ask) -> Mounting | None:
+    """Return how one joint is mounted; None = skipped."""
+    from wlr_gym.hardware.calibration import find_sign, find_zero
+    from wlr_gym.hardware.config import Mounting
+
+    name = full_name(joint)
+    move = "swing its foot to the back by 30 deg" if joint in LEGS else "roll it forward by a quarter turn"
+
+    def look() -> Mounting | None:
+        if _answer(ask, f"{name}: hold it still, then Enter.") == "s":
+            return None
+        before = _counts(servos)
+        _answer(ask, f"{name}: {move} and hold it there, then Enter.")
+        turn = servos.table(joint).counts.turn
+        sign = find_sign(joint, before, _counts(servos), turn)
+        if joint not in LEGS:
+            return Mounting(sign=-1 if sign < 0 else 1, zero=hardware.joints[joint].zero)
+        _answer(ask, f"{name}: hold it straight down, wheel's centre under the hip, then Enter.")
+        straight_down = float(_counts(servos)[JOINTS.index(joint)])
+        zero = find_zero(joint, sign, straight_down, robot.leg_limits, turn)
+        return Mounting(sign=-1 if sign < 0 else 1, zero=zero)
+
+    return _until_good(look)
+
+
+def _counts(servos: Servos) -> NDArray[np.float64]:
+    """Return Present Position of all joints in counts, the average of 20 reads."""
+    return np.mean([[servos.get(joint, "present_position") for joint in JOINTS] for _ in range(20)], axis=0)
+
+
+def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
+    """Ask for each pose, show what was found, and write the file; 1 when the operator stops.
+
+    Raises:
+        InputError: unknown file, options that make no sense, an IMU that says nothing.
+    """
+    from wlr_gym.hardware.calibration import with_imu_calibration
+    from wlr_gym.hardware.config import ImuCalibration
+
+    if options.poses not in (1, 6):
+        raise InputError(f"--poses {options.poses}: expected 1 or 6")
+    _, hardware = options.load()
+    source = source_of(options.hardware, options.out)
+    link = options.link(with_imu_calibration(hardware, ImuCalibration()))
+    try:
+        with _dialogue():
+            link.imu.open()
+            print("Enter continues, q ends without a file.")
+            calibration = _find_calibration(options, hardware.imu.calibration, link, ask)
+        for name, value in calibration.model_dump(exclude_unset=True).items():
+            print(f"{name:13} {value}")
+        note = f"IMU calibrated by wlr calibrate imu, {today()}: mounting * scale * (measured - offset), SI units."
+        code = save_calibration(options.out, source, lambda file: with_imu_calibration(file, calibration), "imu", note, ask)
+        if options.json and code == OK:
+            print_json({"hardware": options.out, "imu": calibration.model_dump(mode="json")})
+        return code
+    except _StoppedError:
+        return _stopped()
+    finally:
+        link.close()
+
+
+def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
+    from wlr_gym.hardware import calibration as find
+    from wlr_gym.hardware.imu.reading import to_body
+
+    level = "Block the body level (the legs hold nothing) and let go of it, then Enter."
+    if options.poses == 6:
+        side = "Side {} of 6: turn the robot so that the sensor's axes point {}; keep it still, then Enter."
+        poses = [_pose(options, link, ask, side.format(k, up)) for k, up in enumerate(_UP, 1)]
+        offset, scale = find.six_positions(poses)
+    else:
+        poses = [_pose(options, link, ask, level)]
+        offset, scale = known.accel_offset, known.accel_scale
+    mounting = known.mounting
+    if options.mounting:
+        stood = _pose(options, link, ask, level) if options.poses == 6 else poses[0]
+        nose_down = "Lift the rear: nose down by 10 deg or more, without roll; keep it still, then Enter."
+        tilted = _pose(options, link, ask, nose_down)
+        mounting = find.mounting(*(np.array(scale) * (pose.accelerometer - np.array(offset)) for pose in (stood, tilted)))
+    elif options.poses == 1:
+        offset = find.level_offset(poses[0], known, to_body(known))
+    return known.model_copy(
+        update={
+            "gyro_bias": find.gyro_bias(find.mean_pose(poses)),
+            "accel_offset": offset,
+            "accel_scale": scale,
+            "mounting": mounting,
+            "temperature": round(float(np.mean([pose.temperature for pose in poses])), 1),
+            "date": today(),
+        }
+    )
+
+
+def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
+    from wlr_gym.hardware.calibration import rest_pose
+    from wlr_gym.hardware.safety.preflight import sample_imu
+
+    def look() -> RestPose:
+        _answer(ask, text)
+        samples = sample_imu(link.imu, link.clock, options.seconds)
+        return rest_pose(samples.gyro, samples.accelerometer, samples.temperature)
+
+    return _until_good(look)
+
+
+@contextlib.contextmanager
+def _dialogue() -> Iterator[None]:
+    """Turn trouble with the hardware into an :class:`InputError`: nothing moves, so there is nothing to save."""
+    from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
+
+    try:
+        yield
+    except (NoAnswerError, RefusedError, ConnectionError) as error:
+        raise InputError(f"{error}; see wlr doctor") from None
+
+
+def calibrate_flow(options: FlowOptions) -> int:
+    """Show what was found, ask, and write the file; 1 when the operator stops.
+
+    Raises:
+        InputError: a run without flow, too little way, a hardware file that names no flow sensor.
+    """
+    from wlr_gym.data.read import read_run
+    from wlr_gym.hardware.calibration import with_flow_calibration
+    from wlr_gym.hardware.config import load_hardware
+    from wlr_gym.hardware.flow.calibration import calibrate_flow as find
+    from wlr_gym.robot import load_robot
+
+    hardware = load_hardware(options.hardware)
+    robot = load_robot(options.robot or hardware.robot or "nominal")
+    if hardware.flow is None:
+        raise InputError(
+            f"--hardware {options.hardware}: names no flow sensor; expected a section flow, such as flow: {{port: ...}}"
+        )
+    source = source_of(options.hardware, options.out)
+    fit = find(read_run(options.run), robot, hardware.flow.calibration, options.distance)
+    found = fit.calibration.model_copy(update={"date": today()})
+    before = hardware.flow.calibration
+    print(
+        f"{fit.way:.2f} m in {fit.windows} windows, against {'the wheels' if options.distance is None else 'the tape measure'}"
+    )
+    print(f"scale     {before.scale:.4f} -> {found.scale:.4f} +- {fit.scale_sigma:.4f}")
+    print(f"mount_yaw {before.mount_yaw:.4f} -> {found.mount_yaw:.4f} +- {fit.yaw_sigma:.4f} rad")
+    note = f"Flow sensor calibrated by wlr calibrate flow, {today()}: scale, and rotation about body z from body to sensor."
+    ask = (lambda text: "y") if options.yes else ask_terminal
+    code = save_calibration(options.out, source, lambda file: with_flow_calibration(file, found), "flow", note, ask)
+    if options.json and code == OK:
+        sigma = {"scale": fit.scale_sigma, "mount_yaw": fit.yaw_sigma}
+        print_json({"hardware": options.out, "flow": found.model_dump(mode="json"), "sigma": sigma, "way": fit.way})
+    return code
+
+
+# ---- the dialogue ----------------------------------------------------------------------------------------------------
+
+
+class _StoppedError(Exception):
+    """The operator does not want to continue."""
+
+
+def _until_good(look: Callable[[], Result]) -> Result:
+    """Ask again while what was seen makes no sense; the operator can end it at every question."""
+    while True:
+        try:
+            return look()
+        except NobodyThereError:
+            raise
+        except InputError as error:
+            print(f"{error}. Once more.")
+
+
+def _answer(ask: Ask, text: str) -> str:
+    answer = ask(text).strip().lower()
+    if answer in ("q", "quit"):
+        raise _StoppedError
+    return answer
+
+
+def _yes(ask: Ask, text: str) -> bool:
+    return _answer(ask, f"{text} [y/N]") in ("y", "yes")
+
+
+def source_of(hardware: str, out: Path) -> Path:
+    """Return the file the hardware comes from; refuse to write over another one."""
+    source = find_config("hardware", hardware)
+    if out.exists() and not out.samefile(source):
+        raise InputError(f"--out {out}: is there already; name it with --hardware to change it")
+    check_new_file(out, force=True, endings=(".yaml", ".yml"))
+    return source
+
+
+def save_calibration(out: Path, source: Path, change: Callable[[Hardware], Hardware], section: str, note: str, ask: Ask) -> int:
+    """Ask, and write the file with what was found: ``change`` is made to what it says, not to ports of the command line."""
+    from wlr_gym.hardware.calibration import save_hardware
+    from wlr_gym.hardware.config import load_hardware
+
+    if not _yes(ask, f"Write {out}?"):
+        return _stopped()
+    save_hardware(out, source, change(load_hardware(source)), section, note)
+    print(f"written: {out}")
+    return OK
+
+
+def _stopped() -> int:
+    print("stopped: nothing was written")
+    return FAILED
+
+
+def today() -> str:
+    return datetime.datetime.now().astimezone().date().isoformat()
+
+
+#: Command -> its options, and what it does.
+COMMANDS = {
+    "camera": (CameraOptions, calibrate_camera),
+    "targets": (TargetsOptions, write_targets),
+    "servo": (ServoOptions, set_up_servo),
+    "joints": (JointsOptions, calibrate_joints),
+    "imu": (ImuOptions, calibrate_imu),
+    "flow": (FlowOptions, calibrate_flow),
+}

@@ -17,10 +17,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
 from wlr_gym.base.paths import find_config
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import RobotOption, ask_terminal
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, RobotOption
+from wlr_gym.cli.terminal import ask_terminal, print_json, print_table
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -10,16 +10,16 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from wlr_gym.base.checks import Interval
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import output_folder, write_json, write_text
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_counts, settings_of
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.options import Count, ForceOption, JsonOption, PatchOption, Seconds, Seed, settings_of
+from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -48,21 +48,21 @@ class CompareOptions(JsonOption, ForceOption, PatchOption):
     default: all."""
     runs: Path | None = None
     """Drive the commands of this measured run, or folder of runs, instead."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the excitations: another seed, another motion of the same kind."""
-    seconds: float | None = None
+    seconds: Seconds | None = None
     """Cut every motion off after this long."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
-    physics_step: float = 0.001
+    physics_step: Seconds = 0.001
     """Substep of both plants, s."""
     halve: bool = False
     """Repeat at half of both steps: shows whether the difference shrinks, and each plant's own step error."""
     every_effect: bool = False
     """Also compare with each effect of the library at its default severity, one at a time, on top of --effects."""
-    threshold: float = 5.0
+    threshold: Annotated[float, Interval("units of sensor noise", above=0.0)] = 5.0
     """Two signals have diverged when they differ by more than this many units of sensor noise."""
-    threads: int = 1
+    threads: Count = 1
     """Worker threads of each plant."""
     plots: bool = True
     """Write figures."""
@@ -82,14 +82,9 @@ def run(options: CompareOptions) -> int:
     from wlr_gym.data.compared_plants import parse_plant
     from wlr_gym.data.comparison_report import markdown, summary_table, tables
 
-    require_counts(options, "threads")
-    if not options.physics_step > 0.0:
-        raise InputError(f"--physics-step {options.physics_step:g}: expected more than 0 s")
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if first == second:
         raise InputError(f"--plants {' '.join(options.plants)}: the same plant twice; expected two that differ")
-    if not options.threshold > 0.0:
-        raise InputError(f"--threshold {options.threshold:g}: expected more than 0 units of sensor noise")
     motions, robot = _motions(options)
     patches = _patches(options, motions, robot)
     options.refuse_results(options.out, "compare.json")
@@ -120,8 +115,6 @@ def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     from wlr_gym.data.replay import robot_of
     from wlr_gym.robot import load_robot
 
-    if options.seconds is not None and not options.seconds > 0.0:
-        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     if options.runs is None:
         robot = load_robot(options.robot or "nominal")
         names = options.excitation or tuple(EXCITATIONS)

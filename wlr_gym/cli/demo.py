@@ -22,8 +22,8 @@ from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import CONFIG_FILE, record_provenance
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption
-from wlr_gym.cli.results import print_json
+from wlr_gym.cli.options import Count, ForceOption, JsonOption, Seed
+from wlr_gym.cli.terminal import print_json
 
 if TYPE_CHECKING:
     from wlr_gym.demo.settings import Demo
@@ -40,9 +40,9 @@ _SHORT = {
 class DemoOptions(JsonOption, ForceOption):
     out: Path = Path("out/demo")
     """Folder for the page and everything it was made from; --force replaces a demo that is in it."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of everything random: training, episodes, and the hidden fault."""
-    steps: int | None = None
+    steps: Count | None = None
     """Environment steps to train for, all robots together; default: three million."""
     quick: bool = False
     """Everything as short as can be, to see that it works: nothing is learnt, and nothing need be found."""
@@ -90,8 +90,6 @@ def run(options: DemoOptions) -> int:
 def _demo(options: DemoOptions) -> Demo:
     from wlr_gym.demo.settings import Demo
 
-    if options.steps is not None and options.steps < 1:
-        raise InputError(f"--steps {options.steps}: expected 1 or more")
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
     return Demo(options.out, options.seed, steps, **(_SHORT if options.quick else {}))
 

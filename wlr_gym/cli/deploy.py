@@ -1,25 +1,27 @@
-"""Drive the robot with a policy: check, ramp to the start pose, run at 50 Hz through the command limiter, stop, torque off.
-
-Space switches the motors off at once, q stops, and so do Ctrl-C, SIGTERM and SIGHUP. Try it without a robot: --emulated. Wheels
-off the ground the first time; see docs/robot.md.
-"""
+"""Options of ``wlr deploy``, and what it refuses before anything else: before an operator is asked or a robot started."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import require_ending, require_output_place
+from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.deploy_options import DeployOptions, checked_command
-from wlr_gym.cli.options import environment_of, note_untrained
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import port_pairs, wait_for_enter
+from wlr_gym.cli.options import JsonOption, PatchOption, Seconds, Seed, environment_of, note_untrained, port_pairs, read_camera
+from wlr_gym.cli.terminal import print_json, wait_for_enter
+from wlr_gym.robot import JOINTS
 
 if TYPE_CHECKING:
     from wlr_gym.data.logs.stream import McapStream
@@ -29,6 +31,129 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import DrivingPad, Keys
     from wlr_gym.policy import Policy
+if TYPE_CHECKING:
+    from wlr_gym.envs.core import Core
+    from wlr_gym.hardware.loop import ControlLoop
+    from wlr_gym.hardware.safety.rules import RobotStatus
+
+
+@dataclass(frozen=True)
+class DeployOptions(JsonOption, PatchOption):
+    policy: tyro.conf.Positional[str]
+    """Policy file or folder, run folder, or name of an agent or shipped policy."""
+    env: str | None = None
+    """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
+    robot: str | None = None
+    """Robot file, or name in configs/robot/; default: that of the hardware file, else the policy's."""
+    hardware: str = "nominal"
+    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
+    port: tuple[str, ...] = ()
+    """Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0."""
+    emulated: bool = False
+    """Drive an emulated robot, which is started for the purpose."""
+    stepped: bool = False
+    """With --emulated: in emulated time, without ports: faster, and the same bits each time."""
+    camera: str | None = None
+    """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
+    dry_run: bool = False
+    """Do everything but write to the servos: nothing moves."""
+    fault: tuple[str, ...] = ()
+    """With --emulated: what goes wrong, as in wlr emulate: "drop legs after=3"."""
+    seconds: Seconds = 10.0
+    """How long to drive."""
+    command: tuple[str, ...] = ()
+    """What to follow: linear_velocity_x=0.1 yaw_rate=0; default: drawn anew every few seconds, as in training."""
+    seed: Seed = 0
+    """Seed of the drawn commands, and of an emulated robot's noise."""
+    deadman: float | None = None
+    """Stop the wheels when no key was pressed for so many seconds (10 at most); with --gamepad: its dead-man button (0.2)."""
+    gamepad: str | None = None
+    """Steer with a gamepad, such as /dev/input/js0, while its dead-man button is held; buttons: the hardware file's gamepad."""
+    realtime: int | None = None
+    """Run at this real-time priority (1 to 99, SCHED_FIFO) with all memory locked; Linux."""
+    out: Path = Path("robot_runs")
+    """Folder for the logs."""
+    mcap: Path | None = None
+    """Write the run into this new MCAP file, too, while it goes on, for Foxglove and PlotJuggler."""
+    yes: bool = False
+    """Do not ask before the robot moves."""
+    status: bool = True
+    """Show a live status."""
+
+
+def checked_command(options: DeployOptions) -> dict[str, float]:
+    """Return the held command, from options that make sense.
+
+    Raises:
+        InputError: the first option that does not.
+    """
+    from wlr_gym.hardware.limits import require_deadman
+    from wlr_gym.hardware.realtime import require_priority
+
+    if options.deadman is not None:
+        require_deadman("--deadman", options.deadman)
+    if options.realtime is not None:
+        require_priority("--realtime", options.realtime)
+    _check_emulation(options)
+    _check_training(options)
+    read_camera(options.camera, options.emulated)
+    options.patch()  # a bad one is refused before a robot is started for it
+    _check_faults(options)
+    require_output_place(options.out)
+    if options.mcap is not None:
+        if options.mcap.exists():
+            raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
+        require_ending(options.mcap, (".mcap",), "--mcap")
+    return _command(options)
+
+
+def _check_emulation(options: DeployOptions) -> None:
+    if not options.emulated and (options.stepped or options.fault):
+        raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
+    if options.stepped and options.realtime is not None:
+        raise InputError("--realtime: emulated time is not real time; leave out --stepped")
+    if options.effects and not options.emulated:
+        raise InputError("--effects: a real robot has its own; add --emulated")
+    if options.emulated and options.port:
+        raise InputError("--port: the emulated robot brings its own ports")
+
+
+def _check_training(options: DeployOptions) -> None:
+    from wlr_gym.policy import untrained
+
+    words = untrained(options.policy)
+    if words and not (options.emulated or options.dry_run):
+        raise InputError(f"{words}; a real robot moves with one of these, or with your own")
+
+
+def _check_faults(options: DeployOptions) -> None:
+    if not options.fault:
+        return
+    from wlr_gym.hardware.config import load_hardware
+    from wlr_gym.hardware.emulator import parse_fault
+    from wlr_gym.robot import JOINTS
+
+    places = (*JOINTS, *load_hardware(options.hardware).buses, "imu", "flow", "camera")
+    for fault in options.fault:
+        try:
+            parse_fault(fault, places)
+        except InputError as error:
+            raise InputError(f"--fault: {error}") from None
+
+
+def _command(options: DeployOptions) -> dict[str, float]:
+    commands = pairs("--command", options.command, "yaw_rate=0.1")
+    try:
+        numbers = {name: float(text) for name, text in commands.items()}
+    except ValueError:
+        numbers = {"": float("nan")}
+    if not all(map(math.isfinite, numbers.values())):
+        raise InputError(f"--command {' '.join(options.command)}: expected name=number")
+    return numbers
+
+
+# --- drive the robot with a policy: check, ramp to the start pose, run at 50 Hz through the command limiter, stop, torq
+
 
 #: How a stop begins that an emulated robot in real time owes to a busy computer.
 _LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
@@ -268,7 +393,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
 
 def _say_what_is_not_known(core: Core, policy: str, console: Console) -> None:
-    from wlr_gym.cli.robot_options import camera_note
+    from wlr_gym.cli.options import camera_note
     from wlr_gym.policy import contract_of
 
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
@@ -286,8 +411,6 @@ def _serving(
 ) -> Iterator[None]:
     """Serve keys and gamepad, and show the status, in the time that is left in each step."""
     from rich.live import Live
-
-    from wlr_gym.cli.robot_status import RobotView
 
     live = Live(console=console, auto_refresh=False, transient=True) if show else None
     view, count = RobotView(loop, core), 0
@@ -311,8 +434,7 @@ def _serving(
 def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     from rich.text import Text
 
-    from wlr_gym.cli.robot_status import camera_line
-    from wlr_gym.cli.tables import print_table
+    from wlr_gym.cli.terminal import print_table
 
     colour = "green" if result.well else "red"
     console.print(Text.assemble(("ended: ", "bold"), (result.reason, colour)))
@@ -330,3 +452,98 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
         console.print(camera_line(camera))
     if written := [result.run] if result.run is not None else loop.recorder.files:
         console.print(f"written: {', '.join(map(str, written))}", soft_wrap=True)
+
+
+# --- the live status of a robot that drives: its joints, and what supervision sees, beside the limits it holds it to --
+
+
+class RobotView:
+    """What a driver wants to see now.
+
+    Args:
+        loop: drives the robot.
+        core: what it is asked to follow.
+    """
+
+    def __init__(self, loop: ControlLoop, core: Core) -> None:
+        self._loop, self._core = loop, core
+        self._seen: Counter[str] = Counter()
+
+    def table(self) -> Any:
+        """Return a table of the joints, and below it the command and what supervision sees."""
+        from rich.table import Table
+
+        loop, core = self._loop, self._core
+        phase = loop.phase.name.lower().replace("_", " ")
+        table = Table(box=None, title=f"{phase}  {core.time[0]:.1f} s", title_justify="left", caption_justify="left")
+        for name in ("joint", "angle rad", "setpoint", "speed rad/s", "effort N m", "degC", "V"):
+            table.add_column(name, justify="left" if name == "joint" else "right")
+        status = loop.status
+        if status is None:
+            return table
+        columns = (status.position, loop.setpoints, status.velocity, status.effort, status.temperature, status.voltage)
+        for k, joint in enumerate(JOINTS):
+            numbers = (f"{column[k]:.2f}" for column in columns)
+            table.add_row(joint, *numbers, style="red" if status.silence[k] > 0 else "")
+        command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
+        camera = [] if status.camera is None else [camera_state(status)]
+        table.caption = "\n".join([command, supervised(loop, status), *camera, self._interventions()])
+        return table
+
+    def _interventions(self) -> str:
+        """What the command limiter changed or stopped since the last look, and in all."""
+        counts = self._loop.interventions
+        now = ", ".join(sorted(counts - self._seen)) or "nothing"
+        in_all = ", ".join(f"{rule} {count}" for rule, count in counts.most_common()) or "none"
+        self._seen = counts.copy()
+        return f"command limiter acts on: {now}; steps in all: {in_all}"
+
+
+def supervised(loop: ControlLoop, status: RobotStatus) -> str:
+    """Return what the safety rules look at, each with its limit."""
+    from wlr_gym.hardware.safety.rules import ratings_of, tilt_of
+
+    limits = loop.limits
+    load = np.abs(status.effort) / ratings_of(loop.robot, loop.pacer.period).stall_torque
+    strained, hottest, lowest = int(load.argmax()), int(status.temperature.argmax()), int(status.voltage.argmin())
+    seen = [
+        f"load {load[strained]:.0%} ({JOINTS[strained]}, limit {limits.load:.0%})",
+        f"{status.temperature[hottest]:.0f} degC ({JOINTS[hottest]}, limit {limits.hot:g})",
+        f"{status.voltage[lowest]:.1f} V ({JOINTS[lowest]}, limit {limits.low_voltage:g})",
+        f"tilt {tilt_of(status.up):.2f} rad (limit {limits.tilt:g})",
+        f"servos silent {status.silence.max():.2f} s (limit {limits.silence:g})",
+        f"IMU {status.imu_silence:.2f} s (limit {limits.imu_silence:g})",
+        f"late {loop.pacer.late_ticks} in a row (limit {limits.late}), {loop.pacer.late_share:.0%} "
+        f"(limit {limits.late_share:.0%}), missed {loop.pacer.missed}",
+    ]
+    if limits.deadman is not None:
+        seen.append(f"operator silent {loop.operator.silence:.1f} s (limit {limits.deadman:g})")
+    return "  ".join(seen)
+
+
+def camera_state(status: RobotStatus) -> str:
+    """Return what the camera says now."""
+    camera = status.camera
+    assert camera is not None
+    x, y, yaw = camera.pose
+    found = f"camera: x {x:+.3f} m  y {y:+.3f} m  yaw {yaw:+.3f} rad, {1e3 * (status.time - camera.time):.0f} ms old"
+    if camera.doubt:
+        found += f"; {camera.doubt}"
+    if not camera.reason:
+        return found
+    return f"{found}; {'wrong: ' if camera.is_wrong else 'no pose: '}{camera.reason}"
+
+
+def camera_line(found: dict[str, Any]) -> str:
+    """Return what came of a camera in a run, from the control loop's statistics."""
+    line = f"camera: {found['frames']} frames, {found['rate']:.1f} per second, {found['poses']} poses"
+    if latency := found.get("latency"):
+        tail = f"(99 %: {latency['p99']:.0f}, max {latency['max']:.0f})"
+        line += f"; from exposure to the control step {latency['p50']:.0f} ms {tail}"
+    if lag := found.get("lag"):
+        line += f"; pictures older than their stamps by {lag['ms']:.0f} +- {lag['std']:.0f} ms, by the gyroscope"
+    reasons = ", ".join(
+        f"{reason} {count}" for reason, count in sorted(found["without_pose"].items(), key=lambda item: -item[1])
+    )
+    doubt = f"; {found['doubt']}" if "doubt" in found else ""
+    return f"{line}; frames without a believed pose: {reasons or 'none'}{doubt}"

@@ -16,9 +16,8 @@ import tyro
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import JsonOption
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import CameraOption, wait_for_enter
+from wlr_gym.cli.options import CameraOption, JsonOption
+from wlr_gym.cli.terminal import print_json, wait_for_enter
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -65,7 +64,7 @@ def run(options: DoctorOptions) -> int:
     with closing(options.link()) as link:
         checks = examine(link, robot, hardware, options, console)
     if options.policy is not None:
-        checks += check_policy(options.policy, options.robot_name(options.robot), options.camera is not None)
+        checks += check_policy(options.policy, options.robot_name(), options.camera is not None)
     if options.json:
         print_json([check._asdict() for check in checks])
     else:

@@ -17,8 +17,7 @@ from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.base.paths import config_names
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, Patch, PatchEffect, apply_patch, load_patch
 from wlr_gym.physics.effects.library import coordinates, places
 from wlr_gym.physics.plants.forces import FEATURES

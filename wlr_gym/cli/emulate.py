@@ -9,11 +9,12 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from wlr_gym.base.checks import Interval
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption
+from wlr_gym.cli.options import PatchOption, Seconds, Seed
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.emulator import Machine, Server
@@ -50,13 +51,13 @@ class EmulateOptions(PatchOption):
     fault: tuple[str, ...] = ()
     stand: bool = False
     stepped: bool = False
-    tick: float = 0.001
-    usb_latency: float = 0.001
+    tick: Seconds = 0.001
+    usb_latency: Annotated[float, Interval("s", least=0.0)] = 0.001
     wire_time: bool = True
     factory: bool = False
-    firmware: int = 45
-    seed: int = 0
-    seconds: float = 0.0
+    firmware: Annotated[int, Interval(least=0, most=255)] = 45
+    seed: Seed = 0
+    seconds: Annotated[float, Interval("s", least=0.0)] = 0.0
     poses: Path | None = None
 
 
@@ -103,13 +104,6 @@ def machine_of(options: EmulateOptions) -> Machine:
     from wlr_gym.robot.parameters import Parameters
 
     check_simulator(options.backend, "--backend")
-    if not options.tick > 0:
-        raise InputError(f"--tick {options.tick:g}: expected more than 0")
-    for name in ("usb_latency", "seconds"):
-        if not getattr(options, name) >= 0:
-            raise InputError(f"--{name.replace('_', '-')} {getattr(options, name):g}: expected 0 or more")
-    if not 0 <= options.firmware <= 255:
-        raise InputError(f"--firmware {options.firmware}: expected 0 to 255")
     timing = NO_TIME if options.stepped else LineTiming(wire=options.wire_time, usb_latency=options.usb_latency)
     machine_options = MachineOptions(
         backend=options.backend,

@@ -14,8 +14,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing, require_ending
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.envs.tasks import Randomization, Task, load_randomization, load_task
 from wlr_gym.envs.tasks.describe import DescriptionPart, randomization_section, scaling_sections, task_sections

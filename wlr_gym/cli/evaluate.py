@@ -6,28 +6,30 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.checks import Interval, check_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import output_folder, refuse_existing
 from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import (
+    Count,
     ForceOption,
     JsonOption,
     PatchOption,
+    Seconds,
+    Seed,
     SensorsOption,
     environment_of,
     note_untrained,
-    require_counts,
     settings_of,
 )
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.learning.evaluation import (
@@ -82,7 +84,7 @@ FULL_BLOCKS = 5
 
 @dataclass(frozen=True)
 class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
-    policy: tyro.conf.Positional[tuple[str, ...]]
+    policy: tyro.conf.Positional[tuple[str, ...]] = ()
     """Agent, policy file (.onnx), policy or run folder, or shipped policy; NAME=POLICY names it. Several, NAME=POLICY,POLICY, a
     pattern ('out/five/trials/*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
     env: str | None = None
@@ -92,26 +94,26 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     learning and the environment's shipped policies."""
     full: bool = False
     """The whole card: 5 blocks of 256 episodes, every sweep, both simulators. Minutes per policy; options below still count."""
-    episodes: int | None = None
+    episodes: Count | None = None
     """Number of episodes per block; default: 64, with --full 256."""
-    blocks: int | None = None
+    blocks: Count | None = None
     """Number of blocks of --episodes, each with its own seeds; default: 1, with --full 5."""
-    seed: int = FIRST_SEED
+    seed: Seed = FIRST_SEED
     """Seed of the first episode; the others count up from it, each further one of --blocks from 10000 above the last one."""
     backend: str | None = None
     """Simulator: gibbs_appell, mujoco, or both (the second for the main table only); default: the first, with --full both."""
-    other_episodes: int = OTHER_EPISODES
+    other_episodes: Count = OTHER_EPISODES
     """Episodes in the second simulator."""
     sweep: tuple[str, ...] | None = None
     """Sweeps: friction, split, floors, slope, grip, shapes, paper, latency, payload; default: none, with --full all that suit
     the task."""
-    sweep_episodes: int = SWEEP_EPISODES
+    sweep_episodes: Count = SWEEP_EPISODES
     """Episodes per point of a sweep."""
     randomization: str | None = None
     """Name in configs/randomization/, path, or a gap result (.json); default: the task's."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the robot that the policy was trained with, else the task's."""
-    threads: int = 1
+    threads: Count = 1
     """Threads of the simulator; results do not depend on it."""
     accept: bool = False
     """Acceptance test instead of the card: on every family of floors of the task the policy must not lose more than 5 % of
@@ -120,11 +122,11 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     out: Path | None = None
     """Folder for card.md, card.json, pictures, episodes.parquet (every episode's scores) and samples.csv (what randomization
     drew); default: only print."""
-    record: int = 0
+    record: Annotated[int, Interval(least=0)] = 0
     """Write so many of the policy's episodes as runs into the folder OUT/runs."""
     video: Path | None = None
     """Film (.webp, .gif, .png, .mp4) of the first episode: the policy, beside the first baseline where there is one."""
-    video_seconds: float = 10.0
+    video_seconds: Seconds = 10.0
     """Length of the film."""
     progress: bool = True
     """Show a progress bar."""
@@ -134,7 +136,6 @@ def run(options: EvaluateOptions) -> int:
     """Play, print the card, write it."""
     if not options.policy:
         raise InputError("no policy given; see: wlr evaluate --help")
-    require_counts(options, "episodes", "blocks", "other_episodes", "sweep_episodes", "threads")
     options.present()  # what cannot be is refused before anything is written
     if options.accept:
         return _accept(options)
@@ -242,15 +243,12 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
 
 
 def _check(options: EvaluateOptions) -> None:
-    if options.backend not in (*BACKENDS, "both"):
-        raise unknown_name("backend", str(options.backend), (*BACKENDS, "both"), "--backend")
+    check_name("backend", options.backend, (*BACKENDS, "both"), "--backend")
     if options.record and (options.out is None or not 0 < options.record <= (options.episodes or 0)):
         raise InputError(f"--record {options.record}: expected 0 to {options.episodes} (--episodes), and --out for the runs")
     if options.video is not None:
         check_video(options.video)
         refuse_existing(options.video, options.force, "--video")
-        if not 0 < options.video_seconds < float("inf"):
-            raise InputError(f"--video-seconds {options.video_seconds:g}: expected more than 0")
 
 
 def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:

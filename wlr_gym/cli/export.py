@@ -22,7 +22,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing, require_ending
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import ForceOption, JsonOption, environment_of
-from wlr_gym.cli.results import print_json
+from wlr_gym.cli.terminal import print_json
 
 if TYPE_CHECKING:
     from wlr_gym.policy import Parity
@@ -36,7 +36,7 @@ ELSEWHERE = ("--out", "--resume", "--max-minutes")
 
 @dataclass(frozen=True)
 class ExportOptions(JsonOption, ForceOption):
-    policy: tyro.conf.Positional[tuple[str, ...]]
+    policy: tyro.conf.Positional[tuple[str, ...]] = ()
     """Policy folder, run folder, or archive of Stable-Baselines3 (.zip, with --env); with --card: policy file, or name of a
     shipped policy; with --reseal: any of these; with --to: runs, or folders of runs."""
     out: Path | None = None

@@ -10,31 +10,61 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
+from tyro.conf import Positional
 
+from wlr_gym.base.checks import Interval, check_folder, check_name
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import progress
+from wlr_gym.base.provenance import record_provenance
+from wlr_gym.base.text import duration
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.gap_decide import DecideOptions, print_rounds, recorder_of
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, require_counts, settings_of
-from wlr_gym.cli.results import print_json
+from wlr_gym.cli.options import Count, ForceOption, JsonOption, PatchOption, RobotOption, noise_seed, settings_of
+from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from wlr_gym.data.excitations import Motion
     from wlr_gym.gap.analysis import Analysis
+    from wlr_gym.gap.decision import Decided, Recorded, Recorder
     from wlr_gym.physics.effects import Patch
+    from wlr_gym.robot import Robot
+
+
+#: s between two looks for the run that was asked for.
+LOOK = 1.0
+#: Folder of the motions that were asked for, in the results' folder.
+ASKED = "motions"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecideOptions:
+    """Options of ``--until-decided``."""
+
+    until_decided: bool = False
+    """Have further runs driven, each chosen by what it would tell per second, until it is decided; see --record."""
+    record: Literal["emulated", "simulator", "ask"] = "ask"
+    """Who drives them: an emulated robot, the simulator (--backend), or you: the motion is written and the run waited for."""
+    hidden: tuple[str, ...] = ()
+    """What the emulated or simulated robot has that its file does not say: patch files or names, to try the workflow."""
+    budget_runs: Annotated[int, Interval(least=0)] = 5
+    """Most further runs."""
+    budget_seconds: Annotated[float, Interval("s", least=0.0)] | None = None
+    """Most seconds of driving; default: as many as the runs take."""
 
 
 @dataclass(frozen=True)
 class GapOptions(DecideOptions, JsonOption, ForceOption, PatchOption):
-    data: tyro.conf.Positional[Path]
+    data: Positional[Path]
     """Folder of measured runs; with --rig, of recordings of the rig."""
     out: Path
     """Folder for the results; made if it is not there."""
@@ -47,7 +77,7 @@ class GapOptions(DecideOptions, JsonOption, ForceOption, PatchOption):
     """Simulator of the robot: gibbs_appell or mujoco."""
     heldout: tuple[str, ...] = ()
     """Runs to hold out for validation; default: chosen by how informative the other runs are."""
-    threads: int | None = None
+    threads: Count | None = None
     """Worker threads; default: one per core."""
 
 
@@ -59,10 +89,8 @@ def run(options: GapOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.base.files import refuse_existing
-    from wlr_gym.base.provenance import record_provenance
     from wlr_gym.gap.analysis import BAD_DATA
-    from wlr_gym.gap.report.page import check_folder
+    from wlr_gym.gap.report.folder import check_folder as check_results
     from wlr_gym.gap.report.result import RESULT_FILE
     from wlr_gym.gap.workflow import analyse
 
@@ -72,7 +100,7 @@ def run(options: GapOptions) -> int:
     if options.until_decided:
         return _decide(options, known, console)
     refuse_existing(options.out / RESULT_FILE, options.force)
-    check_folder(options.out)
+    check_results(options.out)
     with progress(console) as tell:
         analysis = analyse(
             options.data,
@@ -99,7 +127,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     from wlr_gym.data.replay import robot_of
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.decision import Budget, decide
-    from wlr_gym.gap.report.page import REPORT_FILE
+    from wlr_gym.gap.report.folder import REPORT_FILE
     from wlr_gym.gap.report.result import RESULT_FILE
 
     budget = Budget(options.budget_runs, math.inf if options.budget_seconds is None else options.budget_seconds)
@@ -128,14 +156,12 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 def _check(options: GapOptions) -> None:
     from wlr_gym.data.read import run_files
+    from wlr_gym.gap.opened import OWN_RIG, RIGS
     from wlr_gym.gap.rig.own import load_rig
-    from wlr_gym.gap.workflow import OWN_RIG, RIGS
     from wlr_gym.physics.plants import check_simulator
     from wlr_gym.robot import load_robot
 
-    if not options.data.is_dir():
-        what = "is a file" if options.data.exists() else "no such folder"
-        raise InputError(f"{options.data}: {what}; expected a folder of runs")
+    check_folder(options.data, of="runs")
     check_simulator(options.backend, "--backend")
     if options.rig is not None and options.rig not in RIGS and not options.rig.endswith(OWN_RIG):
         raise unknown_name("rig", options.rig, RIGS)
@@ -154,16 +180,13 @@ def _check(options: GapOptions) -> None:
     if given and not options.until_decided:
         raise InputError(f"--{given[0].replace('_', '-')}: it is for --until-decided")
     runs = [path.stem for path in run_files(options.data)] if options.rig is None else []
-    for name in options.heldout:
-        if runs and name not in runs:
-            raise unknown_name("run", name, runs, "--heldout")
-    require_counts(options, "threads")
-    require_counts(options, "budget_runs", "budget_seconds", least=0)
+    for name in options.heldout if runs else ():
+        check_name("run", name, runs, "--heldout")
 
 
 def _known(options: GapOptions) -> Patch:
     """The effects given as known, in the vocabulary of the robot or of the rig."""
-    from wlr_gym.gap.workflow import known_patch
+    from wlr_gym.gap.opened import known_patch
 
     try:
         return options.patch() if options.rig is None else known_patch(list(options.effects), options.rig)
@@ -176,7 +199,7 @@ def _known(options: GapOptions) -> Patch:
 
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
     from wlr_gym.gap.analysis import BAD_DATA
-    from wlr_gym.gap.report.page import REPORT_FILE
+    from wlr_gym.gap.report.folder import REPORT_FILE
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
     from wlr_gym.gap.report.text import closure, made_worse, sentence, title
 
@@ -222,3 +245,88 @@ def _advice(analysis: Analysis) -> Iterator[str]:
         yield f"  not distinguishable: {names}; discriminating experiment: {group.separating_run}"
     for one in analysis.recommendations:
         yield f"  record next: {one.excitation}: {one.why}"
+
+
+# ---- further runs ------------------------------------------------------------------------------------------------------
+
+
+def recorder_of(options: DecideOptions, robot: Robot, backend: str, out: Path, console: Console) -> Recorder:
+    """Return what has a motion driven.
+
+    Raises:
+        InputError: ``--hidden`` for a real robot, or a patch that cannot be read.
+    """
+    from wlr_gym.physics.effects import load_patch
+
+    if options.record == "ask":
+        if options.hidden:
+            raise InputError("--hidden: a real robot has its own effects; they are for --record emulated and simulator")
+        return partial(ask, out=out, console=console)
+    drive = {"emulated": _emulated, "simulator": _simulated}[options.record]
+    return partial(drive, robot=robot, hidden=load_patch(list(options.hidden)), backend=backend)
+
+
+def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callable[[float], None] = time.sleep) -> Recorded:
+    """Write a motion, say how it is driven, and wait until its run is in the folder of the data."""
+    from wlr_gym.data.read import read_run, run_files
+    from wlr_gym.data.record import write_commands
+    from wlr_gym.gap.decision import Recorded
+
+    there = set(run_files(data))
+    path = write_commands(out / ASKED, motion)
+    console.print(f"drive {motion.name} ({motion.duration:.0f} s): wlr record --commands {path} --out {data}", markup=False)
+    console.print(
+        "(a real robot: with --hardware FILE) waiting for its run; Ctrl-C: the same command goes on later", markup=False
+    )
+    size = -1
+    while True:
+        new = [path for path in run_files(data) if path not in there]
+        if new and new[0].stat().st_size == size:
+            try:
+                read_run(new[0])
+            except InputError as error:  # it may be half written, or wrong
+                console.print(f"not usable yet: {error}", markup=False)
+            else:
+                return Recorded(new[0])
+        size = new[0].stat().st_size if new else -1
+        wait(LOOK)
+
+
+def _simulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
+    """Drive the simulator; no two runs of a folder have the same noise."""
+    from wlr_gym.base.random import spawn_seeds
+    from wlr_gym.data.read import read_meta
+    from wlr_gym.data.record import next_run, record_simulation
+    from wlr_gym.gap.decision import Recorded
+
+    path = next_run(data)
+    seed = int(spawn_seeds(0, 1, path.stem)[0])
+    return Recorded(record_simulation(path, motion, robot, backend, seed, hidden, read_meta(data)))
+
+
+def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
+    """Drive an emulated robot in emulated time, through the command limiter as a real one; noise as in a simulator."""
+    from wlr_gym.data.read import read_meta
+    from wlr_gym.gap.decision import Recorded
+    from wlr_gym.hardware.deployment import drive_robot
+
+    del backend  # it has a simulator of its own
+    meta = read_meta(data).model_copy(update={"profile": motion.profile})
+    with closing(RobotOption(emulated=True).plant_of(robot, data, meta, hidden, noise_seed(data, 0))) as plant:
+        drive = drive_robot(plant, motion)
+    return Recorded(drive.run, drive.reason)
+
+
+def print_rounds(decision: Decided, console: Console) -> None:
+    """Print a row for every round, and how it ended."""
+    from wlr_gym.gap.report.text import plain
+
+    history = decision.history
+    rows = []
+    for one in history.rounds:
+        left = ", ".join(f"{plain(name)} {share:.0%}" for name, share in one.names.items()) or plain(one.verdict)
+        driven = one.excitation and f"{one.excitation}{f' ({one.run})' if one.run else ''}"
+        why = "; ".join(filter(None, [one.why, one.stopped]))
+        rows.append((str(one.number), str(len(one.runs)), left, driven or "", f"{one.seconds:.0f}" if one.run else "", why))
+    print_table(console, ("round", "runs", "names left", "drive next", "seconds", "why"), rows)
+    console.print(f"{history.ended}, after {len(history.driven)} further runs, {duration(history.seconds)} of driving")

@@ -19,9 +19,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.options import JsonOption, Seconds
+from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,7 +32,7 @@ _COLOURS = {"sure": "green", "likely": "yellow", "guess": "red"}
 
 @dataclass(frozen=True)
 class ImportOptions(JsonOption):
-    log: tyro.conf.Positional[tuple[Path, ...]]
+    log: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Logs: .mcap, .db3, .bag, .csv or .parquet files, folders of rosbag2, LeRobot data sets (version 3)."""
     map: Path | None = None
     """What topics and fields mean; with --suggest, what of it is known already, be it one line."""
@@ -41,7 +40,7 @@ class ImportOptions(JsonOption):
     """Propose the map, from the first log, and write it: into --out, else to map.yaml here."""
     out: Path | None = None
     """Folder for the runs; made if it is not there."""
-    split: float | None = None
+    split: Seconds | None = None
     """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those of more than 600 s,
     or of 2 million numbers."""
     robot: str | None = None
@@ -92,8 +91,6 @@ def _check(options: ImportOptions) -> None:
     for log in options.log:
         if not log.exists():
             raise InputError(f"{log}: no such file or folder")
-    if options.split is not None and not options.split > 0.0:
-        raise InputError(f"--split {options.split:g}: expected more than 0 s")
     if options.out is None and not options.suggest:
         raise InputError("--out: expected a folder for the runs")
 

@@ -1,19 +1,34 @@
-"""Options that several commands share."""
+"""Options that several commands share: numbers in their range, a patch, results, a robot and its wiring."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from wlr_gym.base.checks import LARGEST_SEED, Interval
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
+from wlr_gym.base.text import pairs
 
 if TYPE_CHECKING:
+    from wlr_gym.data.format import RunMeta
+    from wlr_gym.hardware.camera.config import CameraFile
+    from wlr_gym.hardware.config import Hardware
+    from wlr_gym.hardware.link import Link
+    from wlr_gym.hardware.plant import RobotPlant
     from wlr_gym.physics.effects import Patch
+    from wlr_gym.robot import Robot
+
+#: Numbers that many options take.
+Count = Annotated[int, Interval(least=1)]
+Seconds = Annotated[float, Interval("s", above=0.0)]
+Seed = Annotated[int, Interval(least=0, most=LARGEST_SEED)]
+#: Options that mean nothing to a simulator.
+_ROBOT_ONLY = ("hardware", "port", "emulated", "camera", "yes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,14 +107,6 @@ def require_simulator(backend: str, robot: str) -> None:
     check_simulator(backend, "--backend")
 
 
-def require_counts(options: object, *names: str, least: int = 1) -> None:
-    """Raise :class:`InputError` for the first of some options that is below the least; None = left open."""
-    for name in names:
-        value = getattr(options, name)
-        if value is not None and not value >= least:
-            raise InputError(f"--{name.replace('_', '-')} {value:g}: expected {least} or more")
-
-
 def note_untrained(sources: Iterable[str]) -> None:
     """Say which of some policies is one before any training."""
     from wlr_gym.policy import untrained
@@ -129,3 +136,182 @@ def ray_address(words: tuple[str, ...] | None) -> str | None:
     if words is not None and len(words) > 1:
         raise InputError(f"--ray {' '.join(words)}: expected one address, or none")
     return None if words is None else (words or ("local",))[0]
+
+
+# ---- the robot -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class WiredRobotOption:
+    """Which robot, and how it is wired; a real one, for work that is done at a real robot only."""
+
+    hardware: str = "nominal"
+    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
+    port: tuple[str, ...] = ()
+    """Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0."""
+    robot: str | None = None
+    """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
+    emulated = False  # an option of RobotOption
+
+    def load_hardware(self) -> Hardware:
+        """Return the hardware, with the ports of ``--port``.
+
+        Raises:
+            InputError: unknown or broken file, a port that is not name=value, or a name that is no bus.
+        """
+        from wlr_gym.hardware.config import load_hardware, with_ports
+
+        ports = port_pairs(self.port)
+        if ports and self.emulated:
+            raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
+        return with_ports(load_hardware(self.hardware), ports)
+
+    def robot_name(self) -> str:
+        """Return the robot file that is asked for, else the one that the hardware file names, else ``nominal``."""
+        return str(self.robot or self.load_hardware().robot or "nominal")
+
+    def load(self) -> tuple[Robot, Hardware]:
+        """Return the robot and its hardware; see :meth:`load_hardware`."""
+        from wlr_gym.hardware.config import require_leg_range
+        from wlr_gym.robot import load_robot
+
+        robot, hardware = load_robot(self.robot_name()), self.load_hardware()
+        require_leg_range(hardware, robot, self.hardware)
+        if self.emulated:
+            from wlr_gym.hardware.emulator.link import with_flow_port
+
+            hardware = with_flow_port(robot, hardware)
+        return robot, hardware
+
+    def link(self, changed: Hardware | None = None) -> Link:
+        """Return connections to a robot that does not move, closed; a slow computer is no dead servo then.
+
+        Args:
+            changed: hardware instead of the one of :meth:`load`.
+        """
+        from wlr_gym.hardware.safety.limiter import CALM_PATIENCE
+
+        robot, hardware = self.load()
+        link = self.link_to(robot, changed or hardware)
+        link.servos.set_patience(CALM_PATIENCE)
+        return link
+
+    def link_to(self, robot: Robot, hardware: Hardware, patch: Patch | None = None, seed: int = 0) -> Link:
+        """Return connections to a robot, closed.
+
+        Args:
+            robot, hardware: of the robot.
+            patch: what an emulated one has that the nominal one lacks.
+            seed: of an emulated one's noise.
+
+        Raises:
+            InputError: a patch for a real robot.
+        """
+        camera = self.camera_file()
+        if self.emulated:
+            from wlr_gym.hardware.emulator import Machine, MachineOptions
+            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot, with_flow_port
+
+            hardware = with_flow_port(robot, hardware)
+            if patch is None:
+                return emulated_link(Machine(robot, hardware, MachineOptions(seed=seed)), camera)
+            return emulated_robot(robot, hardware, patch, camera=camera, seed=seed)
+        from wlr_gym.hardware.link import serial_link
+
+        if patch is not None and patch.effects:
+            raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
+        return serial_link(robot, hardware, camera)
+
+    def camera_file(self) -> CameraFile | None:
+        """Return the camera above the floor; None = the command has none."""
+        return None
+
+    def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
+        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``. ``seed``: :meth:`link_to`."""
+        from wlr_gym.hardware.plant import RobotPlant
+        from wlr_gym.physics.plants.base import PlantOptions
+        from wlr_gym.physics.plants.robot_options import RobotOptions
+
+        options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)
+        link = self.link_to(robot, self.load_hardware(), patch, seed)
+        return RobotPlant(robot, 1, PlantOptions(), options, link=link, meta=meta)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotOption(WiredRobotOption):
+    """Which robot, how it is wired, and whether it is a real one."""
+
+    emulated: bool = False
+    """An emulated robot in this process and in emulated time, instead of the ports."""
+
+    def refuse_robot_options(self, remedy: str) -> None:
+        """Refuse options that are about the robot where none is driven; ``remedy`` says what to do.
+
+        Raises:
+            InputError: one is given.
+        """
+        for one in fields(self):
+            if one.name in _ROBOT_ONLY and getattr(self, one.name) != one.default:
+                raise InputError(f"--{one.name} is about the robot: {remedy}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraOption(RobotOption):
+    """Which robot, how it is wired, and which camera sees it."""
+
+    camera: str | None = None
+    """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
+
+    def camera_file(self) -> CameraFile | None:
+        """Return the camera of ``--camera``; None = there is none.
+
+        Raises:
+            InputError: unknown or broken file, or an emulated camera for a real robot.
+        """
+        return read_camera(self.camera, self.emulated)
+
+
+def read_camera(source: str | None, is_emulated: bool) -> CameraFile | None:
+    """Return the camera of ``--camera``; see :meth:`CameraOption.camera_file`."""
+    from wlr_gym.hardware.camera.config import load_camera_file
+
+    if source == "emulated" and not is_emulated:
+        raise InputError(
+            "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
+        )
+    return None if source is None else load_camera_file(source)
+
+
+def camera_note(environment: Mapping[str, Any]) -> str:
+    """Return what to expect of a policy without a camera that had one in most of its training; empty = nothing.
+
+    Args:
+        environment: its contract's.
+    """
+    from wlr_gym.policy import camera_share, misses_camera
+
+    if not misses_camera(environment):
+        return ""
+    share = camera_share(environment)
+    had = "the slip observer is meant to have" if share >= 1.0 else f"in {share:.0%} of its training the policy had"
+    return f"{had} a camera, and none is named (--camera): expect worse tracking"
+
+
+def port_pairs(words: Sequence[str]) -> dict[str, str]:
+    """Return bus name, ``imu`` or ``flow`` -> device of ``--port``.
+
+    Raises:
+        InputError: a word that is not ``name=value``.
+    """
+    return pairs("--port", words, "legs=/dev/ttyUSB1")
+
+
+def noise_seed(folder: Path, seed: int | None) -> int:
+    """Return the seed of an emulated robot's noise in the next run of a folder, one that ``--noise-seed`` takes.
+
+    It follows from ``seed`` and the run's number; without a seed it is drawn anew.
+    """
+    from wlr_gym.base.random import spawn_seeds
+    from wlr_gym.data.record import next_run
+
+    return int(spawn_seeds(seed, 1, next_run(folder).stem)[0]) % (LARGEST_SEED + 1)

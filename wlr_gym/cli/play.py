@@ -7,11 +7,12 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.checks import Interval, check_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import tracked
 from wlr_gym.cli import OK
@@ -19,12 +20,14 @@ from wlr_gym.cli.options import (
     ForceOption,
     JsonOption,
     PatchOption,
+    Seconds,
+    Seed,
     SensorsOption,
     environment_of,
     note_untrained,
     require_simulator,
 )
-from wlr_gym.cli.results import print_json
+from wlr_gym.cli.terminal import print_json
 from wlr_gym.render.camera import CAMERAS
 from wlr_gym.render.display import require_display
 from wlr_gym.render.view import LARGEST, SMALLEST, View, fits
@@ -61,7 +64,7 @@ class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     """Name in configs/randomization/ or path; default: the task's."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the robot that the policy was trained with, else the task's."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the first episode."""
     command: str | None = None
     """Commands by schedule instead of keys: '0.1,0' for good, or '0:0.1,0; 3:0.05,0.3' from these times (s) on."""
@@ -75,9 +78,9 @@ class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     """Of the page; where it is taken, the next free one."""
     video: Path | None = None
     """Write a video (.webp, .gif, .png, .mp4) instead of opening a window; without --command, the task's own commands."""
-    seconds: float | None = None
+    seconds: Seconds | None = None
     """Length; default: 10 s of video, or until the window is closed, or Ctrl-C."""
-    fps: float = FPS
+    fps: Annotated[float, Interval(least=1.0, most=1000.0)] = FPS
     """Pictures per second of a video, where the control period allows."""
     camera: str = "follow"
     """View: follow, chase, side or top."""
@@ -121,10 +124,6 @@ def _check(options: PlayOptions) -> None:
     from wlr_gym.render.video import check_video
 
     require_simulator(options.backend, "a real robot is driven with wlr deploy; wlr play takes a simulator")
-    if options.seconds is not None and not 0 < options.seconds < float("inf"):
-        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
-    if not 1 <= options.fps <= 1000:
-        raise InputError(f"--fps {options.fps:g}: expected 1 to 1000")
     if options.gamepad and (options.command is not None or options.video is not None):
         raise InputError("--gamepad drives in the window: leave out --command and --video")
     _check_view(options)
@@ -140,8 +139,7 @@ def _check(options: PlayOptions) -> None:
 
 
 def _check_view(options: PlayOptions) -> None:
-    if options.camera not in CAMERAS:
-        raise unknown_name("view", options.camera, CAMERAS, "--camera")
+    check_name("view", options.camera, CAMERAS, "--camera")
     size = f"--size {options.size[0]} {options.size[1]}"
     if not all(map(fits, options.size)):
         raise InputError(f"{size}: expected width and height, each {SMALLEST} to {LARGEST} pixels")

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import CameraOption, confirm, noise_seed
+from wlr_gym.cli.options import CameraOption, ForceOption, JsonOption, PatchOption, Seconds, Seed, noise_seed
+from wlr_gym.cli.terminal import confirm, print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -52,9 +51,9 @@ class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
     commands: tuple[Path, ...] = ()
     out: Path | None = None
     backend: str = "dynamixel"
-    seed: int | None = None
-    noise_seed: int | None = None
-    seconds: float | None = None
+    seed: Seed | None = None
+    noise_seed: Seed | None = None
+    seconds: Seconds | None = None
     commands_only: bool = False
     list: bool = False
     ground: str | None = None
@@ -78,7 +77,7 @@ def run(options: RecordOptions) -> int:
 
     console = Console(soft_wrap=True, highlight=False)
     check_backend(options.backend)
-    chosen = options.robot_name(options.robot) if options.backend in REAL else options.robot or "nominal"
+    chosen = options.robot_name() if options.backend in REAL else options.robot or "nominal"
     robot = load_robot(chosen)
     if options.list:
         _list(console, robot, options.json)
@@ -114,8 +113,6 @@ def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
     from wlr_gym.data.excitations import excite
     from wlr_gym.data.record import read_commands
 
-    if options.seconds is not None and not options.seconds > 0.0:
-        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     motions = [excite(name, options.seed or 0, robot, seconds=options.seconds) for name in options.excitation]
     motions += [read_commands(path).cut(options.seconds) for path in options.commands]
     if not motions:
@@ -201,7 +198,7 @@ def _record_simulations(
 
 
 def _list(console: Console, robot: Robot, as_json: bool) -> None:
-    from wlr_gym.cli.tables import print_table
+    from wlr_gym.cli.terminal import print_table
     from wlr_gym.data.excitations import EXCITATIONS, excite
 
     lengths = {name: excite(name, robot=robot).duration for name in EXCITATIONS}

@@ -10,22 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
+from tyro.conf import Positional
 
+from wlr_gym.base.checks import check_number
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
 from wlr_gym.base.progress import tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, settings_of
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_options import HardwareOption, confirm
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, RobotOption, settings_of
+from wlr_gym.cli.terminal import confirm, print_json, print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,30 +37,25 @@ ERRORS_FILE = "errors.json"
 
 
 @dataclass(frozen=True)
-class ReplayOptions(JsonOption, ForceOption, HardwareOption, PatchOption):
-    """Replay measured runs.
-
-    Attributes:
-        runs: a run (CSV or Parquet) or a folder of runs.
-        out: folder for errors.json, plots and provenance; made if it is not there.
-        backend: simulator, or dynamixel for the robot.
-        robot: robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one; of a real
-            robot the one that its hardware file names.
-        segment: time between the points at which a segment starts anew from the measured state, s.
-        plots: write overlay plots.
-        video: file (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each,
-            named FILE_<run>.
-        yes: do not ask before every motion of the robot.
-    """
-
-    runs: Annotated[Path, tyro.conf.Positional]
+class ReplayOptions(JsonOption, ForceOption, RobotOption, PatchOption):
+    runs: Positional[Path]
+    """A run (CSV or Parquet) or a folder of runs."""
     out: Path
+    """Folder for errors.json, plots and provenance; made if it is not there."""
     backend: str = "gibbs_appell"
-    robot: str | None = None
+    """Simulator, or dynamixel for the robot."""
+    robot: str | None = field(default=None, kw_only=True)
+    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one; of a real robot the
+    one that its hardware file names."""
     segment: float = 1.0
+    """Time between the points at which a segment starts anew from the measured state, s."""
     plots: bool = True
+    """Write overlay plots."""
     video: Path | None = None
+    """File (.webp, .gif, .png, .mp4) for a film of the run beside its simulation; with several runs, one film each, named
+    FILE_<run>."""
     yes: bool = False
+    """Do not ask before every motion of the robot."""
 
 
 def run(options: ReplayOptions) -> int:
@@ -87,8 +81,7 @@ def run(options: ReplayOptions) -> int:
         raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
     if options.video is not None:
         check_video(options.video)
-    if not options.segment > LEAD:
-        raise InputError(f"--segment {options.segment:g}: expected more than {LEAD:g} s")
+    check_number("--segment", options.segment, "s", above=LEAD)
     runs = read_runs(options.runs)
     patch = options.patch()
     options.refuse_results(options.out, ERRORS_FILE)

@@ -5,80 +5,188 @@ Exit code 0: done, nothing stands against the robot; 1: it cannot stand, drive o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
+from tyro.conf import Positional
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import refuse_existing, require_ending
+from wlr_gym.base.files import check_new_file, write_text
+from wlr_gym.base.text import counted, pairs
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.robot_exchange import RobotExportOptions, RobotImportOptions, export_robot, import_robot
-from wlr_gym.cli.robot_new import NewOptions, new_robot, print_findings
+from wlr_gym.cli.terminal import ask_terminal, print_json, print_table
 
 if TYPE_CHECKING:
+    from wlr_gym.physics.feasibility import RobotFinding
     from wlr_gym.robot import Robot
+    from wlr_gym.robot.interchange import ImportedRobot, LinkTree
+    from wlr_gym.robot.outline import Question
 
+Format = Literal["mjcf", "urdf"]
+#: End of a file's name -> format.
+SUFFIXES: dict[str, Format] = {".xml": "mjcf", ".mjcf": "mjcf", ".urdf": "urdf"}
+#: Of a robot file, and of a picture.
+ENDINGS, PICTURES = (".yaml", ".yml"), (".png", ".jpg", ".jpeg", ".webp")
 #: SI; what is nearer to 0 is 0 but for rounding.
 ROUNDING = 1e-12
-PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True)
+class NewOptions(JsonOption, ForceOption):
+    """Write a robot file over a base. Asks for what --set does not give; Enter takes the default."""
+
+    out: Path
+    """Robot file to write (.yaml)."""
+    name: str | None = None
+    """Name of the robot; default: that of the file."""
+    base: str = "nominal"
+    """Robot that has all other numbers: name in configs/robot/ or path."""
+    set: tuple[str, ...] = ()
+    """Answers, such as body.mass=12 leg.length="300 mm" servo.wheel.no_load_speed="77 rpm"; units may be left out (SI)."""
+    yes: bool = False
+    """Take the default of everything that --set does not give, and ask nothing."""
 
 
 @dataclass(frozen=True)
 class CheckOptions(JsonOption):
-    """Look for what is wrong or odd about a robot: units, masses, inertias, and what it cannot do, with numbers.
+    """Look for what is wrong or odd about a robot: units, masses, inertias, and what it cannot do, with numbers."""
 
-    Attributes:
-        robot: robot file, or name in configs/robot/.
-        strict: warnings too give exit code 1.
-    """
-
-    robot: Annotated[str, tyro.conf.Positional] = "nominal"
+    robot: Positional[str] = "nominal"
+    """Robot file, or name in configs/robot/."""
     strict: bool = False
+    """Warnings too give exit code 1."""
 
 
 @dataclass(frozen=True)
 class ShowOptions(JsonOption, ForceOption):
-    """Show what a robot is and what it can do.
+    """Show what a robot is and what it can do."""
 
-    Attributes:
-        robot: robot file, or name in configs/robot/.
-        picture: picture to write (.png, .jpg, .webp): standing, and with its legs at their limits.
-    """
-
-    robot: Annotated[str, tyro.conf.Positional] = "nominal"
+    robot: Positional[str] = "nominal"
+    """Robot file, or name in configs/robot/."""
     picture: Path | None = None
+    """Picture to write (.png, .jpg, .webp): standing, and with its legs at their limits."""
 
 
-#: Command -> its options, and what it does.
-COMMANDS = {
-    "new": (NewOptions, "a robot file from a few questions"),
-    "check": (CheckOptions, "what is wrong or odd about a robot, with numbers"),
-    "show": (ShowOptions, "what a robot is and can do; a picture"),
-    "import": (RobotImportOptions, "a robot file from MJCF or URDF"),
-    "export": (RobotExportOptions, "a robot as MJCF or URDF"),
-}
+@dataclass(frozen=True)
+class RobotImportOptions(JsonOption, ForceOption):
+    """Write a robot file from MJCF or URDF: of a robot with four legs of one hinge and a driven wheel on each."""
+
+    file: Positional[Path]
+    """MJCF or URDF."""
+    out: Path
+    """Robot file to write (.yaml)."""
+    name: str | None = None
+    """Name of the robot; default: that in the file."""
+    base: str = "nominal"
+    """Robot that has what the format cannot hold: name in configs/robot/ or path."""
+    idealise: bool = False
+    """Accept that numbers are averaged or left out which change the robot by more than 5 %."""
 
 
-def run(options: NewOptions | CheckOptions | ShowOptions | RobotImportOptions | RobotExportOptions) -> int:
-    """Do what the sub-command says."""
-    match options:
-        case NewOptions():
-            return new_robot(options)
-        case CheckOptions():
-            return _check(options)
-        case ShowOptions():
-            return _show(options)
-        case RobotImportOptions():
-            return import_robot(options)
-        case RobotExportOptions():
-            return export_robot(options)
+@dataclass(frozen=True)
+class RobotExportOptions(JsonOption, ForceOption):
+    """Write a robot as MJCF (the MuJoCo plant's own model) or URDF."""
+
+    robot: Positional[str]
+    """Robot file, or name in configs/robot/."""
+    out: Path
+    """File to write; .xml or .mjcf: MJCF, .urdf: URDF."""
+    format: Format | None = None
+    """Format of the file; default: by the end of --out."""
 
 
-def _check(options: CheckOptions) -> int:
+def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> int:
+    """Ask, write the file, say what is odd about the robot; 1 when it cannot stand, drive or turn.
+
+    Args:
+        options: of the command.
+        ask: shows a text and returns what was typed; None = the terminal.
+
+    Raises:
+        InputError: a bad option, or answers that no robot file can hold; nothing is written.
+    """
+    from wlr_gym.physics.feasibility import examine_robot
+    from wlr_gym.robot import load_robot
+    from wlr_gym.robot.interchange.robot_file import base_beside, of_all, robot_over, robot_text
+    from wlr_gym.robot.outline import QUESTIONS, derived_numbers, question_of
+
+    check_new_file(options.out, options.force, endings=ENDINGS)
+    base, name = load_robot(options.base), options.name or options.out.stem
+    words = pairs("--set", options.set, "body.mass=12")
+    given = {key: question_of(key).read(text) for key, text in words.items()}
+    answers: dict[str, Any] = {}
+    for question in QUESTIONS:
+        default = question.default(answers, base)
+        answers[question.key] = given.get(question.key, default)
+        if not options.yes and question.key not in given:
+            answers[question.key] = _asked(question, default, ask or (lambda text: ask_terminal(text, "wlr robot new")))
+    numbers, comments = derived_numbers(answers, base)
+    numbers = of_all(numbers, options.base)
+    try:
+        robot = robot_over(options.base, name, numbers, options.out, check=False)
+    except InputError as error:
+        why = "; ".join([*_unusual(answers), str(error)])
+        kept = "" if options.yes else f"; your answers: {_as_options(answers)}"
+        raise InputError(f"{why}{kept}") from None
+    title = (
+        f"Written by wlr robot new. SI units, radians; what is not here is as in '{options.base}'.",
+        "[given] an answer or its default; [derived] computed from the answers and the base.",
+    )
+    text = robot_text(name, base_beside(options.base, options.out), numbers, title=title, comments=comments)
+    write_text(options.out, text)
+    print(f"written: {options.out}")
+    findings = examine_robot(robot)
+    if options.json:
+        print_json({"robot": robot.name, "out": options.out, "findings": findings})
+    else:
+        print_findings(robot, findings)
+    return FAILED if any(finding.level == "fault" for finding in findings) else OK
+
+
+def _asked(question: Question, default: Any, ask: Callable[[str], str]) -> Any:
+    """Ask until the answer can be read; an empty one is the default."""
+    while True:
+        answer = ask(f"{question.words} [{question.shown(default)}]:").strip()
+        if not answer:
+            return default
+        try:
+            return question.read(answer)
+        except InputError as error:
+            print(error)
+
+
+def _unusual(answers: Mapping[str, Any]) -> list[str]:
+    """Return what is outside the usual, in words."""
+    from wlr_gym.physics.feasibility import unusual
+
+    lists = {key: value if isinstance(value, list) else [value] for key, value in answers.items()}
+    return [str(finding) for key, values in lists.items() for finding in unusual(key, values)]
+
+
+def _as_options(answers: Mapping[str, Any]) -> str:
+    """Return answers as words of ``--set``, so that none is lost."""
+    return "--set " + " ".join(
+        f"{key}={' '.join(map(str, value))!r}" if isinstance(value, list) else f"{key}={value}"
+        for key, value in answers.items()
+    )
+
+
+def print_findings(robot: Robot, findings: Sequence[RobotFinding]) -> None:
+    """Print findings, faults first, and what they come to."""
+    for finding in findings:
+        print(f"{finding.level + ':':<9}{finding}")
+    faults = sum(finding.level == "fault" for finding in findings)
+    if not findings:
+        print(f"robot '{robot.name}': nothing odd")
+    else:
+        print(f"robot '{robot.name}': {counted(faults, 'fault')}, {counted(len(findings) - faults, 'warning')}")
+
+
+def check_robot(options: CheckOptions) -> int:
+    """Print what is wrong or odd; 1 when something stands against the robot."""
     from wlr_gym.physics.feasibility import examine_robot
     from wlr_gym.robot import load_robot
 
@@ -92,29 +200,22 @@ def _check(options: CheckOptions) -> int:
     return FAILED if against else OK
 
 
-def _show(options: ShowOptions) -> int:
+def show_robot(options: ShowOptions) -> int:
+    """Print the numbers of a robot, and draw it."""
     from rich.console import Console
 
-    from wlr_gym.cli.tables import print_table
     from wlr_gym.robot import load_robot, robot_hash
 
     if options.picture is not None:
-        require_ending(options.picture, PICTURES, "--picture", any_case=True)
-        if not options.picture.parent.is_dir():
-            raise InputError(f"--picture {options.picture}: folder {options.picture.parent} does not exist")
-        refuse_existing(options.picture, options.force, "--picture")
+        check_new_file(options.picture, options.force, "--picture", PICTURES, any_case=True)
     robot = load_robot(options.robot)
     numbers = _numbers(robot)
     if options.json:
         print_json({"robot": robot.name, "fingerprint": robot_hash(robot), "numbers": numbers})
     else:
         rows = [(name, f"{one['value']:.4g}", one["unit"], one["meaning"]) for name, one in numbers.items()]
-        print_table(
-            Console(highlight=False),
-            ("number", "value", "unit", "meaning"),
-            rows,
-            f"{robot.name}, fingerprint {robot_hash(robot)}",
-        )
+        title = f"{robot.name}, fingerprint {robot_hash(robot)}"
+        print_table(Console(highlight=False), ("number", "value", "unit", "meaning"), rows, title)
     if options.picture is not None:
         from wlr_gym.render.portrait import draw_portrait
 
@@ -132,3 +233,86 @@ def _numbers(robot: Robot) -> dict[str, dict[str, Any]]:
         name: {"value": 0.0 if abs(values[name]) < ROUNDING else values[name], "unit": unit, "meaning": doc}
         for name, (unit, doc) in ENTRIES.items()
     }
+
+
+def import_robot(options: RobotImportOptions) -> int:
+    """Read, write, and say what was averaged or left out; 1 when the robot cannot stand, drive or turn.
+
+    Raises:
+        InputError: no such file, another kind of robot, or numbers that no robot file can hold; nothing is written.
+    """
+    from wlr_gym.physics.feasibility import examine_robot
+    from wlr_gym.robot.interchange import recognise
+    from wlr_gym.robot.interchange.robot_file import base_beside, of_all, robot_over, robot_text
+
+    check_new_file(options.out, options.force, endings=ENDINGS)
+    found = recognise(_read(options.file), idealise=options.idealise)
+    name = options.name or found.name or options.out.stem
+    numbers = of_all(found.numbers, options.base)
+    robot = robot_over(options.base, name, numbers, options.out)
+    title = [f"Imported from {options.file.name} by wlr robot import. SI units, radians.", *_explained(found, options.base)]
+    write_text(options.out, robot_text(name, base_beside(options.base, options.out), numbers, title=title))
+    findings = examine_robot(robot)
+    if options.json:
+        print_json({"out": options.out, **asdict(found), "findings": findings})
+    else:
+        print("\n".join([f"written: {options.out}", *_explained(found, options.base)]))
+        print_findings(robot, findings)
+    return FAILED if any(finding.level == "fault" for finding in findings) else OK
+
+
+def _explained(found: ImportedRobot, base: str) -> list[str]:
+    """What was read, what was not, and how joints correspond."""
+    lines = [f"What the file does not hold is as in '{base}'.", *(f"note: {note}" for note in found.notes)]
+    lines.append("Joint here = sign x angle in the file + offset (rad):")
+    return lines + [f"  {one.joint} = {one.sign:+.0f} x {one.name} {one.offset:+.6g}" for one in found.joints]
+
+
+def _read(path: Path) -> LinkTree:
+    """Read a file by what it holds, not by its name."""
+    from wlr_gym.physics.plants.mujoco.mjcf_file import read_mjcf
+    from wlr_gym.robot.interchange import parse_urdf
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    return read_mjcf(path) if "<mujoco" in text and "<robot" not in text else parse_urdf(text, str(path))
+
+
+def export_robot(options: RobotExportOptions) -> int:
+    """Write the file, and say what it cannot hold.
+
+    Raises:
+        InputError: no such robot, or a file that is there or of no known format.
+    """
+    from wlr_gym.physics.plants.mujoco.mjcf_file import NOT_IN_MJCF, mjcf_text
+    from wlr_gym.robot import load_robot
+    from wlr_gym.robot.interchange import urdf_text
+    from wlr_gym.robot.interchange.urdf import NOT_IN_URDF
+
+    by_name = SUFFIXES.get(options.out.suffix.lower())
+    kind = options.format or by_name
+    if kind is None:
+        raise InputError(f"--out {options.out}: expected a file that ends in {', '.join(SUFFIXES)}, or --format")
+    if by_name not in (None, kind) and options.out.suffix.lower() != ".xml":  # which is used for both
+        raise InputError(f"--out {options.out}: a name of {by_name}, and --format {kind}; leave --format out")
+    check_new_file(options.out, options.force)
+    robot = load_robot(options.robot)
+    text, lost = (mjcf_text(robot), NOT_IN_MJCF) if kind == "mjcf" else (urdf_text(robot), NOT_IN_URDF)
+    write_text(options.out, text)
+    if options.json:
+        print_json({"out": options.out, "format": kind, "not_held": lost})
+    else:
+        print(f"written: {options.out}\n{kind.upper()} does not hold: {', '.join(lost)}")
+    return OK
+
+
+#: Command -> its options, and what it does.
+COMMANDS = {
+    "new": (NewOptions, new_robot),
+    "check": (CheckOptions, check_robot),
+    "show": (ShowOptions, show_robot),
+    "import": (RobotImportOptions, import_robot),
+    "export": (RobotExportOptions, export_robot),
+}

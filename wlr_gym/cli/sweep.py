@@ -14,10 +14,11 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
 from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import JsonOption, ray_address, require_counts
-from wlr_gym.cli.results import print_json
+from wlr_gym.cli.options import Count, JsonOption, ray_address
+from wlr_gym.cli.terminal import print_json
+from wlr_gym.learning.sweep.page import PAGE_FILE, name_of
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
-from wlr_gym.learning.sweep.results import PAGE_FILE, TABLE_FILE, name_of
+from wlr_gym.learning.sweep.results import TABLE_FILE
 from wlr_gym.learning.sweep.running import SweepResult, resume_sweep, start_sweep
 
 
@@ -37,7 +38,7 @@ class SweepOptions(JsonOption):
     """Settings, as key=value; several values make a grid: --set learning_rate=1e-3,2e-3 total_steps=500_000"""
     search: Path | None = None
     """File (YAML) with 'space' and 'search': what is searched, and how."""
-    seeds: int | None = None
+    seeds: Count | None = None
     """Trainings of each settings, with seeds from 0 on; default: 5."""
     out: Path | None = None
     """Folder of the sweep; default: runs_out/sweep_<environment or file>."""
@@ -45,14 +46,13 @@ class SweepOptions(JsonOption):
     """Folder of a sweep to resume, as it was planned; --ray and --workers may be others than before."""
     ray: tuple[str, ...] | None = None
     """Run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
-    workers: int | None = None
+    workers: Count | None = None
     """Most trials at a time, each on one core; default: one per core."""
 
 
 def run(options: SweepOptions) -> int:
     """Train, say how it goes, and print where table and page are."""
     ray = ray_address(options.ray)
-    require_counts(options, "workers")
     if options.resume is not None:
         _require_own_plan(options)
         found = resume_sweep(options.resume, ray=ray, workers=options.workers, say=_say)
@@ -77,7 +77,6 @@ def _plan(options: SweepOptions) -> SweepPlan:
     """Return the plan of a file, of the options, or of a file with options laid over it."""
     if options.what is None:
         raise InputError("expected the file of a sweep, or an environment id (see: wlr envs)")
-    require_counts(options, "seeds")
     changes: dict[str, Any] = {"imports": list(IMPORTED)} if IMPORTED else {}
     given = {"config": options.config, "agent": options.agent, "init": options.init, "seeds": options.seeds}
     changes |= {name: value for name, value in given.items() if value is not None}

@@ -6,16 +6,17 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
+from wlr_gym.base.checks import Interval
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption, PatchOption, environment_of
-from wlr_gym.cli.results import print_json
+from wlr_gym.cli.options import JsonOption, PatchOption, Seed, environment_of
+from wlr_gym.cli.terminal import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
 from wlr_gym.policy import Training, TrainingProgress, find_policy
 
@@ -34,7 +35,7 @@ class TrainOptions(JsonOption, PatchOption):
     """Simulator: gibbs_appell or mujoco (with --set environment.precision=float64); default: that of the settings."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: that of the settings, else the task's. The run folder has its content."""
-    seed: int | None = None
+    seed: Seed | None = None
     """Seed of everything random; default: that of the settings."""
     out: Path | None = None
     """Run folder; default: runs_out/<env>_<config or agent>_<seed>."""
@@ -44,7 +45,7 @@ class TrainOptions(JsonOption, PatchOption):
     """Run folder to resume; its own environment, agent and settings are used."""
     total_steps: int | None = None
     """With --resume: go on until so many environment steps, at the rate at which the run's schedule ended."""
-    max_minutes: float | None = None
+    max_minutes: Annotated[float, Interval("min", above=0.0)] | None = None
     """Stop in good order after this time."""
     progress: bool = True
     """Show a progress bar."""
@@ -52,8 +53,6 @@ class TrainOptions(JsonOption, PatchOption):
 
 def run(options: TrainOptions) -> int:
     """Train and print where the policy is."""
-    if options.max_minutes is not None and not options.max_minutes > 0:
-        raise InputError(f"--max-minutes {options.max_minutes:g}: expected more than 0")
     seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
     updates: deque[TrainingProgress] = deque(maxlen=1)
     if options.resume is not None:

@@ -14,7 +14,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, require_simulator
+from wlr_gym.cli.options import PatchOption, Seconds, require_simulator
 from wlr_gym.render.web.page import HOST, PORT
 
 if TYPE_CHECKING:
@@ -39,14 +39,14 @@ class ViewOptions(PatchOption):
         seconds: end after this time; default: at Ctrl-C.
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     backend: str = "gibbs_appell"
     robot: str | None = None
     ghost: bool = True
     segment: float = 10.0
     host: str = HOST
     port: int = PORT
-    seconds: float | None = None
+    seconds: Seconds | None = None
 
 
 def run(options: ViewOptions) -> int:
@@ -63,8 +63,6 @@ def run(options: ViewOptions) -> int:
     require_simulator(options.backend, "a ghost needs a simulator; a real robot repeats a run with wlr replay")
     if not options.segment > 0.0:
         raise InputError(f"--segment {options.segment:g}: expected more than 0 s")
-    if options.seconds is not None and not options.seconds > 0.0:
-        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     runs = _read(options.runs)
     backend = options.backend if options.ghost else None
     opened = open_recordings(runs, options.robot, backend, options.patch(), options.segment)

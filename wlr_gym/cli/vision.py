@@ -3,7 +3,7 @@
 Writes the run with cam_* columns, slip.csv (per row), frames.csv (per frame), summary.json, pose.png, slip.png, annotated.mp4.
 A live camera (its number) is filmed first, to film.avi and film.csv, until Ctrl-C; the run is read after that.
 
-wlr vision check PHOTO looks at the marker sheets in one photograph; see: wlr vision check --help.
+``wlr vision check PHOTO`` looks at the marker sheets in one photograph; see: wlr vision check --help.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ import math
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import tyro
+from tyro.conf import Positional
 
+from wlr_gym.base.checks import Interval
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
-from wlr_gym.cli import OK
-from wlr_gym.cli.options import ForceOption, JsonOption, settings_of
-from wlr_gym.cli.results import print_json
-from wlr_gym.cli.tables import print_table
+from wlr_gym.cli import FAILED, OK
+from wlr_gym.cli.options import ForceOption, JsonOption, Seconds, settings_of
+from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,44 +33,56 @@ if TYPE_CHECKING:
     from wlr_gym.perception.markers.camera import Camera
     from wlr_gym.perception.markers.targets import Target
     from wlr_gym.perception.vision import VideoAnalysis
+    from wlr_gym.perception.vision.sheet_check import SheetCheck
     from wlr_gym.perception.vision.tracking import Sample, VideoFrame
 
 
 @dataclass(frozen=True)
 class VisionOptions(JsonOption, ForceOption):
-    """Video to pose and slip.
-
-    Attributes:
-        video: video file, folder of images, or number of a live camera: filmed until Ctrl-C, or --seconds.
-        run: what the robot logged meanwhile (CSV or Parquet); with a live camera it may appear while it films.
-        out: folder for the results; made if it is not there.
-        camera: calibration file; make one with: wlr calibrate camera.
-        markers: markers on the robot: name in configs/vision/ or path.
-        floor: markers on the floor: name in configs/vision/ or path.
-        robot: robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one.
-        offset: servo time minus camera time, s; default: found from the motion.
-        around: where the offset is looked for: servo time minus camera time to within 1 s, s.
-        origin: frame of cam_*: start (0, 0, 0 at the start, as in simulated runs) or floor.
-        rate: of evenly spaced frames, Hz; default: the times in the video.
-        times: CSV with one time (s) per frame, before --rate.
-        seconds: how much of the video to use, s; default: all.
-        annotate: write annotated.mp4.
-    """
-
-    video: Annotated[str, tyro.conf.Positional]
+    video: Positional[str]
+    """Video file, folder of images, or number of a live camera: filmed until Ctrl-C, or --seconds."""
     run: Path
+    """What the robot logged meanwhile (CSV or Parquet); with a live camera it may appear while it films."""
     out: Path
+    """Folder for the results; made if it is not there."""
     camera: Path
+    """Calibration file; make one with: wlr calibrate camera."""
     markers: str = "body"
+    """Markers on the robot: name in configs/vision/ or path."""
     floor: str = "floor"
+    """Markers on the floor: name in configs/vision/ or path."""
     robot: str | None = None
+    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     offset: float | None = None
+    """Servo time minus camera time, s; default: found from the motion."""
     around: float = 0.0
+    """Where the offset is looked for: servo time minus camera time to within 1 s, s."""
     origin: str = "start"
-    rate: float | None = None
+    """Frame of cam_*: start (0, 0, 0 at the start, as in simulated runs) or floor."""
+    rate: Annotated[float, Interval("Hz", above=0.0)] | None = None
+    """Rate of evenly spaced frames, Hz; default: the times in the video."""
     times: Path | None = None
-    seconds: float | None = None
+    """CSV with one time (s) per frame, before --rate."""
+    seconds: Seconds | None = None
+    """How much of the video to use, s; default: all."""
     annotate: bool = True
+    """Write annotated.mp4."""
+
+
+@dataclass(frozen=True)
+class VisionCheckOptions(JsonOption):
+    """Check print and layout of the marker sheets from one photograph: which are there, stretch of the print, what misfits."""
+
+    photo: Positional[Path]
+    """Picture, taken by the calibrated camera, focus and size as in the calibration."""
+    camera: Path
+    """Calibration file; make one with: wlr calibrate camera."""
+    markers: str = "body"
+    """Markers on the robot: name in configs/vision/ or path."""
+    floor: str = "floor"
+    """Markers on the floor: name in configs/vision/ or path."""
+    only: Literal["markers", "floor"] | None = None
+    """Which of them the photograph shows, when it is one: markers or floor."""
 
 
 def run(options: VisionOptions) -> int:
@@ -85,10 +97,6 @@ def run(options: VisionOptions) -> int:
     from wlr_gym.data import read_run
     from wlr_gym.perception.vision import load_camera, load_target, save_video_analysis
 
-    if options.rate is not None and not options.rate > 0:
-        raise InputError(f"--rate {options.rate:g}: expected more than 0")
-    if options.seconds is not None and not options.seconds > 0:
-        raise InputError(f"--seconds {options.seconds:g}: expected more than 0")
     if Path(options.video).is_dir() and options.rate is None and options.times is None:
         raise InputError(f"{options.video}: images do not say when they were taken: give --rate (Hz) or --times")
     live = options.video.isdigit() and not Path(options.video).exists()
@@ -179,3 +187,59 @@ def _print(analysis: VideoAnalysis, console: Console) -> None:
     title = f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma"
     print_table(console, headings, [*rows, ("body", longitudinal, "", lateral, "")], title)
     console.print(f"share of the predicted path that ignoring slip gets wrong: {100 * found['no_slip_error']:.2f} %")
+
+
+# ---- the sheets ----------------------------------------------------------------------------------------------------------
+
+
+def check_photo(options: VisionCheckOptions) -> int:
+    """Check and print; 0 when everything fits.
+
+    Raises:
+        InputError: unreadable photograph, camera or target; wrong image size.
+    """
+    require_package("cv2", "vision")
+
+    from wlr_gym.perception.vision import load_camera, load_target
+    from wlr_gym.perception.vision.sheet_check import check_sheets
+    from wlr_gym.perception.vision.video import read_image
+
+    files = {"markers": options.markers, "floor": options.floor}
+    targets = [load_target(file) for name, file in files.items() if options.only in (None, name)]
+    camera = load_camera(options.camera)
+    image = read_image(options.photo) if options.photo.is_file() else None
+    if image is None:
+        raise InputError(f"{options.photo}: no such picture, or it cannot be read as one")
+    checks = check_sheets(image, camera, targets)
+    if options.json:
+        print_json([_content(check) for check in checks])
+    for check in checks:
+        print(_line(check))
+        print("".join(f"  {warning}\n" for warning in check.warnings), end="")
+    return FAILED if any(check.warnings for check in checks) else OK
+
+
+def _content(check: SheetCheck) -> dict[str, object]:
+    """Return a check as JSON has it: m, shares."""
+    names = ("seen", "fault", "stretch", "stretch_std", "difference_std", "misfit", "warnings")
+    return {"target": check.target.name, "markers": len(check.target.markers), **{name: getattr(check, name) for name in names}}
+
+
+def _line(check: SheetCheck) -> str:
+    head = f"{check.target.name}: {check.seen} of {len(check.target.markers)} markers"
+    if check.fault:
+        return f"{head}; not found"
+    text = f"{head}, off their places by {1e3 * check.misfit:.2f} mm rms (as far as one photograph shows it)"
+    if check.stretch is None or check.stretch_std is None:
+        return text
+    (x, y), (x_std, y_std) = 100 * check.stretch, 100 * check.stretch_std
+    if check.target.caliper is None:
+        return (
+            f"{text}; x stretched by {x - y:+.2f} ± {100 * check.difference_std:.2f} % more than y (the scale itself needs a "
+            "caliper reading in the target file)"
+        )
+    return f"{text}; stretched by {x:+.2f} ± {x_std:.2f} % along x, {y:+.2f} ± {y_std:.2f} % along y"
+
+
+#: Word behind the command -> its options, and what it does.
+COMMANDS = {"check": (VisionCheckOptions, check_photo)}

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.checks import LARGEST_NOISE_SEED, require_seed
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file
-from wlr_gym.base.seeds import LARGEST_NOISE_SEED, require_seed
 from wlr_gym.base.text import row_words
 from wlr_gym.data.compared_plants import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion

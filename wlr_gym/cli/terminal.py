@@ -1,15 +1,30 @@
-"""The one table of all commands: it fits the terminal, wraps words and headings, and never breaks a number."""
+"""What commands print and ask: the one table of all commands, results as JSON, questions to whoever is there."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import json
+import math
 import re
+import sys
 import textwrap
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+
+from wlr_gym.base.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+
+    from wlr_gym.data.excitations import Motion
+    from wlr_gym.hardware.config import Hardware
+    from wlr_gym.robot import Robot
 
 #: Columns between two columns of a table, where there is room and where there is little.
 _GAPS = (2, 1)
@@ -135,3 +150,106 @@ def _lines(text: str, width: int, wrapper: type[textwrap.TextWrapper]) -> list[s
 def _is_number(cells: Sequence[str]) -> bool:
     """Tell whether a column holds numbers, some of which may be missing."""
     return all(_NUMBER.fullmatch(cell) for cell in cells)
+
+
+# --- results as JSON on the standard output, alone: what else a command prints goes to the standard error meanwhile ---
+
+
+#: The standard output, while only results may be printed on it.
+_OUTPUT: ContextVar[TextIO | None] = ContextVar("output", default=None)
+
+
+@contextlib.contextmanager
+def only_results(wanted: bool) -> Iterator[None]:
+    """Keep everything but :func:`print_json` from the standard output, where that is wanted."""
+    if not wanted:
+        yield
+        return
+    token = _OUTPUT.set(sys.stdout)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _OUTPUT.reset(token)
+
+
+def print_json(content: Any) -> None:
+    """Print results as JSON; a number that is not finite is null, a dataclass an object of its fields."""
+    print(json.dumps(plain(content), indent=2, allow_nan=False), file=_OUTPUT.get() or sys.stdout, flush=True)
+
+
+def plain(value: Any) -> Any:
+    """Return a value of what JSON has."""
+    match value:
+        case float() if not math.isfinite(value):
+            return None
+        case None | bool() | int() | float() | str():
+            return value
+        case np.generic() | np.ndarray():
+            return plain(value.tolist())
+        case Mapping():
+            return {str(key): plain(one) for key, one in value.items()}
+        case list() | tuple() | set() | frozenset():
+            return [plain(one) for one in value]
+        case Path():
+            return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    raise TypeError(f"{type(value).__name__}: JSON has no such value")
+
+
+# ---- questions -------------------------------------------------------------------------------------------------------
+
+
+def confirm(motion: Motion, robot: Robot, hardware: Hardware, console: Console) -> None:
+    """Say what the robot is about to do, and wait for Enter; before every motion: after one it lies elsewhere, torque off.
+
+    Raises:
+        InputError: a port is not there, or nobody is.
+    """
+    from wlr_gym.hardware.operator import KEYS_SAID
+    from wlr_gym.hardware.safety.preflight import require_ports
+
+    require_ports(hardware)
+    travel = motion.travel(robot.wheel.radius)
+    rolled = f"{travel[-1]:+.1f} m in all, from {travel.min():+.1f} to {travel.max():+.1f} m on the way (+ is forward)"
+    console.print(f"The robot will stand up and drive {motion.name}: {motion.duration:.0f} s; it rolls {rolled}.")
+    console.print(KEYS_SAID, style="dim")
+    wait_for_enter(console, "Free floor, or wheels off the ground? Hand on the switch?")
+
+
+def wait_for_enter(console: Console, question: str, action: str = "start the robot", otherwise: str = ", or say --yes") -> None:
+    """Ask the operator, and wait for Enter.
+
+    Args:
+        console: to ask on.
+        question: what is asked.
+        action: what Enter does.
+        otherwise: what else can be done where nobody is there.
+
+    Raises:
+        InputError: nobody there.
+        KeyboardInterrupt: anything else was typed, such as "n".
+    """
+    try:
+        answer = console.input(f"[bold]{question} Enter to {action}, Ctrl-C not to. ")
+    except EOFError:
+        raise InputError(f"nobody there to {action}: run it on a terminal{otherwise}") from None
+    if answer.strip().lower() not in ("", "y", "yes"):
+        raise KeyboardInterrupt(f"asked not to {action}")
+
+
+class NobodyThereError(InputError):
+    """Questions cannot be answered."""
+
+
+def ask_terminal(text: str, what: str = "calibration") -> str:
+    """Ask on the terminal; ``what`` is the dialogue that the question is of.
+
+    Raises:
+        NobodyThereError: the input is at its end.
+    """
+    try:
+        return input(text + " ")
+    except EOFError:
+        raise NobodyThereError(f"{what} is a dialogue: run it on a terminal, or pipe its answers in") from None
