@@ -68,7 +68,7 @@ def test_an_interrupt_leaves_no_empty_folder(tmp_path, monkeypatch):
         (["--seconds", "0"], "--seconds 0"),
         (["--threshold", "-1"], "--threshold -1"),
         (["--threads", "0"], "--threads 0: expected 1 or more"),
-        (["--seed", "-1"], "--seed -1: expected 0 to"),
+        (["--seed", "-1"], "--seed -1: expected a number from 0 to"),
         (["--effects", "nothing_like_it"], "nothing_like_it"),
         (["--physics-step", "0.0007"], "does not divide"),
     ],

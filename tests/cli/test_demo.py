@@ -245,7 +245,7 @@ def test_bad_options(tmp_path, capsys):
     assert main(["demo", "--seed", "-1", "--out", str(tmp_path / "a")]) == 2
     assert main(["demo", "--steps", "0", "--out", str(tmp_path / "a")]) == 2
     assert not (tmp_path / "a").exists()
-    assert "--seed -1: expected 0 to 4294967295" in capsys.readouterr().err
+    assert "--seed -1: expected a number from 0 to 4294967295" in capsys.readouterr().err
 
 
 def test_demo_does_not_remove_what_is_not_its_own(tmp_path, capsys):

@@ -126,7 +126,7 @@ def test_a_commanded_path_is_drawn_on_the_floor_it_was_commanded_on(shape):
         (["--video", "film.avi"], "--video film.avi: expected a file that ends in"),
         (["--video", "nowhere/film.webp"], "--video nowhere/film.webp: folder nowhere does not exist"),
         (["--video", "film.webp", "--seconds", "-1"], "--seconds -1: expected more than 0"),
-        (["--video", "film.webp", "--seed", "-1"], "--seed -1: expected 0 to 4294967295"),
+        (["--video", "film.webp", "--seed", "-1"], "--seed -1: expected a number from 0 to 4294967295"),
         (["--video", "film.webp", "--camera", "topp"], "--camera: unknown view 'topp' (did you mean 'top'"),
         (["--video", "film.webp", "--size", "1", "1"], "--size 1 1: expected width and height, each 64 to 4096 pixels"),
         (["--video", "film.mp4", "--size", "641", "482"], "--size 641 482: expected even numbers"),

@@ -150,12 +150,5 @@ def test_what_cannot_be_replayed_is_refused_before_a_page_opens():
     ],
 )
 def test_bad_options_of_view_are_refused(arguments, message, capsys):
-    assert _exit_code(arguments) == 2
+    assert cli.main(arguments) == 2
     assert message in "".join(capsys.readouterr())
-
-
-def _exit_code(arguments):
-    try:
-        return cli.main(arguments)
-    except SystemExit as ended:
-        return ended.code

@@ -114,7 +114,7 @@ class ImuOptions(JsonOption, RobotOption):
 
     out: Path
     """Hardware file to write; may be the one of --hardware."""
-    poses: int = 1
+    poses: Literal[1, 6] = 1
     """1 = gyroscope's bias, and accelerometer's offset on a level floor; 6 = its offset and scale from six sides up."""
     mounting: bool = False
     """Find how the sensor is mounted, from a level pose and one with the nose down."""
@@ -355,8 +355,6 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
     from wlr_gym.hardware.calibration import with_imu_calibration
     from wlr_gym.hardware.config import ImuCalibration
 
-    if options.poses not in (1, 6):
-        raise InputError(f"--poses {options.poses}: expected 1 or 6")
     _, hardware = options.load()
     source = source_of(options.hardware, options.out)
     link = options.link(with_imu_calibration(hardware, ImuCalibration()))

@@ -354,7 +354,7 @@ def test_command_writes_the_sheets(tmp_path, capsys):
         (["vision", "v.avi", "--run", "r.csv", "--out", "o", "--camera", "c.yaml", "--seconds", "-1"], "--seconds -1: exp"),
         (["calibrate", "camera", "nothing", "--out", "camera.yaml"], "no such video"),
         (["calibrate", "camera", ".", "--out", "camera.yaml", "--square", "28"], "expected metres"),
-        (["calibrate", "camera", ".", "--out", "camera.txt"], "expected a .yaml file"),
+        (["calibrate", "camera", ".", "--out", "camera.txt"], "expected a file that ends in .yaml, .yml"),
     ],
 )
 def test_bad_input_is_named(arguments, message, tmp_path, monkeypatch, capsys):
