@@ -86,7 +86,7 @@ def environment_posture(path: Path) -> None:
     from PIL import Image
 
     from wlr_gym.render import Scene
-    from wlr_gym.render.overlay import banner
+    from wlr_gym.render.scene import banner
 
     core, policy = make_player("WLR-Posture-v0", "slip_compensating", 1, {"randomization": "none"})
     scene, pictures = Scene(core.task.robot, View(size=(420, 300), camera="side", text=False)), []
@@ -151,7 +151,7 @@ def _write_stills(
 ) -> None:
     """Write pictures of the episode of seed 0 beside each other: at which time (s) -> what the robot does, for the title."""
     from wlr_gym.render import Scene
-    from wlr_gym.render.overlay import banner
+    from wlr_gym.render.scene import banner
 
     core, policy = make_player(environment, "slip_compensating", 1, keywords)
     scene, journey, pictures = Scene(core.task.robot, view), Journey(), []

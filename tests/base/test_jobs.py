@@ -12,8 +12,7 @@ from waiting import wait_until
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
-from wlr_gym.base.jobs import Job, follow, spread
-from wlr_gym.base.threads import in_threads
+from wlr_gym.base.jobs import Job, follow, in_threads, spread
 
 #: Says what it sees, and leaves a file when it is ended in good order.
 MODULE = """

@@ -16,11 +16,10 @@ from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import INTERRUPTED, main
 from wlr_gym.data import read_dataset
-from wlr_gym.demo import hidden_fault, ice_comparison, learn, retraining, workers
+from wlr_gym.demo import diagnosis, policies, retraining, workers
 from wlr_gym.demo.page import TERMS
 from wlr_gym.demo.page import page as page_of
-from wlr_gym.demo.settings import Demo
-from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Section
+from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Demo, Section
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
 from wlr_gym.learning.evaluation import Estimate
 from wlr_gym.physics.effects import load_patch, save_patch
@@ -144,8 +143,8 @@ def test_what_is_won_back_of_the_fault_is_said():
 
 
 def test_references_that_earn_more_are_named():
-    assert learn.behind(1.8, {"do_nothing": 0.4, "pid": 1.7}) == []
-    (said,) = learn.behind(1.8, {"do_nothing": 0.4, "pid": 1.85})
+    assert policies.behind(1.8, {"do_nothing": 0.4, "pid": 1.7}) == []
+    (said,) = policies.behind(1.8, {"do_nothing": 0.4, "pid": 1.85})
     assert said == "in whole episodes, pid (1.85) gets more reward per second than the new policy (1.80)"
 
 
@@ -158,18 +157,18 @@ def test_terms_are_those_of_the_glossary():
 
 def card(**better):
     """A card whose policies score alike; ``better``: intervals by which the slip-aware one beats the blind one."""
-    even = {column.key: Estimate(90.0, 80.0, 99.0) for column in ice_comparison._COLUMNS}
-    won = {column.key: Estimate(9.0, 5.0, 12.0) for column in ice_comparison._COLUMNS}
-    scores = {ice_comparison.OURS: even | {"excess_slip": Estimate(0.0043, 0.004, 0.005)}, ice_comparison.BLIND: even}
-    labels = list(ice_comparison.FLOORS)
-    compared = {key: {ice_comparison.BLIND: won} for key in labels}
-    compared[labels[0]] = {ice_comparison.BLIND: won | better}
+    even = {column.key: Estimate(90.0, 80.0, 99.0) for column in policies._COLUMNS}
+    won = {column.key: Estimate(9.0, 5.0, 12.0) for column in policies._COLUMNS}
+    scores = {policies.OURS: even | {"excess_slip": Estimate(0.0043, 0.004, 0.005)}, policies.BLIND: even}
+    labels = list(policies.FLOORS)
+    compared = {key: {policies.BLIND: won} for key in labels}
+    compared[labels[0]] = {policies.BLIND: won | better}
     return SimpleNamespace(scores=dict.fromkeys(labels, scores), comparison=compared)
 
 
 def test_where_the_slip_aware_policy_is_no_better_is_said():
     def short(**better) -> list[str]:
-        return ice_comparison.falls_short(cast(Any, card(**better)))
+        return policies.falls_short(cast(Any, card(**better)))
 
     assert short() == []
     assert short(excess_slip=Estimate(-8.0, -12.0, -5.0)) == [
@@ -185,7 +184,7 @@ def test_where_the_slip_aware_policy_is_no_better_is_said():
 
 def test_without_numbers_of_the_gap_workflow_nothing_is_trained(tmp_path):
     demo = Demo(tmp_path)
-    save_patch(load_patch([hidden_fault.hide(0)]), demo.hidden)
+    save_patch(load_patch([diagnosis.hide(0)]), demo.hidden)
     demo.gap.mkdir()
     write_json(demo.gap / RESULT_FILE, NO_NUMBERS)
     save_patch(load_patch(None), demo.gap / PATCH_FILE)

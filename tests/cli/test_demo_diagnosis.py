@@ -5,8 +5,7 @@ import math
 import pytest
 
 from wlr_gym.data.replay import ChannelError
-from wlr_gym.demo.diagnosis import judge, left_over, patch_alone_lacks, worse_channels
-from wlr_gym.demo.hidden_fault import hide
+from wlr_gym.demo.diagnosis import hide, judge, left_over, patch_alone_lacks, worse_channels
 from wlr_gym.gap.analysis import Analysis, ChannelGap, FoundEffect, GapFigures
 from wlr_gym.gap.report.result import EffectEntry, ParameterEntry
 from wlr_gym.physics.effects import load_patch

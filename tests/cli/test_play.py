@@ -24,7 +24,7 @@ from wlr_gym.render.viewer import Viewer
 
 @pytest.fixture
 def headless(monkeypatch):
-    monkeypatch.setattr("wlr_gym.render.display.platform.system", lambda: "Linux")
+    monkeypatch.setattr("wlr_gym.render.view.platform.system", lambda: "Linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
 

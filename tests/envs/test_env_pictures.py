@@ -177,7 +177,7 @@ def test_stable_baselines_own_vector_environment(fake, graphics):
 
 @pytest.mark.parametrize("make_env", [gym.make, gym.make_vec])
 def test_no_display_no_window(fake, monkeypatch, make_env):
-    monkeypatch.setattr("wlr_gym.render.display.platform.system", lambda: "Linux")
+    monkeypatch.setattr("wlr_gym.render.view.platform.system", lambda: "Linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(InputError, match=r"no display here .*render_mode='rgb_array'"):

@@ -10,7 +10,9 @@ from standing import PLAIN, truth_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants import SIMULATORS, PlantOptions, make_plant
-from wlr_gym.render import camera, gl, marks
+from wlr_gym.render import gl
+from wlr_gym.render import stage as marks
+from wlr_gym.render import view as camera
 from wlr_gym.render.scene import describe
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import View, read_view

@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 from wlr_gym.base.errors import InputError, MissingPackageError
-from wlr_gym.render.film_pair import GAP, side_by_side
-from wlr_gym.render.video import check_video, write_video
+from wlr_gym.render.video import GAP, check_video, side_by_side, write_video
 
 MP4 = pytest.param(".mp4", marks=pytest.mark.skipif(not importlib.util.find_spec("imageio_ffmpeg"), reason="no imageio-ffmpeg"))
 

@@ -132,7 +132,7 @@ def test_without_a_display_the_message_says_what_to_do(monkeypatch):
     monkeypatch.undo()
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("wlr_gym.render.display.platform.system", lambda: "Linux")
+    monkeypatch.setattr("wlr_gym.render.view.platform.system", lambda: "Linux")
     with pytest.raises(InputError, match=r"no display here .*wlr play --video"):
         open_window(None, None, None)  # type: ignore[arg-type]
 

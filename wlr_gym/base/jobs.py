@@ -20,9 +20,10 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 Send = Callable[[Mapping[str, Any]], None]
 
@@ -190,3 +191,22 @@ def import_modules(names: Iterable[str]) -> None:
         sys.path.insert(0, str(Path.cwd()))
     for name in names:
         importlib.import_module(name)
+
+
+# ---- threads ---------------------------------------------------------------------------------------------------------
+
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def in_threads(threads: int, work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+    """Return ``work`` of every item, in their order; so many are done at a time. What is returned does not depend on it."""
+    if threads == 1:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            return list(pool.map(work, items))
+        except KeyboardInterrupt:
+            print("interrupting ...", file=sys.stderr, flush=True)  # what has begun ends first
+            raise

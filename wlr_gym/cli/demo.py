@@ -26,7 +26,7 @@ from wlr_gym.cli.options import Count, ForceOption, JsonOption, Seed
 from wlr_gym.cli.terminal import print_json
 
 if TYPE_CHECKING:
-    from wlr_gym.demo.settings import Demo
+    from wlr_gym.demo.stage import Demo
 
 STEPS, QUICK_STEPS = 3_000_000, 16_384
 #: Sizes with --quick.
@@ -88,7 +88,7 @@ def run(options: DemoOptions) -> int:
 
 
 def _demo(options: DemoOptions) -> Demo:
-    from wlr_gym.demo.settings import Demo
+    from wlr_gym.demo.stage import Demo
 
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
     return Demo(options.out, options.seed, steps, **(_SHORT if options.quick else {}))

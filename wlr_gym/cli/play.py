@@ -28,9 +28,7 @@ from wlr_gym.cli.options import (
     require_simulator,
 )
 from wlr_gym.cli.terminal import print_json
-from wlr_gym.render.camera import CAMERAS
-from wlr_gym.render.display import require_display
-from wlr_gym.render.view import LARGEST, SMALLEST, View, fits
+from wlr_gym.render.view import CAMERAS, LARGEST, SMALLEST, View, fits, require_display
 from wlr_gym.render.web.page import HOST, PORT
 
 if TYPE_CHECKING:

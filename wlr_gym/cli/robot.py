@@ -217,7 +217,7 @@ def show_robot(options: ShowOptions) -> int:
         title = f"{robot.name}, fingerprint {robot_hash(robot)}"
         print_table(Console(highlight=False), ("number", "value", "unit", "meaning"), rows, title)
     if options.picture is not None:
-        from wlr_gym.render.portrait import draw_portrait
+        from wlr_gym.render.scene import draw_portrait
 
         draw_portrait(options.picture, robot)
         print(f"written: {options.picture}")

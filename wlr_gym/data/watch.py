@@ -31,8 +31,8 @@ from wlr_gym.data.resimulation import simulated_rows
 from wlr_gym.data.run_states import frame_near, has_camera, measured_state
 from wlr_gym.physics.effects import Patch
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth, standing_state
+from wlr_gym.render.web.page import Curve
 from wlr_gym.render.web.player import Moment
-from wlr_gym.render.web.plots import Curve
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import contact_slip_velocity

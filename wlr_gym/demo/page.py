@@ -9,8 +9,7 @@ from pathlib import Path
 from wlr_gym import __version__
 from wlr_gym.base.files import write_text
 from wlr_gym.base.html import anchor, document, section
-from wlr_gym.demo.settings import Demo
-from wlr_gym.demo.stage import FAILED, NOT_SHOWN, SHOWN, SKIPPED, Section, link
+from wlr_gym.demo.stage import FAILED, NOT_SHOWN, SHOWN, SKIPPED, Demo, Section, link
 
 _MARKS = {SHOWN: "✓", NOT_SHOWN: "✗", SKIPPED: "-", FAILED: "✗"}
 _COLOURS = {SHOWN: "#2e7d32", NOT_SHOWN: "#8a6d00", SKIPPED: "#8a6d00", FAILED: "#b03030"}

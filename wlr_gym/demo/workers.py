@@ -17,9 +17,8 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, MissingPackageError, require_package
 from wlr_gym.base.jobs import PATIENCE, Job, Send, serve, start
-from wlr_gym.demo import diagnosis, hidden_fault, ice_comparison, learn, retraining
-from wlr_gym.demo.settings import Demo
-from wlr_gym.demo.stage import FAILED, SKIPPED, DemoStage, Section, paragraph
+from wlr_gym.demo import diagnosis, policies, retraining
+from wlr_gym.demo.stage import FAILED, SKIPPED, Demo, DemoStage, Section, paragraph
 
 #: The shipped policies are ONNX files.
 _POLICIES = (("onnxruntime", "export"),)
@@ -32,11 +31,11 @@ _ROBOT = (("dynamixel_sdk", "robot"), ("serial", "robot"))
 #: Worker -> its stages, one after the other. Shares: measured on a quiet core.
 WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
     "policies": (
-        DemoStage(learn.TITLE, learn.train, 0.6, _TRAINING),
-        DemoStage(ice_comparison.TITLE, ice_comparison.compare, 0.4, _POLICIES),
+        DemoStage(policies.LEARN_TITLE, policies.train, 0.6, _TRAINING),
+        DemoStage(policies.ICE_TITLE, policies.compare, 0.4, _POLICIES),
     ),
     "robot": (
-        DemoStage(hidden_fault.TITLE, hidden_fault.drive, 0.15, (*_POLICIES, *_ROBOT)),
+        DemoStage(diagnosis.DRIVE_TITLE, diagnosis.drive, 0.15, (*_POLICIES, *_ROBOT)),
         DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.45),
         DemoStage(diagnosis.CHECK_TITLE, diagnosis.check, 0.05),
         DemoStage(retraining.TITLE, retraining.retrain, 0.35, (*_TRAINING, *_POLICIES, *_FILE_WEIGHTS, *_ROBOT)),

@@ -6,9 +6,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from wlr_gym.render.film_pair import side_by_side
     from wlr_gym.render.scene import Scene
-    from wlr_gym.render.video import write_video
+    from wlr_gym.render.video import side_by_side, write_video
     from wlr_gym.render.view import View
     from wlr_gym.render.viewer import Viewer
 

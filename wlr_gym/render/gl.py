@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.render.display import has_display
+from wlr_gym.render.view import has_display
 
 #: System -> contexts that can draw into memory there, the preferred first. On Linux EGL needs no display.
 CONTEXTS = {"Linux": ("egl", "glfw", "osmesa"), "Darwin": ("cgl", "glfw"), "Windows": ("glfw",)}

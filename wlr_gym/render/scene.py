@@ -1,21 +1,41 @@
-"""Pictures of a robot from the truth of any plant."""
+"""Pictures of a robot from the truth of any plant, with text and a legend; a portrait with its dimensions."""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.physics.plants.base import Truth
-from wlr_gym.render import camera, marks, overlay
+from wlr_gym.base.files import replace_file
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth, standing_state
 from wlr_gym.render.gl import Canvas
-from wlr_gym.render.stage import Stage
-from wlr_gym.render.view import View
+from wlr_gym.render.stage import (
+    FORCE_SCALE,
+    SLIP_SCALE,
+    Area,
+    Mark,
+    Stage,
+    Trail,
+    add_marks,
+    areas,
+    force_arrows,
+    pair,
+    pieces,
+    slip_arrows,
+    spots,
+    squares,
+)
+from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, View, aim, friction_colour, magnification, project, up_direction
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -55,7 +75,7 @@ class Scene:
         title: str = "",
         result: str = "",
         look_at: ArrayLike | None = None,
-        trails: Sequence[marks.Trail] = (),
+        trails: Sequence[Trail] = (),
     ) -> Picture:
         """Return the picture (H, W, 3), uint8, of one robot.
 
@@ -82,22 +102,22 @@ class Scene:
             self._scene = mujoco.MjvScene(stage.model, maxgeom=stage.model.ngeom + MAX_MARKS)
         scene, eye = self._scene, mujoco.MjvCamera()
         middle = truth.position[row] if look_at is None else np.asarray(look_at)
-        up = camera.up_direction(parameters["ground.slope"][row])
-        place = (camera.CAMERAS[self.view.camera], middle, stage.yaw(), up, camera.magnification(self.robot))
+        up = up_direction(parameters["ground.slope"][row])
+        place = (CAMERAS[self.view.camera], middle, stage.yaw(), up, magnification(self.robot))
         # The endless floor is laid out around the camera the scene had before, so it gets its own first.
         mujoco.mjv_updateCamera(stage.model, stage.data, eye, scene)
-        camera.aim(scene, *place)
+        aim(scene, *place)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(stage.model, stage.data, mujoco.MjvOption(), None, eye, everything, scene)
-        camera.aim(scene, *place)
-        floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
-        marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
-        marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail)])
+        aim(scene, *place)
+        floor = areas(parameters, row, truth.position[row]) if self.view.friction else []
+        add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+        add_marks(scene, [piece for trail in trails for piece in pieces(trail)])
         picture = self._canvas.draw(scene)
         if not self.view.text:
             return picture
         lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip) + [result] * bool(result)
-        return overlay.write(
+        return annotate(
             picture, lines, legend(parameters, row, self.view), self.view.friction, self._labels(floor, truth.position[row])
         )
 
@@ -105,7 +125,7 @@ class Scene:
         """Return where points (..., 3) of the floor frame are in the last picture: (..., 2) column and row, NaN if behind."""
         if self._scene is None:
             raise InputError("nothing has been drawn yet")
-        return camera.project(self._scene, np.asarray(points, np.float64), self.view.size)
+        return project(self._scene, np.asarray(points, np.float64), self.view.size)
 
     def close(self) -> None:
         """Give OpenGL back; the next picture opens it again."""
@@ -113,11 +133,11 @@ class Scene:
             self._canvas.close()
         self._canvas = self._scene = None
 
-    def _labels(self, floor: list[marks.Area], position: NDArray[np.float64]) -> list[overlay.Note]:
+    def _labels(self, floor: list[Area], position: NDArray[np.float64]) -> list[Note]:
         """Write the friction of each area on it, beside the robot and clear of the other text."""
         width, height = self.view.size
-        scale = camera.magnification(self.robot)
-        middle = np.array([*position[:2], scale * camera.LOOK_HEIGHT])
+        scale = magnification(self.robot)
+        middle = np.array([*position[:2], scale * LOOK_HEIGHT])
         around = middle + 0.32 * scale * np.vstack([np.eye(3), -np.eye(3)[:2]])
         robot = self.pixels(middle)
         clear = np.linalg.norm(self.pixels(around) - robot, axis=1).max() + 0.02 * width
@@ -128,21 +148,19 @@ class Scene:
             text = (places[:, 0] < 0.48 * width) & ((places[:, 1] < 0.27 * height) | (places[:, 1] > 0.76 * height))
             good = inside & ~text & (np.linalg.norm(places - robot, axis=1) > clear)
             if good.any():
-                notes.append(overlay.Note(f"µ {area.mu:.2g}", marks.pair(places[np.argmax(good)])))
+                notes.append(Note(f"µ {area.mu:.2g}", pair(places[np.argmax(good)])))
         return notes
 
 
-def marks_of(
-    stage: Stage, truth: Truth, parameters: Parameters, row: int, floor: list[marks.Area], view: View
-) -> list[marks.Mark]:
+def marks_of(stage: Stage, truth: Truth, parameters: Parameters, row: int, floor: list[Area], view: View) -> list[Mark]:
     """Return all that is drawn besides the robot, posed in ``stage``."""
-    drawn: list[marks.Mark] = [marks.squares(stage, truth.position[row]), *floor]
+    drawn: list[Mark] = [squares(stage, truth.position[row]), *floor]
     if view.friction:
-        drawn += marks.spots(stage, parameters, row)
+        drawn += spots(stage, parameters, row)
     if view.forces:
-        drawn += marks.force_arrows(stage, truth, parameters, row)
+        drawn += force_arrows(stage, truth, parameters, row)
     if view.slip:
-        drawn += marks.slip_arrows(stage, truth, parameters, row)
+        drawn += slip_arrows(stage, truth, parameters, row)
     return drawn
 
 
@@ -153,9 +171,9 @@ def legend(parameters: Parameters, row: int, view: View) -> list[str]:
     floor = f"floor µ {low}" if low == high else f"floors µ {low} to {high}"
     lines = [f"{floor}, squares 0.2 m" if view.friction else "squares 0.2 m"]
     if view.slip:
-        lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
+        lines.append(f"slip: 0.1 m of arrow = {0.1 / SLIP_SCALE:g} m/s")
     if view.forces:
-        lines.append(f"friction (green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
+        lines.append(f"friction (green): 0.1 m = {0.1 / FORCE_SCALE:g} N")
     if view.path:
         lines.append("path: pink; as commanded: dashed")
     return lines
@@ -193,3 +211,145 @@ def describe(
     pitch, roll = np.degrees(parameters["ground.slope"][row])
     slopes = [f"{angle:.1f}° along {axis}" for angle, axis in ((pitch, "x"), (roll, "y")) if abs(angle) >= LEAST_SLOPE]
     return [*lines, f"slope {', '.join(slopes)}"] if slopes else lines
+
+
+# ---- text and a legend -----------------------------------------------------------------------------------------------
+
+
+# Colours (red, green, blue, opacity), 0 to 255.
+PAPER = (255, 255, 255, 205)
+INK = (25, 28, 32, 255)
+#: Pixels; width of the friction bar.
+BAR = 120
+#: Friction coefficients at its ends.
+BAR_RANGE = (0.0, 1.0)
+#: Pixels.
+MARGIN = 8
+
+
+@dataclass(frozen=True)
+class Note:
+    """A short text at a place of the picture (column, row)."""
+
+    text: str
+    place: tuple[float, float]
+
+
+@functools.cache
+def font(height: int) -> ImageFont.FreeTypeFont:
+    """Return DejaVu Sans, which Matplotlib carries along, in pixels of height."""
+    import matplotlib
+
+    return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", height)
+
+
+def annotate(
+    picture: Picture, lines: Sequence[str], legend: Sequence[str] = (), bar: bool = True, notes: Sequence[Note] = ()
+) -> Picture:
+    """Return the picture with lines at the top left, a friction bar and a legend at the bottom left, and notes in the scene."""
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image, "RGBA")
+    size = max(9, round(picture.shape[0] / 34))  # pixels; height of the letters
+    for note in notes:
+        _note(draw, note, image.size, size)
+    if lines:
+        _box(draw, lines, size)
+    if bar or legend:
+        _legend(draw, legend, bar, image.size, size)
+    return np.asarray(image)
+
+
+def banner(width: int, text: str, height: int) -> Picture:
+    """Return a white strip (height, width, 3) with a centred text, made smaller where it would not fit."""
+    image = Image.new("RGB", (width, height), "white")
+    size = round(0.6 * height)
+    while size > 7 and font(size).getlength(text) > width - 2 * MARGIN:
+        size -= 1
+    ImageDraw.Draw(image).text((width / 2, height / 2), text, font=font(size), fill=INK[:3], anchor="mm")
+    return np.asarray(image)
+
+
+def _box(draw: ImageDraw.ImageDraw, lines: Sequence[str], size: int) -> None:
+    step = round(1.35 * size)
+    wide = max(font(size).getlength(line) for line in lines)
+    draw.rounded_rectangle((MARGIN, MARGIN, wide + 3 * MARGIN, step * len(lines) + 2 * MARGIN), 4, fill=PAPER)
+    for index, line in enumerate(lines):
+        draw.text((2 * MARGIN, 1.5 * MARGIN + step * index), line, font=font(size), fill=INK)
+
+
+def _legend(draw: ImageDraw.ImageDraw, lines: Sequence[str], bar: bool, size: tuple[int, int], height: int) -> None:
+    step, letters = round(1.35 * height), font(height)
+    wide = max([letters.getlength(line) for line in lines] + [BAR + letters.getlength("µ 0  1") + MARGIN] * bar)
+    row = size[1] - 1.5 * MARGIN - step * (len(lines) + bar)
+    draw.rounded_rectangle((MARGIN, row - MARGIN / 2, 3 * MARGIN + wide, size[1] - MARGIN), 4, fill=PAPER)
+    if bar:
+        _bar(draw, row, letters, height)
+    for index, line in enumerate(lines, start=int(bar)):
+        draw.text((2 * MARGIN, row + step * index), line, font=letters, fill=INK)
+
+
+def _bar(draw: ImageDraw.ImageDraw, row: float, letters: ImageFont.FreeTypeFont, height: int) -> None:
+    low, high = BAR_RANGE
+    start = 2 * MARGIN + letters.getlength(f"µ {low:g} ")
+    draw.text((2 * MARGIN, row), f"µ {low:g}", font=letters, fill=INK)
+    for column in range(BAR):
+        red, green, blue = friction_colour(low + (high - low) * column / (BAR - 1))
+        colour = (round(255 * red), round(255 * green), round(255 * blue), 255)
+        draw.line((start + column, row + 2, start + column, row + height), fill=colour)
+    draw.text((start + BAR + MARGIN / 2, row), f"{high:g}", font=letters, fill=INK)
+
+
+def _note(draw: ImageDraw.ImageDraw, note: Note, size: tuple[int, int], height: int) -> None:
+    column, row = note.place
+    half = 0.5 * font(height).getlength(note.text)
+    if not (half <= column <= size[0] - half and height <= row <= size[1] - height):
+        return
+    draw.text(
+        (column, row), note.text, font=font(height), fill=INK, anchor="mm", stroke_width=2, stroke_fill=(255, 255, 255, 200)
+    )
+
+
+# ---- the portrait ----------------------------------------------------------------------------------------------------
+
+
+#: Pixels; of one of the four views.
+SIZE = (640, 480)
+
+
+def draw_portrait(path: Path, robot: Robot) -> None:
+    """Write the picture (.png, .jpg, ...).
+
+    Args:
+        path: of the file.
+        robot: what stands in it.
+
+    Raises:
+        InputError: no OpenGL on this machine, or the file cannot be written.
+    """
+    low, high = robot.leg_limits
+    home = robot.home.leg_angle
+    x, y, z = robot.body.size
+    sizes = [
+        f"{robot.name}: {robot.total_mass:.3g} kg",
+        f"body {x:g} x {y:g} x {z:g} m, {robot.body.mass:g} kg",
+        f"legs {robot.leg.length:g} m, wheels of radius {robot.wheel.radius:g} m",
+        "squares 0.2 m",
+    ]
+    panels = (
+        _view(robot, "follow", home, sizes),
+        _view(robot, "side", home, [f"home: legs at {home:.3g} rad"]),
+        _view(robot, "side", low, [f"lower limit: legs at {low:.3g} rad"]),
+        _view(robot, "side", high, [f"upper limit: legs at {high:.3g} rad"]),
+    )
+    picture = np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])])
+    replace_file(path, lambda temporary: Image.fromarray(picture).save(temporary))
+
+
+def _view(robot: Robot, camera: str, leg_angle: float, lines: list[str]) -> Picture:
+    parameters = Parameters.nominal(robot)
+    state = standing_state(robot, parameters, leg_angle)
+    truth = Truth(np.zeros((1, TRUTH_LAYOUT.width)))
+    for name in ("position", "quaternion", "joint_position"):
+        truth[name][:] = getattr(state, name)
+    with closing(Scene(robot, View(size=SIZE, camera=camera, friction=False, slip=False, text=False))) as scene:
+        return annotate(scene.draw(truth, parameters), lines, bar=False)

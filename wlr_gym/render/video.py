@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from PIL import Image
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import replace_file, require_ending
+from wlr_gym.render.scene import banner
 
 Picture = NDArray[np.uint8]
 
@@ -143,3 +144,37 @@ def _write_mp4(path: Path, pictures: Iterator[Picture], fps: float, count: int) 
 _WRITERS: dict[str, Callable[[Path, Iterator[Picture], float, int], None]] = {
     ".webp": _write_webp, ".gif": _write_gif, ".png": _write_png, ".mp4": _write_mp4,
 }  # fmt: skip
+
+
+# ---- two films beside each other -------------------------------------------------------------------------------------
+
+
+GAP = 4
+
+
+def side_by_side(left: Iterable[Picture], right: Iterable[Picture], titles: tuple[str, str] = ("", "")) -> Iterator[Picture]:
+    """Put two films (pictures of one height) next to each other, each under its title; the shorter one holds its last picture.
+
+    Raises:
+        InputError: pictures of different heights, or an empty film.
+    """
+    last: list[Picture | None] = [None, None]
+    for pair in zip_longest(left, right):
+        last = [new if new is not None else old for new, old in zip(pair, last, strict=True)]
+        yield _join(last, titles)
+
+
+def _join(pictures: list[Picture | None], titles: tuple[str, str]) -> Picture:
+    one, two = pictures
+    if one is None or two is None:
+        raise InputError(f"film '{titles[0 if one is None else 1]}' has no pictures")
+    if one.shape[0] != two.shape[0]:
+        raise InputError(f"pictures are {one.shape[0]} and {two.shape[0]} pixels high, expected one height for both films")
+    height = one.shape[0]
+    parts = [one, np.full((height, GAP, 3), 255, np.uint8), two]
+    if any(titles):
+        strip = max(18, height // 16)
+        labels = [banner(picture.shape[1], title, strip) for picture, title in zip((one, two), titles, strict=True)]
+        top = np.hstack([labels[0], np.full((strip, GAP, 3), 255, np.uint8), labels[1]])
+        return np.vstack([top, np.hstack(parts)])
+    return np.hstack(parts)

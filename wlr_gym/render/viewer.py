@@ -19,12 +19,9 @@ import numpy as np
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants.base import Truth
-from wlr_gym.render import marks
-from wlr_gym.render.camera import CAMERAS, LOOK_HEIGHT, magnification
-from wlr_gym.render.display import require_display
 from wlr_gym.render.scene import describe, marks_of
-from wlr_gym.render.stage import Stage
-from wlr_gym.render.view import View
+from wlr_gym.render.stage import Stage, add_marks, areas
+from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, View, magnification, require_display
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -155,8 +152,8 @@ class Viewer:
             self._window.cam.lookat[:] = [*truth.position[row, :2], magnification(self.robot) * LOOK_HEIGHT]
             scene = self._window.user_scn
             scene.ngeom = 0
-            floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
-            marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+            floor = areas(parameters, row, truth.position[row]) if self.view.friction else []
+            add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
         if self.view.text:
             lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip)
             self._window.set_texts([(None, mujoco.mjtGridPos.mjGRID_TOPLEFT, "\n".join(lines).replace("°", " deg"), "")])

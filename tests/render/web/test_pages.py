@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from standing import truth_of
 
-from wlr_gym.render.marks import Arrow
-from wlr_gym.render.stage import Stage
+from wlr_gym.render.stage import Arrow, Stage
 from wlr_gym.render.teleop import UP
 from wlr_gym.render.view import View
 from wlr_gym.render.web.figure import Figure, PageFloor
 from wlr_gym.render.web.live import KEYS, Past, WebViewer, curves_of
-from wlr_gym.render.web.page import close_server, open_server
+from wlr_gym.render.web.page import NOTHING, Curve, close_server, open_server
 from wlr_gym.render.web.player import Moment, Player
-from wlr_gym.render.web.plots import NOTHING, Curve
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 

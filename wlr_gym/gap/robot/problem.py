@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.jobs import in_threads
 from wlr_gym.base.random import generator
-from wlr_gym.base.threads import in_threads
 from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.data.noise import channel_noise, noise_parts
 from wlr_gym.data.read import Run, read_dataset

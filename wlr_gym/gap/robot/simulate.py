@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.threads import in_threads
+from wlr_gym.base.jobs import in_threads
 from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.gap.robot.replay_loop import POSE_TICKS, Recorder, Replays, WrittenSetpoints, follower

@@ -16,10 +16,21 @@ from wlr_gym.render.scene import describe, legend
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP
 from wlr_gym.render.view import View
 from wlr_gym.render.viewer import KeyCallback, Pace
-from wlr_gym.render.web.controls import ViewControls, plot_panel
 from wlr_gym.render.web.figure import Figure, PageFloor, arrows_of
-from wlr_gym.render.web.page import HOST, PORT, TEXTS, aim, close_server, html_lines, open_server, say
-from wlr_gym.render.web.plots import Curve, Plots
+from wlr_gym.render.web.page import (
+    HOST,
+    PORT,
+    TEXTS,
+    Curve,
+    Plots,
+    ViewControls,
+    aim,
+    close_server,
+    html_lines,
+    open_server,
+    plot_panel,
+    say,
+)
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 

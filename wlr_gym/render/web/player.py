@@ -14,10 +14,22 @@ from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render.scene import describe, legend
 from wlr_gym.render.view import View
 from wlr_gym.render.viewer import Pace
-from wlr_gym.render.web.controls import ViewControls, plot_panel
 from wlr_gym.render.web.figure import Figure, PageFloor, arrows_of
-from wlr_gym.render.web.page import HOST, PORT, TEXTS, UPDATES, aim, close_server, html_lines, open_server, say
-from wlr_gym.render.web.plots import Curve, Plots
+from wlr_gym.render.web.page import (
+    HOST,
+    PORT,
+    TEXTS,
+    UPDATES,
+    Curve,
+    Plots,
+    ViewControls,
+    aim,
+    close_server,
+    html_lines,
+    open_server,
+    plot_panel,
+    say,
+)
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
