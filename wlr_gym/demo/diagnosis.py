@@ -1,5 +1,4 @@
-"""Three stages of the second worker: an emulated robot with a hidden fault is driven and logged, the gap workflow names the fault,
-and its patch is tried on held-out runs."""
+"""The stages of the second worker: a robot with a hidden fault is driven, the gap workflow names it, its patch is tried."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages of the first worker: a policy learns for about a minute; then it, shipped policies and a controller drive on ice."""
+"""The stages of the first worker: a policy learns for a minute; it, shipped policies and a controller drive on ice."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from wlr_gym.render.view import View
     from wlr_gym.render.viewer import Viewer
 
-_PARTS = {"Scene": "scene", "View": "view", "Viewer": "viewer", "side_by_side": "film_pair", "write_video": "video"}
+_PARTS = {"Scene": "scene", "View": "view", "Viewer": "viewer", "side_by_side": "video", "write_video": "video"}
 
 __all__ = ["Scene", "View", "Viewer", "side_by_side", "write_video"]
 

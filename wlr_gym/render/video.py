@@ -13,7 +13,6 @@ from PIL import Image
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import replace_file, require_ending
-from wlr_gym.render.scene import banner
 
 Picture = NDArray[np.uint8]
 
@@ -165,6 +164,8 @@ def side_by_side(left: Iterable[Picture], right: Iterable[Picture], titles: tupl
 
 
 def _join(pictures: list[Picture | None], titles: tuple[str, str]) -> Picture:
+    from wlr_gym.render.scene import banner  # loads MuJoCo; to check a film's name takes none
+
     one, two = pictures
     if one is None or two is None:
         raise InputError(f"film '{titles[0 if one is None else 1]}' has no pictures")
