@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.learning.adaptation import Adapted
-    from wlr_gym.learning.adaptation.robots import RealRobot
+    from wlr_gym.learning.adaptation.driving import RealRobot
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def run(options: AdaptOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.learning.adaptation import adapt
-    from wlr_gym.learning.adaptation.page import NUMBERS_FILE
+    from wlr_gym.learning.adaptation.state import NUMBERS_FILE
 
     _check(options)
     console = Console(soft_wrap=True, highlight=False, file=sys.stderr if options.json else None)
@@ -155,7 +155,7 @@ def _real(options: AdaptOptions, console: Console) -> RealRobot:
 def _print(found: Adapted, content: dict[str, Any], console: Console) -> None:
     from wlr_gym.base.text import duration
     from wlr_gym.cli.terminal import print_table
-    from wlr_gym.learning.adaptation.page import headline
+    from wlr_gym.learning.adaptation.state import headline
 
     rows = [
         (name, duration(one.driving), duration(one.computing), one.said[0] if one.said else "")

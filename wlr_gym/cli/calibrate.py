@@ -33,9 +33,8 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.servos import Servos
-    from wlr_gym.perception.markers.boards import Board
+    from wlr_gym.perception.markers.calibration import Board, Readout
     from wlr_gym.perception.markers.camera import Camera
-    from wlr_gym.perception.markers.shutter import Readout
     from wlr_gym.perception.vision.video import Frames
     from wlr_gym.robot import Robot
 
@@ -146,7 +145,7 @@ class FlowOptions(JsonOption):
 def calibrate_camera(options: CameraOptions) -> int:
     """Find lens and shutter, and write the camera file."""
     require_package("cv2", "vision")
-    from wlr_gym.perception.markers.boards import Board
+    from wlr_gym.perception.markers.calibration import Board
     from wlr_gym.perception.markers.camera import save_camera
     from wlr_gym.perception.vision.video import Frames
 
@@ -178,8 +177,7 @@ def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[C
     from rich.console import Console
 
     from wlr_gym.base.progress import progress
-    from wlr_gym.perception.markers.calibration import calibrate, calibrate_film
-    from wlr_gym.perception.markers.shutter import Readout
+    from wlr_gym.perception.markers.calibration import Readout, calibrate, calibrate_film
 
     with progress(Console(highlight=False)) as tell:
         named = _named(options.images, frames, lambda doing, share: tell("", doing, share))
@@ -214,7 +212,7 @@ def _shutter(camera: Camera, told: Readout) -> str:
 def write_targets(options: TargetsOptions) -> int:
     """Write the sheets into a folder."""
     require_package("cv2", "vision")
-    from wlr_gym.perception.markers.boards import Board
+    from wlr_gym.perception.markers.calibration import Board
     from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 
@@ -239,7 +237,7 @@ def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
         InputError: unknown joint, none or several servos, another model, a servo that does not take it.
     """
     from wlr_gym.hardware.dynamixel.tables import BAUD_RATES
-    from wlr_gym.hardware.servo_setup import FACTORY_RATE, check_new_servo, find_servos, set_up
+    from wlr_gym.hardware.servos import FACTORY_RATE, check_new_servo, find_servos, set_up
 
     check_name("joint", options.joint, JOINTS)
     robot, hardware = options.load()
@@ -378,7 +376,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
 
 def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
     from wlr_gym.hardware import calibration as find
-    from wlr_gym.hardware.imu.reading import to_body
+    from wlr_gym.hardware.imu import to_body
 
     level = "Block the body level (the legs hold nothing) and let go of it, then Enter."
     if options.poses == 6:
@@ -423,7 +421,7 @@ def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
 @contextlib.contextmanager
 def _dialogue() -> Iterator[None]:
     """Turn trouble with the hardware into an :class:`InputError`: nothing moves, so there is nothing to save."""
-    from wlr_gym.hardware.dynamixel.errors import NoAnswerError, RefusedError
+    from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
 
     try:
         yield
@@ -440,7 +438,7 @@ def calibrate_flow(options: FlowOptions) -> int:
     from wlr_gym.data.read import read_run
     from wlr_gym.hardware.calibration import with_flow_calibration
     from wlr_gym.hardware.config import load_hardware
-    from wlr_gym.hardware.flow.calibration import calibrate_flow as find
+    from wlr_gym.hardware.flow_comparison import calibrate_flow as find
     from wlr_gym.robot import load_robot
 
     hardware = load_hardware(options.hardware)

@@ -87,8 +87,8 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
     Raises:
         InputError: the first option that does not.
     """
-    from wlr_gym.hardware.limits import require_deadman
-    from wlr_gym.hardware.realtime import require_priority
+    from wlr_gym.hardware.config import require_deadman
+    from wlr_gym.hardware.timing import require_priority
 
     if options.deadman is not None:
         require_deadman("--deadman", options.deadman)

@@ -16,7 +16,7 @@ from wlr_gym.base.text import pairs
 
 if TYPE_CHECKING:
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.hardware.camera.config import CameraFile
+    from wlr_gym.hardware.camera.reading import CameraFile
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.plant import RobotPlant
@@ -229,8 +229,7 @@ class WiredRobotOption:
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
         """Return the robot as a plant, torque off; every start is logged in a new run of ``log``. ``seed``: :meth:`link_to`."""
         from wlr_gym.hardware.plant import RobotPlant
-        from wlr_gym.physics.plants.base import PlantOptions
-        from wlr_gym.physics.plants.robot_options import RobotOptions
+        from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
         options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)
         link = self.link_to(robot, self.load_hardware(), patch, seed)
@@ -273,7 +272,7 @@ class CameraOption(RobotOption):
 
 def read_camera(source: str | None, is_emulated: bool) -> CameraFile | None:
     """Return the camera of ``--camera``; see :meth:`CameraOption.camera_file`."""
-    from wlr_gym.hardware.camera.config import load_camera_file
+    from wlr_gym.hardware.camera.reading import load_camera_file
 
     if source == "emulated" and not is_emulated:
         raise InputError(

@@ -270,7 +270,7 @@ def _explained(found: ImportedRobot, base: str) -> list[str]:
 
 def _read(path: Path) -> LinkTree:
     """Read a file by what it holds, not by its name."""
-    from wlr_gym.physics.plants.mujoco.mjcf_file import read_mjcf
+    from wlr_gym.physics.plants.mujoco.mjcf import read_mjcf
     from wlr_gym.robot.interchange import parse_urdf
 
     try:
@@ -286,7 +286,7 @@ def export_robot(options: RobotExportOptions) -> int:
     Raises:
         InputError: no such robot, or a file that is there or of no known format.
     """
-    from wlr_gym.physics.plants.mujoco.mjcf_file import NOT_IN_MJCF, mjcf_text
+    from wlr_gym.physics.plants.mujoco.mjcf import NOT_IN_MJCF, mjcf_text
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.interchange import urdf_text
     from wlr_gym.robot.interchange.urdf import NOT_IN_URDF

@@ -16,9 +16,8 @@ from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import Count, JsonOption, ray_address
 from wlr_gym.cli.terminal import print_json
-from wlr_gym.learning.sweep.page import PAGE_FILE, name_of
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
-from wlr_gym.learning.sweep.results import TABLE_FILE
+from wlr_gym.learning.sweep.results import PAGE_FILE, TABLE_FILE, name_of
 from wlr_gym.learning.sweep.running import SweepResult, resume_sweep, start_sweep
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from wlr_gym.perception.markers.camera import Camera
     from wlr_gym.perception.markers.targets import Target
     from wlr_gym.perception.vision import VideoAnalysis
-    from wlr_gym.perception.vision.sheet_check import SheetCheck
+    from wlr_gym.perception.vision.sheets import SheetCheck
     from wlr_gym.perception.vision.tracking import Sample, VideoFrame
 
 
@@ -201,7 +201,7 @@ def check_photo(options: VisionCheckOptions) -> int:
     require_package("cv2", "vision")
 
     from wlr_gym.perception.vision import load_camera, load_target
-    from wlr_gym.perception.vision.sheet_check import check_sheets
+    from wlr_gym.perception.vision.sheets import check_sheets
     from wlr_gym.perception.vision.video import read_image
 
     files = {"markers": options.markers, "floor": options.floor}

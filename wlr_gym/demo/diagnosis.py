@@ -106,7 +106,7 @@ def _excite(demo: Demo, patch: Any, name: str) -> None:
     from wlr_gym.data.format import Profile
     from wlr_gym.hardware.deployment import drive_robot
     from wlr_gym.hardware.plant import RobotPlant
-    from wlr_gym.physics.plants.robot_options import RobotOptions
+    from wlr_gym.physics.plants.base import RobotOptions
     from wlr_gym.robot import load_robot
 
     robot = load_robot()

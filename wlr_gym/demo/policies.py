@@ -14,7 +14,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import heading, table
 from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, filmed, paragraph
-from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, unit_of
 from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
 

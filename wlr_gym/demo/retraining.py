@@ -10,13 +10,13 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import commands, table
 from wlr_gym.demo.diagnosis import POLICY
 from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, SKIPPED, Demo, Section, Tell, filmed, paragraph
-from wlr_gym.envs.tasks.task_config import having
+from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, places, plain
 from wlr_gym.learning.evaluation import Subject
 
 if TYPE_CHECKING:
-    from wlr_gym.learning.adaptation.plan import Progress
-    from wlr_gym.learning.adaptation.robots import EmulatedRobot
+    from wlr_gym.learning.adaptation.driving import EmulatedRobot
+    from wlr_gym.learning.adaptation.state import Progress
 
 TITLE = "6. What training on wins back"
 OLD, NEW = "old policy", "trained on"
@@ -30,11 +30,10 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     """Train on from the shipped policy, drive both on the robot with the fault, film them."""
     from wlr_gym.gap.decision import Decided, History
     from wlr_gym.gap.report.result import RESULT_FILE, read_result
-    from wlr_gym.learning.adaptation.driving import drive_after
-    from wlr_gym.learning.adaptation.identification import state_uncertainty
-    from wlr_gym.learning.adaptation.plan import Asked, Progress
+    from wlr_gym.learning.adaptation.adapt import state_uncertainty
+    from wlr_gym.learning.adaptation.driving import EmulatedRobot, drive_after
     from wlr_gym.learning.adaptation.retraining import train_on, trained_policy
-    from wlr_gym.learning.adaptation.robots import EmulatedRobot
+    from wlr_gym.learning.adaptation.state import Asked, Progress
     from wlr_gym.physics.effects import load_patch
     from wlr_gym.robot import load_robot, robot_hash
 

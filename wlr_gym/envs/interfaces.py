@@ -23,7 +23,7 @@ from wlr_gym.envs.episodes import Mask, own_seed, read_seed
 from wlr_gym.envs.observation import read_actions
 from wlr_gym.envs.settings import EnvironmentOptions, read_settings, task_of
 from wlr_gym.envs.tasks.task import limits_of, scales_of, succeeded, tracking_error
-from wlr_gym.render.display import has_display, require_display
+from wlr_gym.render.view import has_display, require_display
 
 if TYPE_CHECKING:
     from wlr_gym.render import Scene, Viewer

@@ -15,8 +15,7 @@ from pydantic_core import PydanticCustomError
 from wlr_gym.base.checks import check_name
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.paths import find_config, named_by, named_in
-from wlr_gym.base.refusals import expected
-from wlr_gym.base.settings import SettingsModel, parse_config, read_config
+from wlr_gym.base.settings import SettingsModel, expected, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, ControlTable, load_table
 from wlr_gym.physics.servo import measures_current
 from wlr_gym.robot import JOINTS, LEGS, Robot, Vector3

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 from wlr_gym.envs.interfaces import Infos
 from wlr_gym.envs.tasks.signals import Signals, climb_speed, path_point, yaw_of
-from wlr_gym.render.colours import DRIVEN, WANTED
-from wlr_gym.render.view import View
+from wlr_gym.render.view import DRIVEN, WANTED, View
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.learning.evaluation.subjects import Subject
     from wlr_gym.policy import Policy
-    from wlr_gym.render.marks import Trail
+    from wlr_gym.render.stage import Trail
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -193,7 +192,7 @@ class Journey:
 
     def trails(self) -> list[Trail]:
         """Return both, to be drawn."""
-        from wlr_gym.render.marks import Trail
+        from wlr_gym.render.stage import Trail
 
         return [Trail(np.array(self._wanted), WANTED, dashed=True), Trail(np.array(self._driven), DRIVEN)]
 

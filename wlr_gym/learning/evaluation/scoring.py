@@ -10,10 +10,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.checks import check_name
+from wlr_gym.base.checks import check_name, require_seed
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
-from wlr_gym.base.seeds import require_seed
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings

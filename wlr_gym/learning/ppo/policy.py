@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt, model_validator
 
+from wlr_gym.base.checks import LARGEST_SEED
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.base.seeds import LARGEST_SEED
 from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.policy import contract_of
 from wlr_gym.robot import LEGS, WHEELS
