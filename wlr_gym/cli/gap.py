@@ -90,7 +90,7 @@ def run(options: GapOptions) -> int:
     from rich.console import Console
 
     from wlr_gym.gap.analysis import BAD_DATA
-    from wlr_gym.gap.report.folder import check_folder as check_results
+    from wlr_gym.gap.report.page import check_folder as check_results
     from wlr_gym.gap.report.result import RESULT_FILE
     from wlr_gym.gap.workflow import analyse
 
@@ -127,7 +127,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     from wlr_gym.data.replay import robot_of
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.decision import Budget, decide
-    from wlr_gym.gap.report.folder import REPORT_FILE
+    from wlr_gym.gap.report.page import REPORT_FILE
     from wlr_gym.gap.report.result import RESULT_FILE
 
     budget = Budget(options.budget_runs, math.inf if options.budget_seconds is None else options.budget_seconds)
@@ -156,8 +156,8 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 def _check(options: GapOptions) -> None:
     from wlr_gym.data.read import run_files
-    from wlr_gym.gap.opened import OWN_RIG, RIGS
     from wlr_gym.gap.rig.own import load_rig
+    from wlr_gym.gap.workflow import OWN_RIG, RIGS
     from wlr_gym.physics.plants import check_simulator
     from wlr_gym.robot import load_robot
 
@@ -186,7 +186,7 @@ def _check(options: GapOptions) -> None:
 
 def _known(options: GapOptions) -> Patch:
     """The effects given as known, in the vocabulary of the robot or of the rig."""
-    from wlr_gym.gap.opened import known_patch
+    from wlr_gym.gap.workflow import known_patch
 
     try:
         return options.patch() if options.rig is None else known_patch(list(options.effects), options.rig)
@@ -199,7 +199,7 @@ def _known(options: GapOptions) -> Patch:
 
 def _print(analysis: Analysis, out: Path, console: Console) -> None:
     from wlr_gym.gap.analysis import BAD_DATA
-    from wlr_gym.gap.report.folder import REPORT_FILE
+    from wlr_gym.gap.report.page import REPORT_FILE
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
     from wlr_gym.gap.report.text import closure, made_worse, sentence, title
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
-from wlr_gym.base.threads import in_threads
+from wlr_gym.base.jobs import in_threads
 from wlr_gym.gap.estimation.model import (
     FittedModel,
     Noise,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.threads import in_threads
+from wlr_gym.base.jobs import in_threads
 from wlr_gym.gap.estimation.fit import Fit, cheapest, constrained_step, equations_by_run, fit
 from wlr_gym.gap.estimation.model import (
     FittedModel,

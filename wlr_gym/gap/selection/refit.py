@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.threads import in_threads
+from wlr_gym.base.jobs import in_threads
 from wlr_gym.gap.estimation.fit import CONVERGED, Fit, channel_products, constrained_step, cross_products, fit
 from wlr_gym.gap.estimation.model import FittedModel, Noise, estimate_noise, moved, scaled_numbers, total_cost, untouched
 from wlr_gym.gap.problem import Candidate, Problem, Setting

@@ -29,7 +29,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.threads import in_threads
+from wlr_gym.base.jobs import in_threads
 from wlr_gym.gap.analysis import Detectable
 from wlr_gym.gap.estimation.fit import Fit, bounded_minimum, by_channel, normal_equations
 from wlr_gym.gap.estimation.model import (
