@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.read import Run, read_run
+from wlr_gym.data.runs import Run, read_run
 from wlr_gym.envs.core import Core
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 from wlr_gym.policy import Policy

@@ -30,8 +30,8 @@ from wlr_gym.base.jobs import Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.data.excitations import Motion, excite
-from wlr_gym.data.read import read_meta
 from wlr_gym.data.record import next_run
+from wlr_gym.data.runs import read_meta
 from wlr_gym.gap.decision import Budget, Decided, Recorded, decide
 from wlr_gym.gap.robot.next_run import motions_to_drive
 from wlr_gym.robot import load_robot

@@ -26,9 +26,9 @@ from studies.bench.mujoco_loop import build_servo_model
 from studies.bench.sysid_contest import Contest, PeerProblem, PeerRun, contest_between
 from wlr_gym.base.random import generator
 from wlr_gym.data.format import CHANNELS, COMMANDS, RunMeta
-from wlr_gym.data.read import Run
 from wlr_gym.data.run_states import start_state
-from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.runs import Run
+from wlr_gym.data.sensors import SENSED, channels
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.robot.problem import RobotProblem
 from wlr_gym.gap.robot.windows import LEAD, anchored_residuals

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from studies.bench.vision_scenes import shown_robot
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
-from wlr_gym.data.read import Run
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.data.sensor_columns import SENSED, channels
+from wlr_gym.data.runs import Run
+from wlr_gym.data.sensors import SENSED, channels
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, plate_facet
 from wlr_gym.perception.vision.tracking import VideoFrame

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from studies.paper import reduced
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.data.body_pose import euler_angles
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import Profile
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.data.run_states import standing_at
+from wlr_gym.data.run_states import euler_angles, standing_at
 from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, Sensors

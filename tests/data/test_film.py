@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from wlr_gym.data import read_run
-from wlr_gym.data.body_pose import euler_angles
-from wlr_gym.data.film import film_length, replay_film, truth_of
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.replay import ReplayResult
-from wlr_gym.data.run_states import measured_state
+from wlr_gym.data.run_states import euler_angles, measured_state
+from wlr_gym.data.watch import film_length, replay_film, truth_of
 from wlr_gym.physics.plants.base import standing_state
 from wlr_gym.render.view import View
 from wlr_gym.robot import load_robot

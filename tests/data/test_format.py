@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data import COLUMNS, Profile, RunMeta, check_table, convert, read_dataset, read_meta, read_run, write_run
 from wlr_gym.data.format import CAMERA, FLOW, REQUIRED
 from wlr_gym.data.logs import export_run
-from wlr_gym.data.logs.exported import read_exported
+from wlr_gym.data.logs.write import read_exported
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 
 DATA = Path(__file__).parent / "data"
@@ -375,7 +375,7 @@ def test_writing_does_not_overwrite_other_meta_data(tmp_path, table):
 def test_a_broken_write_leaves_the_old_file(tmp_path, table, monkeypatch):
     path = write_run(tmp_path / "run_01.csv", table)
     before = path.read_bytes()
-    monkeypatch.setattr("wlr_gym.data.write.write_csv", lambda path, columns: 1 / 0)
+    monkeypatch.setattr("wlr_gym.data.runs.write_csv", lambda path, columns: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         write_run(path, table)
     assert path.read_bytes() == before

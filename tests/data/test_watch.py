@@ -12,9 +12,8 @@ from wlr_gym import cli
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Simulation, read_run, simulate_again
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.data.odometry import rolled_poses
 from wlr_gym.data.replay import replay
-from wlr_gym.data.run_states import start_state
+from wlr_gym.data.run_states import rolled_poses, start_state
 from wlr_gym.data.watch import RunRecording, open_recordings
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import LEGS, WHEELS, load_robot

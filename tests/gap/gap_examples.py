@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from wlr_gym.data.format import CHANNELS, COLUMNS
-from wlr_gym.data.noise import channel_noise
+from wlr_gym.data.sensors import channel_noise
 from wlr_gym.gap.analysis import (
     Adequacy,
     Analysis,

@@ -13,8 +13,8 @@ from waiting import wait_until
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli.gap import DecideOptions, ask, recorder_of
 from wlr_gym.data.excitations import GENTLE, excite
-from wlr_gym.data.read import read_run
 from wlr_gym.data.record import record_simulation
+from wlr_gym.data.runs import read_run
 from wlr_gym.gap import Budget, Recorded, decide
 from wlr_gym.gap.report.result import Explanation, Result, explanations
 from wlr_gym.gap.robot import next_run

@@ -17,7 +17,7 @@ from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.record import record_simulation
 from wlr_gym.data.replay import replay
-from wlr_gym.data.write import write_run
+from wlr_gym.data.runs import write_run
 from wlr_gym.gap.analysis import ParameterEstimate
 from wlr_gym.gap.estimation.model import FittedModel, level, mean_squares, nominal_model
 from wlr_gym.gap.problem import Setting, Unknown

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.data.noise import channel_noise
+from wlr_gym.data.sensors import channel_noise
 from wlr_gym.gap.robot.windows import BLIND, BOUNCE, anchored_residuals, window_rows
 from wlr_gym.robot import JOINTS, load_robot
 

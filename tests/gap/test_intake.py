@@ -8,7 +8,7 @@ import pytest
 from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 
 from wlr_gym.data import Run
-from wlr_gym.data.write import write_run
+from wlr_gym.data.runs import write_run
 from wlr_gym.gap import analyse
 from wlr_gym.gap.analysis import NO_PROFILE
 from wlr_gym.gap.robot.intake import CHECKS, ChannelFault, findings_of, wrapped

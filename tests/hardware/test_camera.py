@@ -18,7 +18,7 @@ from robot_rig import HARDWARE, ROBOT
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli.deploy import camera_line, camera_state
-from wlr_gym.data.read import read_run
+from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.camera import process
 from wlr_gym.hardware.camera.live import LiveCamera
 from wlr_gym.hardware.camera.reading import (

@@ -25,8 +25,8 @@ from wlr_gym.base.paths import data_directory
 from wlr_gym.cli import FAILED, OK, run_command
 from wlr_gym.cli.deploy import DeployOptions, RobotView, _emulator, busy_note
 from wlr_gym.cli.terminal import wait_for_enter
-from wlr_gym.data.read import read_run
 from wlr_gym.data.replay import replay
+from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.deployment import REHEARSALS, loop_of
 from wlr_gym.hardware.deployment import deploy as drive

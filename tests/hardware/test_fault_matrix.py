@@ -16,7 +16,7 @@ pytest.importorskip("serial")
 from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, ROBOT, Phase, Rig, StoppedError
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.read import read_run
+from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.camera.reading import CAMERA_FAULTS
 from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import FAULTS, MachineOptions

@@ -8,7 +8,7 @@ import pytest
 
 from wlr_gym.base.paths import find_config
 from wlr_gym.cli import main
-from wlr_gym.data.read import read_run
+from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.config import FlowPort, load_hardware
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port

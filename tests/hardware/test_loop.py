@@ -14,7 +14,7 @@ import robot_rig
 from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, Phase, Rig, StoppedError
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.read import read_dataset, read_run
+from wlr_gym.data.runs import read_dataset, read_run
 from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.timing import Pacer

@@ -13,7 +13,7 @@ pytest.importorskip("serial")
 from robot_rig import DRIVE, HARDWARE, JOINTS, PERIOD, ROBOT, Phase, Rig, StoppedError
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.read import read_run
+from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.log import CsvTable, read_events
 from wlr_gym.hardware.operator import STOP_SIGNALS, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant

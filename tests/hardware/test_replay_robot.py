@@ -13,7 +13,7 @@ from wlr_gym.data import read_run
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.data.record import record_simulation
-from wlr_gym.data.repetition import compare_repeat
+from wlr_gym.data.replay import compare_repeat
 from wlr_gym.robot import load_robot
 
 pytest.importorskip("dynamixel_sdk")

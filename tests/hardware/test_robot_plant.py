@@ -13,7 +13,7 @@ from robot_rig import ROBOT, Phase, StoppedError, machine_of
 
 import wlr_gym  # noqa: F401  (registers the environments)
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.read import read_run
+from wlr_gym.data.runs import read_run
 from wlr_gym.envs.core import MEASURED, measured_truth
 from wlr_gym.envs.settings import Settings
 from wlr_gym.learning.evaluation import make_core, roll_out

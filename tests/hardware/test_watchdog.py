@@ -14,7 +14,7 @@ pytest.importorskip("termios")
 
 from robot_rig import HARDWARE, ROBOT, hardware_file
 
-from wlr_gym.data.read import read_run
+from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.dynamixel.bus import BusGroup
 from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server

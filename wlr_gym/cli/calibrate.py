@@ -435,7 +435,7 @@ def calibrate_flow(options: FlowOptions) -> int:
     Raises:
         InputError: a run without flow, too little way, a hardware file that names no flow sensor.
     """
-    from wlr_gym.data.read import read_run
+    from wlr_gym.data.runs import read_run
     from wlr_gym.hardware.calibration import with_flow_calibration
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.flow_comparison import calibrate_flow as find

@@ -24,8 +24,7 @@ from wlr_gym.cli.terminal import print_json, print_table
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from wlr_gym.data.compared_plants import ComparedPlant
-    from wlr_gym.data.comparison import Comparison
+    from wlr_gym.data.comparison import ComparedPlant, Comparison
     from wlr_gym.data.comparison_report import ReportTable
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
@@ -79,7 +78,7 @@ def run(options: CompareOptions) -> int:
     """
     from rich.console import Console
 
-    from wlr_gym.data.compared_plants import parse_plant
+    from wlr_gym.data.comparison import parse_plant
     from wlr_gym.data.comparison_report import markdown, summary_table, tables
 
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
@@ -110,9 +109,9 @@ def run(options: CompareOptions) -> int:
 
 def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     from wlr_gym.data.excitations import EXCITATIONS, excite
-    from wlr_gym.data.read import read_runs
     from wlr_gym.data.record import motion_of
     from wlr_gym.data.replay import robot_of
+    from wlr_gym.data.runs import read_runs
     from wlr_gym.robot import load_robot
 
     if options.runs is None:

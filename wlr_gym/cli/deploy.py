@@ -24,7 +24,7 @@ from wlr_gym.cli.terminal import print_json, wait_for_enter
 from wlr_gym.robot import JOINTS
 
 if TYPE_CHECKING:
-    from wlr_gym.data.logs.stream import McapStream
+    from wlr_gym.data.logs.write import McapStream
     from wlr_gym.envs.core import Core
     from wlr_gym.hardware.deployment import Deployment
     from wlr_gym.hardware.emulator.machine import Machine
@@ -322,7 +322,7 @@ def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Co
 
 def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -> McapStream | None:
     """Return what writes the run into an MCAP file while it goes on, or None."""
-    from wlr_gym.data.logs.stream import McapStream
+    from wlr_gym.data.logs.write import McapStream
 
     if path is None:
         return None
@@ -352,7 +352,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
     import subprocess
     import tempfile
 
-    from wlr_gym.data.robot_file import write_robot
+    from wlr_gym.data.runs import write_robot
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.robot import load_robot
 

@@ -98,7 +98,7 @@ def _target(options: ExportOptions) -> Path:
 def _export_runs(options: ExportOptions, form: str) -> list[Path]:
     from wlr_gym.data.logs import export_run
     from wlr_gym.data.logs.write import FORMATS
-    from wlr_gym.data.read import read_run, some_runs
+    from wlr_gym.data.runs import read_run, some_runs
 
     if any((options.card, options.env, options.config, options.normalizer, options.reseal, options.robot)):
         raise InputError(f"--to {form} writes runs: the options of policies do not go with it")

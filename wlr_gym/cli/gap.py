@@ -123,8 +123,8 @@ def run(options: GapOptions) -> int:
 
 def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     """Have runs driven until it is decided; 1 where the last analysis could not be made."""
-    from wlr_gym.data.read import read_dataset
     from wlr_gym.data.replay import robot_of
+    from wlr_gym.data.runs import read_dataset
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.decision import Budget, decide
     from wlr_gym.gap.report.page import REPORT_FILE
@@ -155,7 +155,7 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
 
 
 def _check(options: GapOptions) -> None:
-    from wlr_gym.data.read import run_files
+    from wlr_gym.data.runs import run_files
     from wlr_gym.gap.rig.own import load_rig
     from wlr_gym.gap.workflow import OWN_RIG, RIGS
     from wlr_gym.physics.plants import check_simulator
@@ -268,8 +268,8 @@ def recorder_of(options: DecideOptions, robot: Robot, backend: str, out: Path, c
 
 def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callable[[float], None] = time.sleep) -> Recorded:
     """Write a motion, say how it is driven, and wait until its run is in the folder of the data."""
-    from wlr_gym.data.read import read_run, run_files
     from wlr_gym.data.record import write_commands
+    from wlr_gym.data.runs import read_run, run_files
     from wlr_gym.gap.decision import Recorded
 
     there = set(run_files(data))
@@ -295,8 +295,8 @@ def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callab
 def _simulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
     """Drive the simulator; no two runs of a folder have the same noise."""
     from wlr_gym.base.random import spawn_seeds
-    from wlr_gym.data.read import read_meta
     from wlr_gym.data.record import next_run, record_simulation
+    from wlr_gym.data.runs import read_meta
     from wlr_gym.gap.decision import Recorded
 
     path = next_run(data)
@@ -306,7 +306,7 @@ def _simulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backe
 
 def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
     """Drive an emulated robot in emulated time, through the command limiter as a real one; noise as in a simulator."""
-    from wlr_gym.data.read import read_meta
+    from wlr_gym.data.runs import read_meta
     from wlr_gym.gap.decision import Recorded
     from wlr_gym.hardware.deployment import drive_robot
 

@@ -132,7 +132,7 @@ def _print_proposal(found: Proposal, console: Console) -> None:
 
 
 def _print_costs(columns: set[str], console: Console) -> None:
-    from wlr_gym.data.logs.costs import costs
+    from wlr_gym.data.logs.map import costs
 
     for missing, cost in costs(columns):
         console.print(f"missing: {missing}: {cost}", style="yellow", markup=False)

@@ -73,7 +73,7 @@ def run(options: ViewOptions) -> int:
 
 
 def _read(paths: Sequence[Path]) -> list[Run]:
-    from wlr_gym.data.read import read_runs
+    from wlr_gym.data.runs import read_runs
 
     if not paths:
         raise InputError("expected runs (CSV or Parquet), or folders of runs; wlr import makes runs of other programs' logs")

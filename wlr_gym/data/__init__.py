@@ -6,10 +6,8 @@
 
 from wlr_gym.data.check import Finding, check_table
 from wlr_gym.data.format import COLUMNS, Column, Profile, RunMeta
-from wlr_gym.data.read import DataSet, Run, read_dataset, read_meta, read_run
-from wlr_gym.data.resimulation import simulate_again, simulated_parameters
-from wlr_gym.data.simulation_record import Simulation
-from wlr_gym.data.write import convert, write_meta, write_run
+from wlr_gym.data.replay import simulate_again, simulated_parameters
+from wlr_gym.data.runs import DataSet, Run, Simulation, convert, read_dataset, read_meta, read_run, write_meta, write_run
 
 __all__ = [
     "COLUMNS",

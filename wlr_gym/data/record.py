@@ -14,15 +14,13 @@ from wlr_gym.base.checks import LARGEST_NOISE_SEED, require_seed
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.base.text import row_words
-from wlr_gym.data.compared_plants import SETTLE
+from wlr_gym.data.comparison import SETTLE
 from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
-from wlr_gym.data.read import Run, read_meta
 from wlr_gym.data.replay import held_setpoints, profile_parameters
 from wlr_gym.data.run_states import standing_at
-from wlr_gym.data.sensor_columns import channels, sensed_columns
-from wlr_gym.data.simulation_record import Simulation, departures, start_of
-from wlr_gym.data.write import write_csv, write_meta, write_run
+from wlr_gym.data.runs import Run, Simulation, departures, read_meta, start_of, write_csv, write_meta, write_run
+from wlr_gym.data.sensors import channels, sensed_columns
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import PlantOptions

@@ -11,26 +11,30 @@ times. Command delays shift the measured times of the setpoints, so a segment st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.body_pose import euler_angles
+from wlr_gym.base.plots import BLUE, GREY, ORANGE, new_figure, save, tidy
 from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, Profile
-from wlr_gym.data.noise import channel_noise
-from wlr_gym.data.read import Run
-from wlr_gym.data.robot_file import robot_of_meta
-from wlr_gym.data.run_states import measured_state, start_state, starts_at_rest
-from wlr_gym.physics.effects import Source, apply_patch, load_patch
+from wlr_gym.data.run_states import euler_angles, measured_state, start_state, starts_at_rest
+from wlr_gym.data.runs import Run, Simulation, robot_of_meta, simulation_path
+from wlr_gym.data.sensors import channel_noise, channels, sensed_columns
+from wlr_gym.physics.effects import Patch, Source, apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.robot import JOINTS, LEG_SLICE, WHEEL_SLICE, Robot, load_robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -92,7 +96,7 @@ def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
     """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one.
 
     Raises:
-        InputError: see :func:`wlr_gym.data.robot_file.robot_of_meta`.
+        InputError: see :func:`wlr_gym.data.runs.robot_of_meta`.
     """
     return robot_of_meta(run.meta, run.path.parent) if robot is None else load_robot(robot)
 
@@ -343,3 +347,239 @@ def _rms(error: Array) -> float:
 def pooled(errors: Sequence[ChannelError], value: Callable[[ChannelError], float]) -> float:
     """Root mean square of one figure over several channels or runs."""
     return float(np.sqrt(np.mean([value(error) ** 2 for error in errors])))
+
+
+# --- a run replayed row by row, as fast as it comes: what a page shows beside the measured robot ----------------------
+
+
+#: s around an anchor whose samples are looked at.
+_AROUND = 1.0
+
+
+def replayed_rows(
+    run: Run, robot: Robot, parameters: Parameters, backend: str, patch: Patch | None, segment: float
+) -> Iterator[tuple[Parameters, Truth, Array]]:
+    """Yield parameters (1), truth (1) and the channels :data:`wlr_gym.data.format.CHANNELS` of a replay at each row of the run.
+
+    As in :func:`wlr_gym.data.replay.replay` the plant ticks on a clock of its own, and each row's setpoint acts from that row's
+    time on; every ``segment`` s the plant starts anew from the measured state, at once and not as one batch.
+
+    Args:
+        run: the run.
+        robot, parameters: (1) that it is replayed with, see :func:`wlr_gym.data.replay.prepare`.
+        backend: a simulator.
+        patch: formulas that act in the plant; None = none.
+        segment: s; inf = only the beginning is measured.
+    """
+    t, offset = run["t"], np.asarray(run.meta.marker_offset)
+    ticks = np.rint((t - t[0]) / CLOCK).astype(int)
+    setpoints, torque_on = tick_setpoints(run, parameters, t[:1], int(ticks[-1]), CLOCK)
+    undelayed = parameters.copy()
+    undelayed["command.delay"] = 0.0  # the setpoints come delayed
+    plant = make_plant(backend, robot, 1, PlantOptions(control_period=CLOCK, sensor_noise=False), patch.forces if patch else ())
+    state, begin = start_state(run, robot, parameters), 0
+    try:
+        sensors = plant.reset(parameters=undelayed, state=replace(state, time=np.zeros(1)))
+        shift = state.joint_position[:, WHEEL_SLICE] - sensors.joint_position[:, WHEEL_SLICE]
+        for row in range(len(t)):
+            for tick in range(ticks[row - 1] if row else 0, ticks[row]):
+                sensors = plant.step(setpoints[tick], torque_on[tick])
+            if t[row] - t[begin] >= segment:
+                begin = row
+                state = measured_state(_near(run, row), t[row : row + 1], plant.mechanical_state(), parameters)
+                sensors = plant.reset(parameters=undelayed, state=replace(state, time=t[row : row + 1] - t[0]))
+                shift = state.joint_position[:, WHEEL_SLICE] - sensors.joint_position[:, WHEEL_SLICE]
+            truth = plant.truth()
+            channels = readings(sensors, truth, shift, offset)[None]
+            camera_frame(channels, parameters)
+            yield parameters, truth, channels[0, 0]
+    finally:
+        plant.close()
+
+
+def _near(run: Run, row: int) -> Run:
+    t = run["t"]
+    first, last = np.searchsorted(t, [t[row] - _AROUND, t[row] + _AROUND])
+    return replace(run, table=run.table.iloc[int(first) : int(last)])
+
+
+# --- a run repeated on a robot, compared with the one that was measured first: the same table as for a simulator ------
+
+
+def compare_repeat(measured: Run, repeated: Run, robot: Robot | str | Path | None = None, segment: float = 1.0) -> ReplayResult:
+    """Compare a run with a repetition of it, channel by channel, from the first row of both on.
+
+    A robot cannot be put back to where it was at the start of each segment; what drifts in a log of joints and IMU are the
+    wheels' angles, and those count anew from each segment's start. Both runs carry sensor noise, so a perfect repetition
+    shows 1.4 noise units. Rows beyond the end of the repetition are not compared.
+
+    Args:
+        measured: the run whose setpoints were driven again.
+        repeated: what was logged then.
+        robot: whose sensors' noise; None = the one the run's meta data name.
+        segment: s.
+
+    Raises:
+        InputError: as :func:`wlr_gym.data.replay.replay`.
+    """
+    robot, _ = prepare(measured, robot, segment=segment)
+    t = measured["t"]
+    starts = segment_starts(t, segment)
+    own = repeated["t"] - repeated["t"][0]
+    full, pieces = {}, {}
+    for name in CHANNELS:
+        if name not in measured or name not in repeated:
+            continue
+        known = np.isfinite(repeated[name])
+        if not known.any():
+            continue
+        full[name] = np.interp(t - t[0], own[known], repeated[name][known], right=np.nan)
+        full[name][t - t[0] > own[-1]] = np.nan
+        turns = name in {f"pos_{joint}" for joint in WHEELS}
+        pieces[name] = _from_each_start(measured[name], full[name], starts) if turns else full[name]
+    errors = channel_errors(measured, full, pieces, channel_noise(robot))
+    return ReplayResult(measured, full, pieces, tuple(map(int, starts)), errors, robot, float(np.median(np.diff(own))), 0.0)
+
+
+def _from_each_start(measured: Array, repeated: Array, starts: NDArray[np.intp]) -> Array:
+    """Shift each segment of ``repeated`` so that it begins where ``measured`` does."""
+    shifted = repeated.copy()
+    for begin, end in zip(starts, [*starts[1:], len(measured)], strict=True):
+        shifted[begin:end] += measured[begin] - repeated[begin]
+    return shifted
+
+
+# --- simulate a run again from its record, bit for bit ----------------------------------------------------------------
+
+
+def simulated_parameters(run: Run, robot: Robot) -> Parameters:
+    """Return the parameters (1 robot) that a simulated run began with.
+
+    Raises:
+        InputError: no record beside the run, or a parameter that is unknown or out of bounds.
+    """
+    parameters = Parameters.nominal(robot)
+    _set(parameters, _record_of(run).parameters)
+    return parameters
+
+
+def simulate_again(run: Run, robot: Robot) -> dict[str, Array]:
+    """Simulate a run as it was: same plant, start, noise, parameters and setpoints; same bits on the same kind of machine.
+
+    Args:
+        run: a run with its record.
+        robot: the robot it is of.
+
+    Returns:
+        The channels of the robot's sensors, each (rows,).
+
+    Raises:
+        InputError: no record beside the run, or one that does not fit the table or the plant.
+    """
+    rows = [values for _, _, values in simulated_rows(run, robot)]
+    return dict(zip(sensed_columns(robot), np.array(rows).T, strict=True))
+
+
+def simulated_rows(run: Run, robot: Robot) -> Iterator[tuple[Parameters, Truth, Array]]:
+    """Yield what :func:`simulate_again` knows at each row of a run: parameters (1), truth (1), readings."""
+    record = _record_of(run)
+    names = ("control_period", "physics_step", "precision", "sensor_noise")
+    options = PlantOptions(**{name: getattr(record, name) for name in names})
+    setpoints = np.stack([run[name] for name in COMMANDS], axis=1)
+    parameters, columns = simulated_parameters(run, robot), sensed_columns(robot)
+    changes = {change.row: change.parameters for change in record.changes}
+    forces = load_patch(record.formulas).forces
+    plant = make_plant(record.backend, robot, 1, options, forces)
+    try:
+        sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=_state(record, run))
+        for row, wanted in enumerate(setpoints):
+            yield parameters, plant.truth(), channels(sensors, 0, columns)
+            if row in changes:
+                _set(parameters, changes[row])
+                plant.set_parameters(parameters)
+            torque_on = np.isfinite(wanted)
+            sensors = plant.step(np.nan_to_num(wanted)[None], None if torque_on.all() else torque_on[None])
+    finally:
+        plant.close()
+
+
+def _record_of(run: Run) -> Simulation:
+    if run.simulation is None:
+        raise InputError(f"{run.path}: no {simulation_path(run.path).name} beside it: not a simulated run, or not a whole one")
+    return run.simulation
+
+
+def _state(record: Simulation, run: Run) -> PlantState:
+    try:
+        return PlantState(**{name: np.array([value]) for name, value in record.start.items()})
+    except TypeError as error:
+        raise InputError(f"{simulation_path(run.path)}: start: {error}") from None
+
+
+def _set(parameters: Parameters, values: Mapping[str, Any]) -> None:
+    for name, value in values.items():
+        parameters[name] = value
+    parameters.validate()
+
+
+# --- overlay plots of a replay: measured, full run, segments ----------------------------------------------------------
+
+
+_JOINTS = [[f"{kind}_{joint}" for joint in joints] for joints in (LEGS, WHEELS) for kind in ("pos", "vel", "eff")]
+_BODY = [
+    ["gyro_x", "gyro_y", "gyro_z"],
+    ["acc_x", "acc_y", "acc_z"],
+    ["cam_x", "cam_y", "cam_yaw"],
+    ["cam_z", "cam_pitch", "volt"],
+]
+_CALM = 6.0  # noise units; flat channels are not blown up beyond this
+
+
+def save_plots(result: ReplayResult, folder: Path) -> list[Path]:
+    """Write ``<run>_joints.png`` and ``<run>_body.png`` and return their paths."""
+    return [
+        save(
+            _figure(result, grid, f"{result.run.name}: {name}, measured and replayed"), folder / f"{result.run.name}_{name}.png"
+        )
+        for name, grid in (("joints", _JOINTS), ("body", _BODY))
+    ]
+
+
+def _figure(result: ReplayResult, grid: list[list[str]], title: str) -> Figure:
+    grid = [row for row in grid if any(name in result.errors for name in row)]
+    figure = new_figure(5.2 * len(grid[0]), 2.1 * len(grid) + 0.9)
+    panels = figure.subplots(len(grid), len(grid[0]), squeeze=False, sharex=True)
+    for axes, name in zip(panels.flat, (name for row in grid for name in row), strict=True):
+        if name in result.errors:
+            _draw(axes, result, name)
+        else:
+            axes.set_axis_off()
+    for axes in panels[-1]:
+        axes.set_xlabel("time (s)")
+    handles, labels = next(axes for axes in panels.flat if axes.has_data()).get_legend_handles_labels()
+    figure.suptitle(title, fontsize=13)
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
+    return figure
+
+
+def _draw(axes: Axes, result: ReplayResult, name: str) -> None:
+    run, error = result.run, result.errors[name]
+    t = run["t"]
+    known = np.isfinite(run[name])
+    style: dict[str, Any] = (
+        {"marker": ".", "markersize": 2.5, "linestyle": ""} if COLUMNS[name].may_be_nan else {"linewidth": 2.2}
+    )
+    axes.plot(t[known], run[name][known], color=GREY, label="measured", **style)
+    axes.plot(t, result.full[name], color=ORANGE, linewidth=0.9, label="full run")
+    pieces = result.segments[name].copy()
+    pieces[list(result.starts)] = np.nan  # lift the pen between segments
+    axes.plot(t, pieces, color=BLUE, linewidth=0.9, label="segments")
+    low, high = axes.get_ylim()
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    if half < _CALM * error.noise:
+        axes.set_ylim(middle - _CALM * error.noise, middle + _CALM * error.noise)
+    ratio = error.segment_rms / error.noise
+    axes.set_title(f"{name}: segment error {error.segment_rms:.2g} {error.unit} = {ratio:.1f} x noise", fontsize=9)
+    axes.set_ylabel(error.unit)
+    tidy(axes)
+    axes.margins(x=0.01)

@@ -1,22 +1,62 @@
-"""Robot states of a run, from what it measures: where a replay starts, and where each of its segments starts again.
-
-What the run measures is taken from it, smoothed; the rest (height, attitude, servo references) comes from a background state.
-"""
+"""Pose of the body: attitude as quaternion and as angles, and how the body stands on four wheels."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
-from wlr_gym.data.read import Run
+from wlr_gym.data.runs import Run
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
 from wlr_gym.physics.servo import reference_per_effort, reference_per_rate
-from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
+from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
+
+
+def rest_pose(parameters: Parameters, legs: Array) -> Array:
+    """Return height of the body origin, pitch and roll (N, 3) that put four wheels on a flat floor, least squares.
+
+    Args:
+        parameters: (N).
+        legs: (N, 4) true leg angles, rad.
+    """
+    signs = np.array(CORNER_SIGNS)
+    hip, length, radius = parameters["hip.position"], parameters["leg.length"], parameters["wheel.radius"]
+    x = signs[:, 0] * hip[:, :1] + length * np.cos(legs)
+    y = signs[:, 1] * hip[:, 1:2] + np.zeros_like(legs)
+    z = hip[:, 2:] - length * np.sin(legs)
+    pose = np.zeros((len(legs), 3))
+    for _ in range(5):  # Gauss-Newton; the problem is almost linear
+        height, pitch, roll = pose[:, :1], pose[:, 1:2], pose[:, 2:]
+        up = np.sin(roll) * y + np.cos(roll) * z
+        gap = height - np.sin(pitch) * x + np.cos(pitch) * up - radius
+        along = np.cos(pitch) * (np.cos(roll) * y - np.sin(roll) * z)
+        slope = np.stack([np.ones_like(x), -np.cos(pitch) * x - np.sin(pitch) * up, along], axis=2)
+        pose = pose - np.einsum("nij,nj->ni", np.linalg.pinv(slope), gap)
+    return pose
+
+
+def euler_angles(q: Array) -> tuple[Array, Array, Array]:
+    """Yaw, pitch and roll (N,) of quaternions (N, 4), (w, x, y, z): Rz(yaw) Ry(pitch) Rx(roll), body to floor frame."""
+    w, x, y, z = q.T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1, 1))
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return yaw, pitch, roll
+
+
+def quaternion(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Quaternions (N, 4) of Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a / 2), np.sin(a / 2)) for a in (yaw, pitch, roll))
+    w, x = cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr
+    y, z = cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr
+    return np.stack([w, x, y, z], axis=1)
+
+
+# --- robot states of a run, from what it measures: where a replay starts, and where each of its segments starts again -
+
 
 #: s; half width of the window over which a joint or gyro reading is smoothed.
 JOINT_WINDOW = 0.07
@@ -188,3 +228,46 @@ def _rows_before_motion(run: Run) -> NDArray[np.bool_]:
     asked = np.any([np.nan_to_num(run[f"cmd_{joint}"]) != 0.0 for joint in WHEELS], axis=0)
     before = np.concatenate([[False], np.logical_or.accumulate(asked)[:-1]])
     return (run["t"] <= run["t"][0] + CAMERA_WINDOW) & ~before
+
+
+# --- where a robot went by its wheels and its gyroscope: for runs, and stretches of runs, that no camera saw ----------
+
+
+def rolled_poses(run: Run, robot: Robot) -> Array:
+    """Return x, y (m) and yaw (rad) of a robot that rolls without slip, (rows, 3); through each frame of the camera it passes.
+
+    Between frames it moves as the wheels roll, along the heading that the gyroscope has turned to; without a gyroscope, that
+    the wheels of both sides turn to, as if they did not skid.
+    """
+    t = run["t"]
+    steps, turns = _rolled(run, robot).mean(axis=1), _turns(run, robot)
+    poses = np.zeros((len(t), 3))
+    poses[:, 2] = np.cumsum(turns)
+    heading = poses[:, 2] - 0.5 * turns
+    poses[:, :2] = np.cumsum(steps[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    if not has_camera(run):
+        return poses
+    frames = np.flatnonzero(np.isfinite(run["cam_x"] + run["cam_y"] + run["cam_yaw"]))
+    seen = camera_pose(run).T
+    last = np.maximum(np.searchsorted(frames, np.arange(len(t)), side="right") - 1, 0)
+    anchors = frames[last]  # before the first frame: that one
+    turned = seen[anchors, 2] - poses[anchors, 2]
+    moved = poses[:, :2] - poses[anchors, :2]
+    cosine, sine = np.cos(turned), np.sin(turned)
+    x, y = cosine * moved[:, 0] - sine * moved[:, 1], sine * moved[:, 0] + cosine * moved[:, 1]
+    return np.stack([seen[anchors, 0] + x, seen[anchors, 1] + y, poses[:, 2] + turned], axis=1)
+
+
+def _rolled(run: Run, robot: Robot) -> Array:
+    """Return how far each wheel has rolled against the body in each row's step (rows, 4), m."""
+    angles = np.stack([run[f"pos_{wheel}"] + run[f"pos_{leg}"] for wheel, leg in zip(WHEELS, LEGS, strict=True)], axis=1)
+    return robot.wheel.radius * np.diff(angles, axis=0, prepend=angles[:1])
+
+
+def _turns(run: Run, robot: Robot) -> Array:
+    if "gyro_z" in run and np.isfinite(run["gyro_z"]).any():
+        known = np.isfinite(run["gyro_z"])
+        rate = np.interp(run["t"], run["t"][known], run["gyro_z"][known])
+        return rate * np.diff(run["t"], prepend=run["t"][0])
+    sides = np.array([sign for _, sign in CORNER_SIGNS])
+    return -(sides * _rolled(run, robot)).mean(axis=1) / robot.hip_position.y

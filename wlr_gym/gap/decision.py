@@ -15,8 +15,8 @@ from wlr_gym.base.files import alone_in, check_same_request, resumes, write_json
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import META_FILE
-from wlr_gym.data.read import read_meta, read_run, run_files
 from wlr_gym.data.replay import robot_of
+from wlr_gym.data.runs import read_meta, read_run, run_files
 from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED
 from wlr_gym.gap.report.result import DECIDED, NOTHING, RESULT_FILE, Explanation, Result, explanations, read_result
 from wlr_gym.gap.robot.next_run import TELLS, driven_already, most_shown, motions_to_drive, promises

@@ -377,8 +377,7 @@ def open_problem(
 
 def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | None) -> str | None:
     """Return what ``--robot`` takes for the robot that is analysed; None = nothing names it, or it is a rig."""
-    from wlr_gym.data.read import read_meta
-    from wlr_gym.data.robot_file import names_file, shipped_robots
+    from wlr_gym.data.runs import names_file, read_meta, shipped_robots
 
     if rig is not None:
         return None

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.read import Run
+from wlr_gym.data.runs import Run
 from wlr_gym.hardware.config import FlowCalibration
 from wlr_gym.hardware.flow import Flow, FlowReading
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot

@@ -20,10 +20,9 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
-from wlr_gym.data.logs.stream import McapStream
-from wlr_gym.data.robot_file import note_robot
-from wlr_gym.data.sensor_columns import LIVE_CAMERA, channels, sensed_columns
-from wlr_gym.data.write import write_meta
+from wlr_gym.data.logs.write import McapStream
+from wlr_gym.data.runs import note_robot, write_meta
+from wlr_gym.data.sensors import LIVE_CAMERA, channels, sensed_columns
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.safety.rules import Decision, RobotStatus
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors

@@ -14,7 +14,7 @@ from studies.bench.decide_table import markdown
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended
 from wlr_gym.data.excitations import excite
-from wlr_gym.data.read import read_run
+from wlr_gym.data.runs import read_run
 from wlr_gym.gap.report.result import Result
 
 decision = importlib.import_module("wlr_gym.gap.decision")

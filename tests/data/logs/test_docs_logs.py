@@ -6,10 +6,19 @@ from pathlib import Path
 import yaml
 
 from wlr_gym.base.settings import parse_config
-from wlr_gym.data.logs.display import DESCRIPTION, POSE, SLIP, TRANSFORMS
-from wlr_gym.data.logs.map import LogMap, resolve
-from wlr_gym.data.logs.messages import CAMERA_TOPIC, COMMANDS, IMU, JOINT_STATES, RUN, SUPPLY
-from wlr_gym.data.logs.units import CURRENTS, FACTORS
+from wlr_gym.data.logs.map import CURRENTS, FACTORS, LogMap, resolve
+from wlr_gym.data.logs.messages import (
+    CAMERA_TOPIC,
+    COMMANDS,
+    DESCRIPTION,
+    IMU,
+    JOINT_STATES,
+    POSE,
+    RUN,
+    SLIP,
+    SUPPLY,
+    TRANSFORMS,
+)
 from wlr_gym.robot import JOINTS, load_robot
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "own_logs.md").read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
 from wlr_gym.data.format import COLUMNS
 from wlr_gym.data.logs import import_log, suggest_joints, suggest_map
-from wlr_gym.data.logs.units import factor
+from wlr_gym.data.logs.map import factor
 from wlr_gym.physics.servo import current_law
 from wlr_gym.robot import JOINTS, load_robot
 

@@ -14,10 +14,8 @@ from wlr_gym.data import read_run
 from wlr_gym.data.logs import LogMap, import_log, read_logs, suggest_map
 from wlr_gym.data.logs.map import resolve
 from wlr_gym.data.logs.messages import make
-from wlr_gym.data.logs.parts import runs_of
-from wlr_gym.data.logs.rows import wanted_fields
-from wlr_gym.data.logs.topic_store import TopicStore
-from wlr_gym.data.logs.topics import Topic
+from wlr_gym.data.logs.rows import runs_of, wanted_fields
+from wlr_gym.data.logs.topics import Topic, TopicStore
 from wlr_gym.robot import WHEELS, load_robot
 
 
@@ -34,9 +32,9 @@ def known(messages, tmp_path_factory):
 @pytest.fixture
 def small(monkeypatch):
     """As if memory were small: parts of about 4 s, blocks of some messages, all of them on disk."""
-    monkeypatch.setattr("wlr_gym.data.logs.parts.NUMBERS", 12_000)
+    monkeypatch.setattr("wlr_gym.data.logs.rows.NUMBERS", 12_000)
     monkeypatch.setattr("wlr_gym.data.logs.open.BLOCK", 40)
-    monkeypatch.setattr("wlr_gym.data.logs.topic_store.IN_MEMORY", 10_000)
+    monkeypatch.setattr("wlr_gym.data.logs.topics.IN_MEMORY", 10_000)
 
 
 def rows_of_all(imported):
@@ -142,7 +140,7 @@ def test_what_is_refused_in_the_last_part_leaves_nothing(messages, known, tmp_pa
 
 
 def test_a_table_comes_in_parts_too(tmp_path, monkeypatch, small):
-    monkeypatch.setattr("wlr_gym.data.logs.csv_file.ROWS", 100)
+    monkeypatch.setattr("wlr_gym.data.logs.tables.ROWS", 100)
     path = tmp_path / "a.csv"
     lab_frame(made_up(12.0)).to_csv(path, index=False)
     found = suggest_map(path).map
@@ -152,7 +150,7 @@ def test_a_table_comes_in_parts_too(tmp_path, monkeypatch, small):
 
 
 def test_memory_does_not_grow_with_length(small, known, monkeypatch):
-    monkeypatch.setattr("wlr_gym.data.logs.parts.NUMBERS", 60_000)
+    monkeypatch.setattr("wlr_gym.data.logs.rows.NUMBERS", 60_000)
     content = known.model_dump(exclude_defaults=True)
     content["channels"] = {key: one for key, one in content["channels"].items() if one["topic"].startswith("/chassis")}
     found = LogMap.model_validate(content)

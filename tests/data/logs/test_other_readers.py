@@ -9,7 +9,7 @@ from foreign_logs import made_up, rows_of
 
 from wlr_gym.data import read_run
 from wlr_gym.data.logs import export_run
-from wlr_gym.data.write import write_run
+from wlr_gym.data.runs import write_run
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
 

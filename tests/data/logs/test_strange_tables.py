@@ -124,7 +124,7 @@ def test_a_value_that_is_no_number_is_left_out_and_said(tmp_path, frame):
 
 
 def test_long_tables_come_in_parts(tmp_path, frame, text, monkeypatch):
-    monkeypatch.setattr("wlr_gym.data.logs.csv_file.ROWS", 37)
+    monkeypatch.setattr("wlr_gym.data.logs.tables.ROWS", 37)
     monkeypatch.setattr("wlr_gym.data.logs.tables.ROWS", 37)
     lines = text.splitlines(keepends=True)
     lines[90:90] = [lines[0]]

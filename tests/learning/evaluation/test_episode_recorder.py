@@ -11,7 +11,7 @@ import wlr_gym  # noqa: F401
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.data import convert, read_dataset, read_run, simulate_again, simulated_parameters, write_run
-from wlr_gym.data.sensor_columns import SENSED
+from wlr_gym.data.sensors import SENSED
 from wlr_gym.learning.evaluation import EpisodeRecorder
 from wlr_gym.robot.parameters import Parameters
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.body_pose import quaternion
+from wlr_gym.data.run_states import quaternion
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.forces import (
     COORDINATES,

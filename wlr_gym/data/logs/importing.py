@@ -21,20 +21,16 @@ from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_table
 from wlr_gym.data.format import COLUMNS, REQUIRED, RunMeta
-from wlr_gym.data.logs.exported import read_exported
-from wlr_gym.data.logs.map import NO_PROFILE, LogMap, Resolved, map_text, read_map, resolve
+from wlr_gym.data.logs.map import CURRENTS, NO_PROFILE, LogMap, Resolved, check_effort, is_effort, map_text, read_map, resolve
 from wlr_gym.data.logs.messages import RUN
 from wlr_gym.data.logs.open import first_messages, quiet, read_logs, read_recordings
-from wlr_gym.data.logs.parts import runs_of, write_samples
-from wlr_gym.data.logs.rows import ChannelFact, MadeRun, wanted_fields
+from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields, write_samples
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
 from wlr_gym.data.logs.tables import TABLE
-from wlr_gym.data.logs.topic_store import TopicStore
-from wlr_gym.data.logs.topics import Log, Share
-from wlr_gym.data.logs.units import CURRENTS, check_effort, is_effort
+from wlr_gym.data.logs.topics import Log, Share, TopicStore
+from wlr_gym.data.logs.write import read_exported
 from wlr_gym.data.record import next_run
-from wlr_gym.data.robot_file import note_robot, noted, own_robot, robot_of_meta
-from wlr_gym.data.write import check_meta, write_meta, write_run
+from wlr_gym.data.runs import check_meta, note_robot, noted, own_robot, robot_of_meta, write_meta, write_run
 from wlr_gym.robot import Robot, load_robot, robot_hash
 
 MAP_FILE, RECORD_FILE = "map.yaml", "import.yaml"
@@ -95,7 +91,7 @@ def import_log(
         robot: that the runs are of: name or file; None = as the map's ``meta`` says (a path from the map file on, of a map
             that is no file from here), else the nominal one. It goes with the runs.
         split: s; a recording becomes runs of about this length, cut where the robot is quietest. None = one run, of long
-            recordings several (:data:`wlr_gym.data.logs.parts.LONGEST`).
+            recordings several (:data:`wlr_gym.data.logs.rows.LONGEST`).
         suffix: format of the runs.
         tell: called with the share that was read.
 

@@ -1,22 +1,119 @@
-"""What a log's topics and fields mean: the map from them to the channels of a run, as data."""
+"""Units that logs use: what one of them is in SI units."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_yaml
 from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
 from wlr_gym.data.logs.names import words
-from wlr_gym.data.logs.units import factor
-from wlr_gym.data.robot_file import names_file
+from wlr_gym.data.runs import names_file
+from wlr_gym.physics.servo import current_law, effort_counts
 from wlr_gym.robot import JOINTS, LEGS, Robot
+
+_TURN = 2.0 * math.pi
+_RPM = _TURN / 60.0
+_G = 9.80665
+
+#: SI unit -> unit -> factor. ``count`` is a count of a Dynamixel register of the X series; see :func:`factor`.
+FACTORS: dict[str, dict[str, float]] = {
+    "rad": {"rad": 1.0, "deg": math.radians(1.0), "turn": _TURN, "count": _TURN / 4096},
+    "rad/s": {
+        "rad/s": 1.0, "deg/s": math.radians(1.0), "rpm": _RPM, "turn/s": _TURN, "count": 0.229 * _RPM,
+    },
+    "N m": {"N m": 1.0, "mN m": 1e-3, "N cm": 1e-2},
+    "m/s2": {"m/s2": 1.0, "g": _G, "mg": _G * 1e-3},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "s": {"s": 1.0, "ms": 1e-3},
+    "V": {"V": 1.0, "mV": 1e-3},
+}  # fmt: skip
+#: Currents mean a torque by the robot's nominal torque constants; a count is one of Present Current (legs), Load (wheels).
+CURRENTS = ("A", "mA", "count")
+#: Efforts that are often larger than so many stall torques are in another unit.
+_STALLS = 2.0
+#: rad; a joint that moved by more shows its friction.
+_MOVED = 0.5
+
+
+def units_of(column: str) -> Iterable[str]:
+    """Return the units that a column may be in, in a log."""
+    unit = COLUMNS[column].unit
+    return [*FACTORS.get(unit, ()), *(CURRENTS if unit == "N m" else ())]
+
+
+def is_effort(column: str) -> bool:
+    """Whether a column is an effort."""
+    return column.startswith("eff_")
+
+
+def effort_range(column: str, robot: Robot) -> tuple[float, float]:
+    """Return the stall torque behind an effort column, and one count of its register, N m."""
+    joint = JOINTS.index(column.removeprefix("eff_"))
+    motor = robot.servo.leg if joint < len(LEGS) else robot.servo.wheel
+    return motor.stall_torque, float(effort_counts(robot)[joint])
+
+
+def check_effort(column: str, table: Mapping[str, NDArray[np.float64]], unit: str, robot: Robot, where: str) -> None:
+    """Refuse efforts that the robot's motor cannot have, and those in small units that its register would not show.
+
+    Args:
+        column: of the efforts.
+        table: of the run, in SI units.
+        unit: that the log is said to have them in.
+        robot: that the run is of.
+        where: for messages.
+
+    Raises:
+        InputError: naming file, column and value, and what was expected.
+    """
+    stall, count = effort_range(column, robot)
+    sizes, moved = np.nan_to_num(np.abs(table[column])), np.ptp(table[column.replace("eff", "pos")])
+    row = int(np.argmax(sizes))
+    text = f"{where}: row {row}, column '{column}': {table[column][row]:.3g} N m; expected"
+    if np.quantile(sizes, 0.95) > _STALLS * stall:
+        hint = "looks like mA, mN m or counts of a register, or another robot (--robot)"
+        raise InputError(f"{text} up to {stall:g}, the stall torque of robot '{robot.name}'; {hint}")
+    if unit in ("mA", "mN m") and 0.0 < sizes[row] < count and moved > _MOVED:
+        raise InputError(f"{text} more than {count:.2g}, one count of robot '{robot.name}'; looks like A or N m")
+
+
+def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
+    """Return what one ``unit`` of a column is in SI units, a count as the robot's encoders count; None = it is in SI units.
+
+    Raises:
+        InputError: no unit of this column.
+    """
+    si = COLUMNS[column].unit
+    if unit is None:
+        return 1.0
+    encoder = robot.sensors.encoder
+    of_encoder = {"rad": encoder.position, "rad/s": encoder.velocity}.get(si, 0.0)
+    if unit == "count" and of_encoder > 0.0:
+        return of_encoder
+    if unit in FACTORS.get(si, ()):
+        return FACTORS[si][unit]
+    if si not in FACTORS:
+        raise InputError(f"{where}: channel '{column}': unit '{unit}': expected none, it is a number from 0 to 1")
+    if si != "N m" or unit not in CURRENTS:
+        raise unknown_name("unit", unit, units_of(column), f"{where}: channel '{column}'")
+    joint = JOINTS.index(column.removeprefix("eff_"))
+    if unit == "count":
+        return float(effort_counts(robot)[joint])
+    return float(current_law(robot).torque_constant[joint]) * (1e-3 if unit == "mA" else 1.0)
+
+
+# --- what a log's topics and fields mean: the map from them to the channels of a run, as data -------------------------
+
 
 #: Names that stand for several channels.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -246,3 +343,36 @@ def _resolve(found: LogMap, column: str, source: ChannelSource, robot: Robot, wh
     return Resolved(
         column, source.topic, field, factor(column, unit, robot, where), sign, zero, unit or COLUMNS[column].unit, take
     )
+
+
+# --- what a run lacks, and what that costs the gap workflow -----------------------------------------------------------
+
+
+#: Channel or group of channels, all of it in words, and what an analysis loses without it.
+_COSTS = (
+    ("cmd", "cmd_* of all joints", "no run: every replay drives the simulator with the setpoints"),
+    ("pos", "pos_* of all joints", "no run: every replay is compared with the joints' angles"),
+    ("vel", "vel_* of all joints",
+     "rates come from angles alone: what a servo's velocity loop does shows less, errors of its reading not at all"),
+    ("eff_leg", "eff_* of the legs",
+     "torques of legs are seen by their motion only: friction and springs show less, torque constants not at all"),
+    ("eff_wheel", "eff_* of the wheels",
+     "torques of the wheels are seen by the wheels' motion only: rolling resistance and friction in the gear look alike"),
+    ("gyro", "gyro_* of x, y, z",
+     "turning is seen by the camera alone, pitch and roll hardly: masses, and slip in turns, show less"),
+    ("acc", "acc_* of x, y, z", "shocks and tilt are not seen: displaced masses, springs and slopes show less"),
+    ("cam", "cam_* of x, y, yaw",
+     "no way is measured: what floor and wheels do (friction, slip, radius) shows in turning and torques only"),
+    ("volt", "volt", "the supply counts as nominal: a weak or sagging one looks like weak motors"),
+)  # fmt: skip
+
+
+def costs(columns: Collection[str]) -> list[tuple[str, str]]:
+    """Return what is missing, as names of channels, and what each costs."""
+    found = []
+    for group, in_words, cost in _COSTS:
+        members = GROUPS.get(group, (group,))
+        missing = [name for name in members if name not in columns]
+        if missing:
+            found.append((in_words if len(missing) == len(members) else ", ".join(missing), cost))
+    return found

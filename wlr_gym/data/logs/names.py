@@ -39,7 +39,7 @@ class NameFacts:
         part: leg or wheel.
         quantity: pos, vel or eff.
         command: it is a setpoint.
-        unit: one of :mod:`wlr_gym.data.logs.units`.
+        unit: one of :mod:`wlr_gym.data.logs.map`.
     """
 
     corner: str | None

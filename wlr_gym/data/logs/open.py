@@ -7,11 +7,10 @@ from contextlib import closing
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.logs import bags, mcap_file
-from wlr_gym.data.logs.lerobot import INFO, read_lerobot
-from wlr_gym.data.logs.tables import TABLE, read_table
-from wlr_gym.data.logs.topic_store import BLOCK, TopicStore
-from wlr_gym.data.logs.topics import Collector, Log, Message, Share
+from wlr_gym.data.logs import bags
+from wlr_gym.data.logs import bags as mcap_file
+from wlr_gym.data.logs.tables import INFO, TABLE, read_lerobot, read_table
+from wlr_gym.data.logs.topics import BLOCK, Collector, Log, Message, Share, TopicStore
 
 #: Topic -> fields that are read; None = all topics and all their fields.
 Wanted = Mapping[str, Collection[str]]
@@ -74,12 +73,12 @@ def _is_table(path: Path) -> bool:
 def _reader(path: Path) -> Callable[..., Iterator[Message]]:
     if path.is_dir():
         if (path / bags.METADATA).is_file() or any(path.glob("*.db3")) or any(path.glob("*.mcap")):
-            return bags.messages
+            return bags.bag_messages
         raise InputError(f"{path}: no bag and no data set in it; expected {_KINDS}")
     if path.suffix.lower() == ".mcap":
-        return mcap_file.messages
+        return mcap_file.mcap_messages
     if path.suffix.lower() in (".db3", ".bag"):
-        return bags.messages
+        return bags.bag_messages
     raise InputError(f"{path}: '{path.suffix}' files are not read; expected {_KINDS}")
 
 

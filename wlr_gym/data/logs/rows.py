@@ -1,24 +1,228 @@
-"""Make a run of a log by a map: rows at the true times of one topic, and every sample of every channel beside them."""
+"""Headings and pitches from quaternions of a log, in whatever frame it has them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+import itertools
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, REQUIRED
-from wlr_gym.data.logs.joint_series import with_torque_off, without_wraps
 from wlr_gym.data.logs.map import LogMap, Resolved
-from wlr_gym.data.logs.poses import ANGLES, lost_frames, pose_angle, quaternion_names
-from wlr_gym.data.logs.takes import TAKES, bridged, hole
-from wlr_gym.data.logs.topics import LOG, Log
+from wlr_gym.data.logs.tables import TABLE
+from wlr_gym.data.logs.topics import LOG, Log, Share, Topic, TopicStore
+from wlr_gym.data.run_states import euler_angles
 from wlr_gym.robot import JOINTS, WHEELS
+from wlr_gym.robot.parameter_table import XYZ
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
+
+#: Angles that can be taken of a quaternion.
+ANGLES = ("yaw", "pitch", "roll", "tilt")
+
+
+def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> tuple[Times, Array]:
+    """Return times (ns) and an angle (rad) of a quaternion: ``yaw``, ``pitch``, ``roll``, or ``tilt`` off upright.
+
+    Lost frames, whose quaternion is no rotation, are left out.
+
+    Args:
+        topic: that has it.
+        field: name of the angle.
+        use: clock of the topic.
+        axes: axes of the log that our x, y and z are, of the floor's frame and of the body's; None = the same.
+        where: for messages.
+
+    Raises:
+        InputError: no such quaternion.
+    """
+    stem, _, angle = field.rpartition(".")
+    at, quaternion, lost = _rotations(topic, stem, use, where)
+    at, quaternion = at[~lost], quaternion[~lost]
+    w, *vector = (quaternion / np.linalg.norm(quaternion, axis=1)[:, None]).T
+    if axes is not None:  # a proper turn of both frames: the quaternion's vector turns with them
+        vector = [vector[XYZ.index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0) for axis in axes]
+    yaw, pitch, roll = euler_angles(np.stack([w, *vector], axis=1))
+    x, y, _ = vector
+    angles = {"yaw": yaw, "pitch": pitch, "roll": roll, "tilt": np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))}
+    values = angles[angle]
+    return at, np.unwrap(values) if angle == "yaw" else values
+
+
+def lost_frames(topic: Topic, field: str, use: str, where: str) -> Times:
+    """Return the times (ns) at which the quaternion of an angle is no rotation: not known, or of length 0.
+
+    Its message's position is not one, either. Of a field that is no angle of a quaternion there are none.
+    """
+    stem, _, angle = field.rpartition(".")
+    if field in topic.fields or angle not in ANGLES:
+        return np.zeros(0, np.int64)
+    at, _, lost = _rotations(topic, stem, use, where)
+    return at[lost]
+
+
+def _rotations(topic: Topic, stem: str, use: str, where: str) -> tuple[Times, Array, NDArray[np.bool_]]:
+    """Return times, quaternions (n, 4), and which of them are no rotations: of a table's row some parts may be missing."""
+    names = next((names for names in _quaternions(stem) if names[0] in topic.fields), _quaternions(stem)[0])
+    parts = [topic.series(name, use, where) for name in names]
+    every = np.unique(np.concatenate([at for at, _ in parts]))
+    quaternion = np.full((len(every), len(parts)), np.nan)
+    for part, (at, values) in enumerate(parts):
+        quaternion[np.searchsorted(every, at), part] = values
+    return every, quaternion, ~(np.linalg.norm(quaternion, axis=1) >= 0.5)
+
+
+def quaternion_names(stem: str) -> set[str]:
+    """Return the names that the parts of a quaternion may have."""
+    return {name for names in _quaternions(stem) for name in names}
+
+
+def _quaternions(stem: str) -> list[list[str]]:
+    """Return names of w, x, y and z of a quaternion.
+
+    Of ``q`` they are ``q.w``, or in tables ``q_w`` or ``qw``; a list without names says its order: ``q[xyzw]`` has its w in
+    ``q[3]``.
+    """
+    ordered = re.fullmatch(r"(.*)\[([wxyz]{4})\]", stem)
+    if ordered and sorted(ordered.group(2)) == list("wxyz"):
+        return [[f"{ordered.group(1)}[{ordered.group(2).index(part)}]" for part in "wxyz"]]
+    return [[f"{stem}{joint}{part}" for part in "wxyz"] for joint in (".", "_", "")]
+
+
+# --- what a channel has at the times of rows that are not its own samples': ways to take a value, and how far that move
+
+
+#: Usual steps between a channel's samples beyond which nothing is said of what lies between.
+_BRIDGED = 5.0
+#: s; holes up to this are bridged whatever the channel's rate.
+_SHORT = 0.1
+
+
+def hole(at: Times) -> float:
+    """Return how far samples (ns) may be apart, at most, so that they say what is between them, ns."""
+    return max(_BRIDGED * float(np.median(np.diff(at))), _SHORT * 1e9)
+
+
+def interpolated(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
+    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
+    width = (at[after] - at[after - 1]).astype(np.float64)
+    share = (times - at[after - 1]) / width
+    result = values[after - 1] + share * (values[after] - values[after - 1])
+    return np.where(bridged(times, at), result, np.nan), _rms(np.minimum(np.abs(share), np.abs(1.0 - share)) * width)
+
+
+def bridged(times: Times, at: Times) -> NDArray[np.bool_]:
+    """Whether the samples before and after each time say what was between them; a sample at the time itself does."""
+    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
+    usual = float(np.median(np.diff(at)))
+    width = (at[after] - at[after - 1]).astype(np.float64)
+    share = (times - at[after - 1]) / width
+    edge = 0.5 * usual / width  # the first and last half step are read off the line
+    inside = (share >= -edge) & (share <= 1.0 + edge) & (width <= hole(at))
+    return inside | (at[after] == times) | (at[after - 1] == times)
+
+
+def held(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
+    middle = times + round(0.5e9 * period)
+    place = np.clip(np.searchsorted(at, middle, side="right") - 1, 0, len(at) - 1)
+    return values[place], _rms((at[place] - times)[np.abs(at[place] - times) < 1e9 * period])
+
+
+def nearest(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
+    place = _next_to(times, at)
+    distance = np.abs(at[place] - times)
+    return np.where(distance <= hole(at), values[place], np.nan), _rms(distance)
+
+
+def framed(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
+    """Each frame goes to the row next to it, moved along the line to the next frame; the other rows get none."""
+    inside = (at >= times[0] - 0.5e9 * period) & (at <= times[-1] + 0.5e9 * period)
+    rows = np.unique(_next_to(at[inside], times))
+    result = np.full(len(times), np.nan)
+    result[rows] = interpolated(times[rows], at, values, period)[0]
+    distance = np.abs(times[rows] - at[_next_to(times[rows], at)])
+    return result, _rms(distance)
+
+
+def _next_to(times: Times, at: Times) -> NDArray[np.intp]:
+    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
+    return after - ((times - at[after - 1]) < (at[after] - times))
+
+
+def _rms(nanoseconds: NDArray[np.generic]) -> float:
+    return float(np.sqrt(np.mean(np.square(nanoseconds.astype(np.float64))))) * 1e-9 if len(nanoseconds) else 0.0
+
+
+#: Way -> function of rows' times, samples' times (ns), their values, and s between rows, which returns values at the rows and
+#: how far they were moved (s, rms); and what is said of it.
+TAKES = {
+    "interpolate": (interpolated, "interpolated"),
+    "hold": (held, "held at mid-step"),
+    "nearest": (nearest, "nearest sample"),
+    "frames": (framed, "next to frames"),
+}
+
+
+# --- what a log leaves open about joints: where a table says that a motor is off, and angles that start anew after a tu
+
+
+#: rad; an angle that stays within a turn, or little more, and jumps by so much between two samples starts anew after a turn.
+_TURN, _JUMP = 2.2 * np.pi, 1.5 * np.pi
+
+
+def with_torque_off(topic: Topic, setpoint: str, angle: str) -> Topic:
+    """Return a table whose rows with a joint's angle and an empty setpoint have NaN as setpoint: torque off.
+
+    Not where most setpoints stand in rows of their own, or alone between empty cells: those have another rate, and hold.
+    """
+    if topic.kind != TABLE or not {setpoint, angle} <= set(topic.fields):
+        return topic
+    (rows, values), measured = topic.fields[setpoint], topic.fields[angle][0]
+    off = np.setdiff1d(measured, rows)
+    place = np.searchsorted(measured, rows[np.isin(rows, measured)])
+    if len(rows) and (len(place) < max(2, len(rows) / 2) or np.median(np.diff(place)) > 1.0):
+        return topic
+    rows, values = np.concatenate([rows, off]), np.concatenate([values, np.full(len(off), np.nan)])
+    order = np.argsort(rows)
+    return replace(topic, fields={**topic.fields, setpoint: (rows[order], values[order])})
+
+
+def without_wraps(series: Mapping[str, tuple[Times, Array]], joint: str) -> tuple[Array, str]:
+    """Return a joint's angles, jumps undone where they start anew after a turn or half of one; and what is to be said of it.
+
+    Args:
+        series: channel -> times (ns) and values, SI units.
+        joint: name.
+    """
+    at, values = series[f"pos_{joint}"]
+    steps, gaps = np.abs(np.diff(values)), np.diff(at)
+    if np.ptp(values) >= _TURN or not (steps > np.pi).any():
+        return values, ""
+    if not ((steps > _JUMP) & (gaps <= hole(at))).any():
+        return values, f"'pos_{joint}': {(steps > np.pi).sum()} jumps of more than half a turn are left in"
+    rate = max(_fastest(series, f"{kind}_{joint}") for kind in ("cmd", "vel")) if joint in WHEELS else 0.0
+    unsure = gaps[rate * gaps * 1e-9 > np.pi]
+    if not len(unsure):
+        return np.unwrap(values), ""
+    where = f"between {len(unsure)} pairs of samples, up to {unsure.max() * 1e-9:.2g} s apart"
+    return np.unwrap(values), f"'pos_{joint}': turns are a guess {where}: at {rate:.3g} rad/s that may be more than half a turn"
+
+
+def _fastest(series: Mapping[str, tuple[Times, Array]], channel: str) -> float:
+    """Return the highest rate of a channel, rad/s; 0 where it is not known."""
+    rates = np.abs(series[channel][1]) if channel in series else np.zeros(0)
+    return float(rates[np.isfinite(rates)].max(initial=0.0))
+
+
+# --- make a run of a log by a map: rows at the true times of one topic, and every sample of every channel beside them -
+
 
 #: ns; channels that begin or end within this of the others shorten the run.
 _END = 1_000_000_000
@@ -364,3 +568,150 @@ def _taken(times: Times, at: Times, values: Array, source: Resolved, period: flo
     rate = 1e9 / float(np.median(np.diff(at)))
     known = float(np.isfinite(result).mean())
     return result, ChannelFact(source.column, source.topic, source.field, source.unit, rate, how, moved, known)
+
+
+# --- make runs of a recording, part by part: as much of it is in memory as a part needs; cuts are where the robot is qu
+
+
+#: s, and numbers of the log, that a part may have (250 s of 40 channels at 200 Hz); ``split`` may ask for longer ones.
+LONGEST, NUMBERS = 600.0, 2_000_000
+#: Share of a part's length by which a cut may be moved to where the robot is quieter.
+_PLAY = 0.25
+#: s that samples of a part go on at its ends.
+_AROUND = 0.1
+#: Usual steps, and s, from which on what is between two rows is a hole; s below which a piece between holes is no run.
+_HOLE, _LEAST_HOLE, _LEAST_PIECE = 5.0, 0.5, 1.0
+
+
+def runs_of(
+    recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], split: float | None, tell: Share
+) -> Iterator[MadeRun]:
+    """Yield the runs that a map makes of a recording.
+
+    One, or of one that is longer than :data:`LONGEST`, or has more than :data:`NUMBERS`, several; with ``split``, runs of about
+    so many seconds, none of them across a hole. What is to be said of all of them goes into the recording's notes.
+
+    Raises:
+        InputError: what :func:`wlr_gym.data.logs.rows.make_run` raises; parts without rows are left out, and said.
+    """
+    check_sources(recording.name, resolved)
+    edges = _edges(recording, found, resolved, split)
+    if len(edges) < 3:
+        yield from _parts(make_run(recording.whole(), found, resolved), split)
+        return
+    recording.notes.append(f"cut into {len(edges) - 1} parts, where the robot is quietest")
+    start, begin, refused = edges[0], edges[0], 0
+    for k, edge in enumerate(edges[1:], 1):
+        here = f"{(begin - start) * 1e-9:.0f} s on: "
+        play = round(_PLAY * min(edge - edges[k - 1], edges[k + 1] - edge)) if k + 1 < len(edges) else 0
+        try:
+            made, begin = _part_until(recording, found, resolved, (begin, edge), play)
+        except NoRowsError as error:
+            refused, begin = refused + 1, edge
+            if refused == len(edges) - 1:
+                raise
+            recording.notes.append(f"{here}no run: {str(error).partition(': ')[2]}")
+        else:
+            yield from _parts(replace(made, notes=tuple(here + note for note in made.notes)), split)
+        tell(k / (len(edges) - 1))
+
+
+def _part_until(
+    recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], span: tuple[int, int], play: int
+) -> tuple[MadeRun, int]:
+    """Return the rows of a span (ns), its end moved by up to ``play`` to where the robot is quiet, and that end."""
+    begin, edge = span
+    end = edge + play
+
+    def when(topic: str) -> tuple[str, int, int]:
+        clock = found.use(topic)
+        offset = round(clock.offset * 1e9)
+        return clock.use, begin - offset, end - offset
+
+    made = make_run(recording.between(when), found, resolved, (begin, end))
+    t, middle = made.table["t"], (edge - made.origin) * 1e-9
+    last = _quiet_row(made, middle, play * 1e-9 / _PLAY) if play and 0.0 < middle < t[-1] else 0
+    if last < 2:  # nothing to be cut
+        return _part(made, 0, len(t)), end
+    return _part(made, 0, last), made.origin + round(float(t[last]) * 1e9)
+
+
+def _edges(recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], split: float | None) -> list[int]:
+    """Return where parts begin and end, ns on the common clock; none where the recording is a part itself."""
+    rows = rows_topic(found, resolved)
+    if rows not in recording:
+        return []
+    clock = found.use(rows)
+    spans = recording.spans(rows, clock.use)
+    seconds = len(spans) * float(np.median([last - first for first, last in spans])) * 1e-9  # whatever a stray header says
+    longest = max(min(LONGEST, seconds * NUMBERS / max(recording.numbers, 1)), split or 0.0)
+    count = min(math.ceil(seconds / longest), len(spans)) if longest > 0.0 else 1
+    begins = sorted({first for first, _ in spans})
+    inner = [begins[k * len(begins) // count] for k in range(1, count)]
+    edges = sorted({begins[0], *inner, max(last for _, last in spans) + 1})
+    return [edge + round(clock.offset * 1e9) for edge in edges]
+
+
+# ---- cutting what is in memory ---------------------------------------------------------------------------------------
+
+
+def _parts(made: MadeRun, split: float | None) -> Iterator[MadeRun]:
+    """Yield a recording whole, or in parts of about ``split`` seconds, none of them across a hole."""
+    if split is None:
+        yield made
+        return
+    t = made.table["t"]
+    holes = np.flatnonzero(np.diff(t) > max(_HOLE * float(np.median(np.diff(t))), _LEAST_HOLE)) + 1
+    pieces = list(itertools.pairwise([0, *holes.tolist(), len(t)]))
+    kept = [(first, last) for first, last in pieces if t[last - 1] - t[first] >= _LEAST_PIECE] or pieces
+    if len(kept) < len(pieces):
+        text = f"{len(pieces) - len(kept)} pieces between holes are shorter than {_LEAST_PIECE:g} s and are left out"
+        made = replace(made, notes=(*made.notes, text))
+    for first, last in kept:
+        piece = made if len(pieces) == 1 else _part(made, first, last)
+        whole = float(piece.table["t"][-1])
+        count = max(round(whole / split), 1)
+        cuts = [_quiet_row(piece, k * whole / count, whole / count) for k in range(1, count)]
+        edges = [0, *cuts, len(piece.table["t"])]
+        for begin, end in itertools.pairwise(edges):
+            yield piece if len(edges) == 2 else _part(piece, begin, end)
+
+
+def _quiet_row(made: MadeRun, middle: float, length: float) -> int:
+    """Return the row near a time at which the joints are asked to move least."""
+    t = made.table["t"]
+    rows = np.flatnonzero(np.abs(t - middle) <= _PLAY * length)
+    motion = np.zeros(len(t))
+    for joint in JOINTS:
+        motion += np.abs(np.gradient(made.table[f"pos_{joint}"], t))
+    width = max(int(0.3 / float(np.median(np.diff(t)))), 1)
+    smooth = np.convolve(motion, np.ones(width) / width, mode="same")
+    cost = smooth[rows] + 0.01 * np.abs(t[rows] - middle) / length
+    return int(rows[np.argmin(cost)])
+
+
+def _part(made: MadeRun, first: int, last: int) -> MadeRun:
+    table = {name: values[first:last].copy() for name, values in made.table.items()}
+    begin, end = float(table["t"][0]), float(table["t"][-1])
+    samples = {}
+    for name, one in made.samples.items():
+        inside = (one.t >= begin - _AROUND) & (one.t <= end + _AROUND)
+        samples[name] = Samples(one.t[inside] - begin, one.values[inside])
+    for wheel in (f"pos_{wheel}" for wheel in WHEELS):  # wheels count from the run's start
+        start = table[wheel][0]
+        table[wheel] -= start
+        samples[wheel] = Samples(samples[wheel].t, samples[wheel].values - start)
+    table["t"] -= begin
+    return replace(made, table=table, samples=samples, origin=made.origin + round(begin * 1e9))
+
+
+def write_samples(path: Path, made: MadeRun) -> None:
+    """Write every sample at its own time: channel, t (s, the run's clock), value (SI units)."""
+    import pyarrow
+    import pyarrow.parquet
+
+    schema = pyarrow.schema([("channel", pyarrow.string()), ("t", pyarrow.float64()), ("value", pyarrow.float64())])
+    with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        for name, one in made.samples.items():
+            columns = [pyarrow.array([name] * len(one.t)), pyarrow.array(one.t), pyarrow.array(one.values)]
+            writer.write_table(pyarrow.table(columns, schema=schema))

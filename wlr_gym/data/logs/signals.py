@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from wlr_gym.data.format import CAMERA
 from wlr_gym.data.logs.candidates import FieldCandidate
 from wlr_gym.data.logs.map import LogMap, TopicClock
-from wlr_gym.data.logs.poses import lost_frames, pose_angle
+from wlr_gym.data.logs.rows import lost_frames, pose_angle
 from wlr_gym.data.logs.topics import HEADER, LOG, Log
 from wlr_gym.robot import Robot
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.data.check import integral
 from wlr_gym.data.logs.align import Lag, find_lag
-from wlr_gym.data.logs.poses import pose_angle
+from wlr_gym.data.logs.map import FACTORS
+from wlr_gym.data.logs.rows import pose_angle
 from wlr_gym.data.logs.signals import (
     GUESS,
     LIKELY,
@@ -22,7 +23,6 @@ from wlr_gym.data.logs.signals import (
     unit_of,
 )
 from wlr_gym.data.logs.suggest_joints import JointFindings, angle
-from wlr_gym.data.logs.units import FACTORS
 from wlr_gym.robot import LEGS, WHEELS
 from wlr_gym.robot.parameter_table import XYZ
 from wlr_gym.robot.parameters import Parameters

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.check import integral
+from wlr_gym.data.logs.map import FACTORS, effort_range, factor, units_of
 from wlr_gym.data.logs.names import words
 from wlr_gym.data.logs.signals import (
     GUESS,
@@ -23,7 +24,6 @@ from wlr_gym.data.logs.signals import (
     over_windows,
     unit_of,
 )
-from wlr_gym.data.logs.units import FACTORS, effort_range, factor, units_of
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 from wlr_gym.robot.parameters import Parameters
 

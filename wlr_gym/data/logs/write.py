@@ -2,21 +2,45 @@
 
 from __future__ import annotations
 
+import queue
 import shutil
+import sys
 import tempfile
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import replace_file
+from wlr_gym.base.settings import parse_config
 from wlr_gym.base.text import row_words
-from wlr_gym.data.logs.display import display_messages
-from wlr_gym.data.logs.messages import Sent, clock_offset, definition, nanoseconds, row_messages, run_message, typestore
-from wlr_gym.data.read import Run
-from wlr_gym.data.robot_file import own_robot
+from wlr_gym.data.format import COMMANDS, RunMeta
+from wlr_gym.data.logs.messages import (
+    JOINT_STATES,
+    PLACES,
+    RUN,
+    Sent,
+    clock_offset,
+    definition,
+    display_messages,
+    nanoseconds,
+    read_content,
+    row_messages,
+    run_message,
+    seconds,
+    typestore,
+)
+from wlr_gym.data.logs.open import quiet, read_logs
+from wlr_gym.data.logs.topics import LOG, Log, Share
+from wlr_gym.data.runs import Run, Simulation, is_shipped, own_robot
+from wlr_gym.robot import Robot, load_robot
 
 #: Formats by name, and the suffix of what is written.
 FORMATS = {"mcap": ".mcap", "rosbag2": ".bag2"}
@@ -95,9 +119,9 @@ def messages_of(run: Run) -> Iterator[Sent]:
     shown = display_messages(run, times)
     names = [name for name in columns if name != "t"]
     values = np.stack([run[name] for name in names], axis=1).tolist()
-    for time, row in zip(times, values, strict=True):
-        yield from row_messages(dict(zip(names, row, strict=True)), time)
-        yield from shown.get(time, ())
+    for at, row in zip(times, values, strict=True):
+        yield from row_messages(dict(zip(names, row, strict=True)), at)
+        yield from shown.get(at, ())
 
 
 def _write_mcap(path: Path, run: Run) -> None:
@@ -127,3 +151,184 @@ def _write_rosbag(path: Path, run: Run) -> None:
             shutil.move(bag, path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+# --- write a run into an MCAP file while it goes on, without holding up what makes it ---------------------------------
+
+
+#: Rows that may wait to be written: 20 s at 50 Hz. Beyond, rows are left out: whoever makes them never waits.
+WAITING = 1000
+#: s between two flushes: of a process that is killed, all before the last one can be read.
+FLUSH = 0.5
+#: s after which the writing thread gives way to the one that drives the robot; Python's own choice is 5 ms.
+SWITCH = 0.0005
+#: s that the rest may take to be written at the end.
+_LAST = 10.0
+
+
+class McapStream:
+    """Writes rows into an MCAP file, in a thread of its own. Use as a context manager.
+
+    Args:
+        path: a new file.
+        columns: names of the channels of each row, without ``t``.
+        meta: of the run.
+        robot: whose run it is.
+
+    Attributes:
+        left_out: rows that came while too many waited.
+        trouble: why nothing is written any more; empty = all is well.
+
+    Raises:
+        InputError: the file is there, or cannot be made.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], meta: RunMeta, robot: Robot | None = None) -> None:
+        self.path, self.columns, self.meta = path, tuple(columns), meta
+        self._robot = None if robot is None or is_shipped(robot) else robot
+        self.left_out = 0
+        self.trouble = ""
+        self._offset: int | None = None
+        self._rows: queue.Queue[tuple[float, list[float]]] = queue.Queue(WAITING)
+        self._over = threading.Event()
+        self._flushed = time.monotonic()
+        run = run_message(columns, 0, 0, meta)  # what first messages compile and look up is done now, not while it drives
+        for message in (run, *row_messages(dict.fromkeys((*COMMANDS, *columns), 0.0), 0)):
+            definition(message.kind)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("xb")
+        except FileExistsError:
+            raise InputError(f"{path}: is there already; a stream goes into a new file") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        self._sink = McapSink(self._file)
+        self._thread = threading.Thread(target=self._write_all, name="mcap", daemon=True)
+
+    def __enter__(self) -> McapStream:
+        self._thread.start()
+        self._switch = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        sys.setswitchinterval(self._switch)
+        self._over.set()  # no word in the queue: it may be full, and nobody left to empty it
+        self._thread.join(_LAST)
+        if self._thread.is_alive():
+            self.trouble = f"{self.path}: not all is written after {_LAST:g} s"
+
+    def add(self, t: float, values: Sequence[float]) -> None:
+        """Hand over a row: time (s), and a value per channel. Never waits."""
+        try:
+            self._rows.put_nowait((t, list(values)))
+        except queue.Full:
+            self.left_out += 1
+
+    def _write_all(self) -> None:
+        try:
+            self._write_rows()
+        except Exception as error:  # whatever it is, it stops no robot
+            self.trouble = f"{self.path}: {error or type(error).__name__}"
+
+    def _write_rows(self) -> None:
+        try:
+            while (row := self._next()) is not None:
+                self._write(*row)
+            self._sink.finish()
+        finally:
+            self._file.close()
+            if self._offset is None:  # no row came: there is no run
+                self.path.unlink(missing_ok=True)
+
+    def _next(self) -> tuple[float, list[float]] | None:
+        """Wait for a row and return it; None = the run is over, and all its rows are written."""
+        while True:
+            over = self._over.is_set()  # asked first: what came before is in the queue
+            try:
+                return self._rows.get(timeout=0.05)
+            except queue.Empty:
+                if over:
+                    return None
+
+    def _write(self, t: float, values: Sequence[float]) -> None:
+        if self._offset is None:
+            self._offset = clock_offset(t)
+            self._sink.add(
+                run_message(
+                    ["t", *self.columns],
+                    nanoseconds(t, self._offset),
+                    self._offset,
+                    self.meta,
+                    name=self.path.stem,
+                    robot=self._robot,
+                )
+            )
+        for message in row_messages(dict(zip(self.columns, values, strict=True)), nanoseconds(t, self._offset)):
+            self._sink.add(message)
+        if time.monotonic() - self._flushed > FLUSH:
+            self._sink.flush()
+            self._flushed = time.monotonic()
+
+
+# --- read back runs that :mod:`wlr_gym.data.logs.write` wrote: channels to the bit, times to 1 ns ---------------------
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedRun:
+    """A run as it was exported.
+
+    Attributes:
+        table: columns by name, (rows,).
+        meta, simulation: what stood beside it.
+        robot: whose run it is, where it travelled by content.
+        notes: what is odd about the file.
+    """
+
+    table: dict[str, Array]
+    meta: RunMeta
+    simulation: Simulation | None
+    robot: Robot | None
+    notes: tuple[str, ...]
+
+
+def read_exported(path: str | Path, tell: Share = quiet) -> ExportedRun:
+    """Read a run back from an MCAP file or a rosbag2 of :func:`wlr_gym.data.logs.write.export_run`.
+
+    Raises:
+        InputError: no such file, or another program's.
+    """
+    fields: dict[str, set[str]] = {RUN: set()}
+    for topic, field in PLACES.values():
+        fields.setdefault(topic, set()).add(field)
+    (log,) = read_logs(path, fields, tell=tell)
+    if RUN not in log.topics or not log.topics[RUN].text:
+        raise InputError(f"{path}: no message on '{RUN}': another program's log; import it with a map")
+    content = read_content(log.topics[RUN].text, log.name)
+    if JOINT_STATES not in log.topics:
+        raise InputError(f"{log.name}: no message on '{JOINT_STATES}': the run has no row")
+    times = log.topics[JOINT_STATES].clock(LOG)
+    table = {"t": np.array([seconds(int(time), content["clock_offset"]) for time in times])}
+    for column in content["columns"]:
+        if column != "t":
+            table[column] = _column(log, column, times)
+    meta = parse_config(RunMeta, content["meta"], f"{log.name}, topic '{RUN}', meta")
+    record = content["simulation"]
+    simulation = parse_config(Simulation, record, f"{log.name}, topic '{RUN}', simulation") if record else None
+    robot = load_robot(content["robot"]) if content.get("robot") else None
+    return ExportedRun(table, meta, simulation, robot, log.notes)
+
+
+def _column(log: Log, column: str, times: NDArray[np.int64]) -> Array:
+    """Values at the rows' times; NaN where a row's message is not there."""
+    topic, field = PLACES[column]
+    values = np.full(len(times), np.nan)
+    if topic in log.topics and field in log.topics[topic].fields:
+        at, found = log.topics[topic].series(field, LOG, log.name)
+        rows = np.minimum(np.searchsorted(times, at), len(times) - 1)
+        mine = times[rows] == at  # of a file that was cut off, a row may lack some of its messages
+        values[rows[mine]] = found[mine]
+    return values

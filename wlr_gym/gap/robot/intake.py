@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.data.check import increments
 from wlr_gym.data.format import COMMANDS
-from wlr_gym.data.read import Run
+from wlr_gym.data.runs import Run
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.physics import servo
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import Profile
-from wlr_gym.data.read import Run, read_run
 from wlr_gym.data.record import motion_of, record_simulation
+from wlr_gym.data.runs import Run, read_run
 from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.result import NOTHING, AdequacyEntry, Explanation, Result

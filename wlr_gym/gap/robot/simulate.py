@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.jobs import in_threads
-from wlr_gym.data.body_pose import euler_angles, quaternion, rest_pose
 from wlr_gym.data.replay import profile_parameters
+from wlr_gym.data.run_states import euler_angles, quaternion, rest_pose
 from wlr_gym.gap.robot.replay_loop import POSE_TICKS, Recorder, Replays, WrittenSetpoints, follower
 from wlr_gym.gap.robot.windows import CLOCK, Anchors, RunClock
 from wlr_gym.physics.plants import drive, ground, make_plant

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.format import CHANNELS, COMMANDS
-from wlr_gym.data.read import Run
 from wlr_gym.data.replay import held_setpoints
 from wlr_gym.data.run_states import (
     CAMERA_WINDOW,
@@ -26,6 +25,7 @@ from wlr_gym.data.run_states import (
     start_state,
     starts_at_rest,
 )
+from wlr_gym.data.runs import Run
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters

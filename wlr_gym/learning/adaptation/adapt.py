@@ -15,8 +15,8 @@ from wlr_gym.base.files import alone_in
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.settings import parse_config, parse_options, read_yaml
 from wlr_gym.data.excitations import excite
-from wlr_gym.data.read import run_files
 from wlr_gym.data.record import same_profile
+from wlr_gym.data.runs import run_files
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED

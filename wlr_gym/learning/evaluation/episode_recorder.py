@@ -10,9 +10,8 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_text
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
-from wlr_gym.data.sensor_columns import channels, sensed_columns
-from wlr_gym.data.simulation_record import ParameterChange, Simulation, departures, start_of
-from wlr_gym.data.write import write_run
+from wlr_gym.data.runs import ParameterChange, Simulation, departures, start_of, write_run
+from wlr_gym.data.sensors import channels, sensed_columns
 from wlr_gym.learning.evaluation.rollout import roll_out
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import FIRST_WHEEL

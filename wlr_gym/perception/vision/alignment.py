@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.body_pose import quaternion, rest_pose
-from wlr_gym.data.read import Run
+from wlr_gym.data.run_states import quaternion, rest_pose
+from wlr_gym.data.runs import Run
 from wlr_gym.perception.vision.smoothing import smooth
 from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters

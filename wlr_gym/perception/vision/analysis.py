@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import replace_file, write_json
 from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, tidy
-from wlr_gym.data.body_pose import rest_pose
-from wlr_gym.data.read import Run
 from wlr_gym.data.replay import robot_of
-from wlr_gym.data.robot_file import own_robot
-from wlr_gym.data.write import write_run
+from wlr_gym.data.run_states import rest_pose
+from wlr_gym.data.runs import Run, own_robot, write_run
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.pose import sheet_fault

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.read import Run
+from wlr_gym.data.runs import Run
 from wlr_gym.perception.vision.alignment import readings, without_slow
 from wlr_gym.perception.vision.motion import smoothed_poses
 from wlr_gym.perception.vision.self_calibration import UNSURE

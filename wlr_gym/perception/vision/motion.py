@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.body_pose import rest_pose
-from wlr_gym.data.read import Run
+from wlr_gym.data.run_states import rest_pose
+from wlr_gym.data.runs import Run
 from wlr_gym.perception.observer.slip_filter import leak_noise, rate_noise, shaking
 from wlr_gym.perception.observer.state import constants
 from wlr_gym.perception.vision.alignment import repeated

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.body_pose import quaternion
-from wlr_gym.data.read import Run
+from wlr_gym.data.run_states import quaternion
+from wlr_gym.data.runs import Run
 from wlr_gym.perception.vision.alignment import joint_signals, repeated
 from wlr_gym.perception.vision.imu_check import imu_compared
 from wlr_gym.perception.vision.motion import (
