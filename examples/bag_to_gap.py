@@ -1,9 +1,10 @@
 """From bags to a gap report: ``report_on`` is all of it. Three minutes (``--quick``: imports only, some seconds).
 
-Give bags of your robot (.mcap, .db3, .bag, folders of rosbag2, CSV): what they hold is proposed from names and numbers; look at
-``runs/map.yaml`` before you believe the rest (docs/own_logs.md). Without any, bags of a simulated robot with a fault are made.
+Give bags of your robot (.mcap, .db3, .bag, folders of rosbag2, CSV), and a map of what their fields mean: ``wlr import BAG
+--suggest`` writes one that asks what names leave open (docs/own_logs.md). Without any, bags of a simulated robot with a fault are
+made.
 
-    python examples/bag_to_gap.py [BAG ...] [--quick]
+    python examples/bag_to_gap.py [BAG ... --map map.yaml] [--quick]
 """
 
 import argparse
@@ -23,9 +24,9 @@ effects:
 """
 
 
-def report_on(bags: Sequence[Path], folder: Path) -> None:
+def report_on(bags: Sequence[Path], folder: Path, map_file: Path | None = None) -> None:
     for bag in bags:
-        import_log(bag, folder / "runs")
+        import_log(bag, folder / "runs", map_file)
     result = wlr_gym.analyse(folder / "runs", folder / "report", threads=2)
     print(f"{result.verdict}: {', '.join(effect.name for effect in result.effects)}; {folder / 'report' / 'report.html'}")
 
@@ -41,10 +42,11 @@ def made_bags(folder: Path, motions: Sequence[str]) -> list[Path]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bags", nargs="*", type=Path)
+    parser.add_argument("--map", type=Path, help="what topics and fields mean")
     parser.add_argument("--quick", action="store_true", help="a made bag, imported and not analysed")
     options = parser.parse_args()
     if options.bags:
-        report_on(options.bags, Path("from_bags"))
+        report_on(options.bags, Path("from_bags"), options.map)
         return
     with tempfile.TemporaryDirectory() as name:
         if options.quick:

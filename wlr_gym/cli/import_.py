@@ -1,7 +1,8 @@
 """Import logs of other programs as measured runs: MCAP, rosbag2, rosbag1, CSV, Parquet and LeRobot data sets; no ROS needed.
 
-A map says which topics and fields are which channels. --suggest proposes one from names, types and the numbers themselves, says
-how sure it is, and writes it; with --out it is used at once. What wlr export --to has written needs no map.
+A map says which topics and fields are which channels. --suggest proposes one from names and types, and writes it. What these
+leave open (units, signs, mounting, clocks), it asks there, line by line, with what the log shows. Runs are made from a complete
+map only. What wlr export --to has written needs no map.
 """
 
 from __future__ import annotations
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from wlr_gym.data.logs import ImportedRun, Proposal
-
-_COLOURS = {"sure": "green", "likely": "yellow", "guess": "red"}
 
 
 @dataclass(frozen=True)
@@ -62,14 +61,18 @@ def run(options: ImportOptions) -> int:
 
     _check(options)
     console = Console(soft_wrap=True, highlight=False)
-    given: dict[str, Any] | None = read_map(options.map) if options.map is not None else None
+    given: Path | dict[str, Any] | None = options.map
     if options.suggest:
-        found = _suggest(options, given or {}, console)
+        found = _suggest(options, read_map(options.map) if options.map is not None else {}, console)
         if options.out is None:
             if options.json:
-                print_json({"map": found})
+                print_json({"map": found.content, "open": found.open})
             return OK
-        given = found
+        if found.open:
+            count = f"{len(found.open)} entries of the map are open" if len(found.open) > 1 else "an entry of the map is open"
+            again = f"replace each 'open', then: wlr import {options.log[0]} --out {options.out}"
+            raise InputError(f"{options.out / MAP_FILE}: no run is made, {count}: {', '.join(found.open)}; {again}")
+        given = found.content
     assert options.out is not None
     if given is None and not (options.out / MAP_FILE).is_file():
         for log in options.log:
@@ -105,30 +108,25 @@ def _reading(console: Console, log: Path) -> Iterator[Callable[[float], None]]:
 # ---- the proposed map ------------------------------------------------------------------------------------------------
 
 
-def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) -> dict[str, Any]:
-    """Propose, print and write a map; return what it says."""
+def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) -> Proposal:
+    """Propose, print and write a map."""
     from wlr_gym.data.logs import suggest_map
     from wlr_gym.data.logs.importing import MAP_FILE, write_map
-    from wlr_gym.data.logs.map import content
+    from wlr_gym.data.logs.map import GROUPS
 
     target = (options.out or Path()) / MAP_FILE
     with _reading(console, options.log[0]) as tell:
         found = suggest_map(options.log[0], given, options.robot, tell)
-    _print_proposal(found, console)
-    make_output_folder(target.parent)
-    write_map(target, found.map)
-    console.print(f"written: {target}", markup=False)
-    return content(found.map)
-
-
-def _print_proposal(found: Proposal, console: Console) -> None:
-    from wlr_gym.data.logs.map import GROUPS
-
-    rows = [(reason.what, reason.sure, reason.why) for reason in found.reasons]
-    print_table(console, ("of the map", "how sure", "why"), rows, styles=[_COLOURS[reason.sure] for reason in found.reasons])
+    rows = [(line.place, "open" if line.asks else "decided", line.why) for line in found.lines]
+    styles = ["yellow" if line.asks else "green" for line in found.lines]
+    print_table(console, ("of the map", "", "what the log shows"), rows, styles=styles)
     if found.unused:
         console.print(f"not used: {', '.join(found.unused)}", style="dim", markup=False)
-    _print_costs({column for key in found.map.channels for column in GROUPS.get(key, (key,))}, console)
+    _print_costs({column for key in found.content.get("channels", {}) for column in GROUPS.get(key, (key,))}, console)
+    make_output_folder(target.parent)
+    write_map(target, found)
+    console.print(f"written: {target}", markup=False)
+    return found
 
 
 def _print_costs(columns: set[str], console: Console) -> None:

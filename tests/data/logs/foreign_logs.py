@@ -7,6 +7,8 @@ import numpy as np
 import pandas
 
 from wlr_gym.data.format import COMMANDS
+from wlr_gym.data.logs import suggest_map
+from wlr_gym.data.logs.map import OPEN, LogMap, parse_map
 from wlr_gym.data.logs.messages import header, make, nanoseconds, typestore
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
 
@@ -136,6 +138,33 @@ def lab_messages(table, offset=0.037, imu_axes=((0, 1), (1, 1), (2, 1)), names=N
         if k % 40 == 0:
             out.append((ns(t), "/power", BATTERY, battery(ns(t), table["volt"][k])))
     return sorted(out, key=lambda one: one[0])
+
+
+#: Units of the laboratory's bags, and of its tables, where names do not state them.
+_UNITS = {"pos": "deg", "vel": "deg/s", "cmd_leg": "deg", "cmd_wheel": "deg/s", "eff": "N m", "gyro": "deg/s"}
+_OF_TABLES = {"pos": "rad", "vel": "rad/s", "cmd_leg": "rad", "cmd_wheel": "rad/s", "gyro": "rad/s", "acc": "g"}
+
+
+def lab_map(log, given=None, **units) -> LogMap:
+    """Return the map that is proposed for a log of the laboratory, its questions answered, but not that for the profile."""
+    content = suggest_map(log, given).content
+    for key, entry in content["channels"].items():
+        known = {**_UNITS, **(_OF_TABLES if entry["topic"] == "table" else {}), **units}
+        if entry.get("unit") == OPEN:
+            name = max((one for one in known if key.startswith(one)), key=len)
+            entry["unit"] = known[name]
+        if entry.get("sign") == OPEN:
+            entry["sign"] = 1
+    for joint, entry in content.get("joints", {}).items():
+        answers = {"sign": 1, "zero": 0.0}
+        content["joints"][joint] = {key: answers[key] if one == OPEN else one for key, one in entry.items()}
+    if content.get("frames", {}).get("imu") == OPEN:
+        content["frames"]["imu"] = ["x", "y", "z"]
+    for topic, clock in content.get("clocks", {}).items():
+        content["clocks"][topic] = {"offset": -0.037} if clock == OPEN else clock
+    if content.get("meta", {}).get("profile") == OPEN:
+        del content["meta"]["profile"]
+    return parse_map(content, "map")
 
 
 def write_rosbag2(path, messages, storage="sqlite3"):

@@ -1,5 +1,6 @@
 """What is wrong with a log is said: the file, the topic, the field."""
 
+import re
 import sqlite3
 
 import numpy as np
@@ -9,6 +10,7 @@ from foreign_logs import (
     RATE,
     joint_state,
     lab_frame,
+    lab_map,
     lab_messages,
     made_up,
     ns,
@@ -35,7 +37,7 @@ def mcap(messages, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def known(mcap):
-    return content(suggest_map(mcap).map)
+    return content(lab_map(mcap))
 
 
 def test_no_such_file(tmp_path):
@@ -111,7 +113,7 @@ def test_a_topic_or_field_that_is_not_there(mcap, known, tmp_path):
 
 
 def test_a_wrong_unit_is_said_with_topic_and_field(mcap, known, tmp_path):
-    wrong = {**known, "channels": {**known["channels"], "pos": {"topic": "/chassis/joints", "field": "position[{joint}]"}}}
+    wrong = {**known, "channels": {**known["channels"], "pos_leg": {"topic": "/chassis/joints", "field": "position[{joint}]"}}}
     message = (
         r"lab.mcap: row \d+, column 'pos_leg_lf': .* looks like degrees \(from topic '/chassis/joints', field 'position\[FL_h"
     )
@@ -143,11 +145,9 @@ def test_mixed_units_are_said(tmp_path):
         message = joint_state(ns(table["t"][k]), NAMES.values(), position)
         messages.append((ns(table["t"][k]), "/joints", "sensor_msgs/msg/JointState", message))
     found = suggest_map(write_mcap(tmp_path / "mixed.mcap", messages))
-    (said,) = [reason for reason in found.reasons if reason.what == "pos_leg"]
-    assert said.sure == "guess"
-    assert "mixed units in topic '/joints': position[FL_hip] in deg, position[FR_hip] in rad" in said.why
-    assert found.map.channels["pos_leg_lf"].unit == "deg"
-    assert found.map.channels["pos_leg_rf"].unit is None
+    (said,) = [line for line in found.lines if line.place == "channels.pos_leg"]
+    assert said.asks
+    assert re.search(r"leg_lf 89\.\d+ to \d+.*; leg_rf 1\.\d+ to \d", said.why)
 
 
 def test_two_robots_in_one_bag(messages, tmp_path):
@@ -157,7 +157,7 @@ def test_two_robots_in_one_bag(messages, tmp_path):
         InputError, match=r"two.mcap: two robots: topics .*say which in the map: namespace: /alpha  \(or /beta\)"
     ):
         suggest_map(bag)
-    found = suggest_map(bag, {"namespace": "/beta"}).map
+    found = lab_map(bag, {"namespace": "/beta"})
     assert {source.topic for source in found.channels.values()} == {
         "/beta/chassis/joints", "/beta/chassis/target", "/beta/xsens/data", "/beta/mocap/base", "/beta/power",
     }  # fmt: skip
@@ -190,10 +190,16 @@ def test_a_type_without_a_definition_is_left_out_and_said(messages, tmp_path):
     assert any("topic '/power': type 'lab_msgs/msg/Power': the file does not define it" in note for note in log.notes)
 
 
-def test_setpoints_that_are_not_there(messages, tmp_path):
-    bag = write_mcap(tmp_path / "a.mcap", [one for one in messages if one[1] != "/chassis/target"])
-    with pytest.raises(InputError, match=r"no source for cmd_leg_lf, .*: the setpoints that drove the robot"):
-        import_log(bag, tmp_path / "runs")
+@pytest.mark.parametrize(
+    ("topic", "kind", "message"),
+    [("target", "cmd", "the setpoints that drove the robot"), ("joints", "pos", "the joints' angles")],
+)
+def test_what_every_run_needs_is_asked_and_a_map_without_it_is_refused(messages, known, tmp_path, topic, kind, message):
+    bag = write_mcap(tmp_path / "a.mcap", [one for one in messages if one[1] != f"/chassis/{topic}"])
+    assert {f"channels.{kind}_{part}.topic" for part in ("leg", "wheel")} <= set(suggest_map(bag).open)
+    less = {**known, "channels": {key: one for key, one in known["channels"].items() if not key.startswith(kind)}}
+    with pytest.raises(InputError, match=rf"a.mcap: no source for {kind}_leg_lf, .*: {message}"):
+        import_log(bag, tmp_path / "runs", less)
 
 
 def test_a_log_is_imported_once(mcap, known, tmp_path):

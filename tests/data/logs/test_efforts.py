@@ -1,15 +1,13 @@
 """Efforts of a log are torques, currents or counts: a unit that is wrong or open is refused or said, whoever the robot is."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from foreign_logs import NAMES, lab_frame, made_up, rows_of
+from foreign_logs import NAMES, lab_frame, lab_map, made_up, rows_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
 from wlr_gym.data.format import COLUMNS
-from wlr_gym.data.logs import import_log, suggest_joints, suggest_map
+from wlr_gym.data.logs import import_log, suggest_map
 from wlr_gym.data.logs.map import factor
 from wlr_gym.physics.servo import current_law
 from wlr_gym.robot import JOINTS, load_robot
@@ -32,21 +30,23 @@ def written(tmp_path, unit, name="current", wheels_only=False):
 
 def read_as(log, unit, name="current"):
     """Return the proposed map with another unit of the efforts."""
-    channels = {key: one for key, one in suggest_map(log).map.model_dump()["channels"].items() if not key.startswith("eff")}
+    known = lab_map(log, eff="N m" if name == "effort" else "A").model_dump()
     efforts = {f"eff_{joint}": f"{NAMES[joint].lower()}_{name}" for joint in JOINTS[4:]}
-    return {"channels": channels | {key: {"topic": "table", "field": one, "unit": unit} for key, one in efforts.items()}}
+    known["channels"] |= {key: {"topic": "table", "field": one, "unit": unit} for key, one in efforts.items()}
+    return known
 
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_a_current_comes_in_as_a_torque(tmp_path, unit):
     log, torques = written(tmp_path, unit)
-    (imported,) = import_log(log, tmp_path / "runs")
+    known = lab_map(log, eff=unit)
+    (imported,) = import_log(log, tmp_path / "runs", known)
     run = read_run(imported.path)
     for joint in JOINTS:
         assert np.allclose(run[f"eff_{joint}"], torques[joint][: len(run["t"])], rtol=1e-6)
     (note,) = [note for note in imported.notes if note.startswith("efforts")]
     assert note == f"efforts in {unit} become N m by the torque constants of 'wlr-nominal': name your robot (--robot)"
-    (named,) = import_log(log, tmp_path / "named", robot="nominal")
+    (named,) = import_log(log, tmp_path / "named", known, robot="nominal")
     assert not [note for note in named.notes if note.startswith("efforts")]
 
 
@@ -76,24 +76,10 @@ def test_every_channel_has_units_or_says_that_it_has_none():
         factor("flow_quality", "ms", robot, "map")
 
 
-def test_an_effort_whose_unit_only_its_size_shows_is_a_guess(tmp_path):
+def test_a_unit_of_efforts_is_asked_with_their_size(tmp_path):
     log, _ = written(tmp_path, "mA", "effort")
-    said = {reason.what: reason for reason in suggest_map(log).reasons}
-    assert said["eff_wheel"].sure == "guess"
-    assert "mA, mN m or another unit? state it in the map" in said["eff_wheel"].why
-
-
-@pytest.mark.parametrize(
-    ("field", "size", "unit"),
-    [
-        ("dynamixel_state[1].present_current", 1.0, "count"),  # of Present Current (2.69 mA), whatever the field is called
-        ("dynamixel_state[1].present_current", 40.0, "count"),
-        ("current", 40.0, "mA"),
-        ("effort", 0.02, "N m"),
-    ],
-)
-def test_whole_currents_of_dynamixel_workbench_are_counts(field, size, unit):
-    look = SimpleNamespace(
-        chosen={"eff_leg_lf": SimpleNamespace(field=field)}, robot=load_robot(), log=SimpleNamespace(name="a.bag")
-    )
-    assert suggest_joints._torque_unit(look, "eff_leg_lf", size * np.arange(-5.0, 6.0)) == unit  # pyright: ignore[reportArgumentType]
+    found = suggest_map(log)
+    assert {f"channels.eff_{part}.unit" for part in ("leg", "wheel")} <= set(found.open)
+    (said,) = [line.why for line in found.lines if line.place == "channels.eff_wheel"]
+    assert "the motor stalls at 1.5 N m" in said
+    assert "A, mA and counts become N m by the robot's torque constants" in said

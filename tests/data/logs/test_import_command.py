@@ -4,11 +4,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from foreign_logs import lab_messages, made_up, rows_of, write_mcap
+from foreign_logs import lab_map, lab_messages, made_up, rows_of, write_mcap
 
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import BAD_INPUT, OK, main
 from wlr_gym.data import read_dataset, read_run, write_run
+from wlr_gym.data.logs.map import content, map_text
 
 
 @pytest.fixture(scope="module")
@@ -16,14 +17,22 @@ def bag(tmp_path_factory):
     return write_mcap(tmp_path_factory.mktemp("mcap") / "lab.mcap", lab_messages(made_up(12.0)))
 
 
-def test_suggest_then_import(bag, tmp_path, monkeypatch, capsys):
+@pytest.fixture(scope="module")
+def answered(bag):
+    return content(lab_map(bag))
+
+
+def test_suggest_answer_import(bag, answered, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     assert main(["import", str(bag), "--suggest"]) == OK
     said = capsys.readouterr().out
-    assert "sure" in said
-    assert "topic '/chassis/joints', in deg" in said
+    assert "decided" in said
+    assert "rad, deg, turn, count? topic '/chassis/joints'" in said
     assert "meta.profile" in said
+    assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == BAD_INPUT
+    assert "map.yaml: still open: joints.leg_lf.sign, joints.leg_lf.zero" in capsys.readouterr().err
+    Path("map.yaml").write_text(map_text(answered))
     assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == OK
     said = capsys.readouterr().out
     assert "as recorded" in said
@@ -36,38 +45,51 @@ def test_suggest_then_import(bag, tmp_path, monkeypatch, capsys):
     assert record["channels"]["gyro_x"]["rate"] == pytest.approx(200.0)
 
 
-@pytest.mark.parametrize("profile", ["{leg_velocity: 1.4}", "{leg_velocity: 0}"], ids=["one", "none"])
-def test_a_profile_that_the_map_states_is_not_called_open(bag, tmp_path, monkeypatch, capsys, profile):
+@pytest.mark.parametrize("profile", ["{leg_velocity: 1.4}", "{}"], ids=["one", "none"])
+def test_what_the_map_states_is_not_asked_and_a_complete_one_is_used_at_once(
+    bag, answered, tmp_path, monkeypatch, capsys, profile
+):
     monkeypatch.chdir(tmp_path)
-    Path("mine.yaml").write_text(f"meta: {{profile: {profile}}}\n")
-    assert main(["import", str(bag), "--suggest", "--map", "mine.yaml"]) == OK
-    assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == OK
+    Path("mine.yaml").write_text(map_text(answered) + f"meta: {{profile: {profile}}}\n")
+    assert main(["import", str(bag), "--suggest", "--map", "mine.yaml", "--out", "runs"]) == OK
     assert "meta.profile" not in capsys.readouterr().out
     assert read_dataset("runs").meta.states_profile
 
 
-def test_a_map_that_is_there_is_not_overwritten(bag, tmp_path, monkeypatch, capsys):
+def test_with_a_folder_the_map_is_written_there_and_runs_wait_for_its_answers(bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["import", str(bag), "--suggest", "--out", "runs"]) == BAD_INPUT
+    said = capsys.readouterr().err
+    assert "runs/map.yaml: no run is made, 24 entries of the map are open: joints.leg_lf.sign, " in said
+    assert said.rstrip().endswith(f"replace each 'open', then: wlr import {bag} --out runs")
+    assert [path.name for path in Path("runs").iterdir()] == ["map.yaml"]
+    assert "# rad, deg, turn, count? topic" in Path("runs/map.yaml").read_text()
+
+
+def test_a_map_that_is_there_is_not_overwritten(bag, answered, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("map.yaml").write_text("every: 2  # mine\n")
     for words in ([], ["--map", "map.yaml"]):
         assert main(["import", str(bag), "--suggest", *words]) == BAD_INPUT
         assert "map.yaml: is there already, and is another map: import with it" in capsys.readouterr().err
-    assert main(["import", str(bag), "--suggest", "--map", "map.yaml", "--out", "runs"]) == OK
     assert Path("map.yaml").read_text() == "every: 2  # mine\n"
+    Path("mine.yaml").write_text(map_text(answered | {"every": 2}))
+    assert main(["import", str(bag), "--map", "mine.yaml", "--out", "runs"]) == OK
     assert read_yaml("runs/map.yaml")["every"] == 2
     assert len(read_run("runs/run_01.parquet")["t"]) == pytest.approx(300, abs=10)
 
 
-def test_a_map_in_the_folder_of_runs_stands(bag, tmp_path, monkeypatch, capsys):
+def test_a_map_in_the_folder_of_runs_stands(bag, answered, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["import", str(bag), "--suggest", "--out", "runs"]) == OK
-    kept = Path("runs/map.yaml").read_text().replace("every: 1", "").replace("rows:", "every: 2\nrows:", 1)
+    Path("runs").mkdir()
+    kept = "# mine\n" + map_text(answered | {"every": 2})
     Path("runs/map.yaml").write_text(kept)
-    shutil.copy(bag, "other.mcap")
-    assert main(["import", "other.mcap", "--suggest", "--out", "runs"]) == BAD_INPUT
+    assert main(["import", str(bag), "--suggest", "--out", "runs"]) == BAD_INPUT
     assert "runs/map.yaml: is there already" in capsys.readouterr().err
-    assert Path("runs/map.yaml").read_text() == kept
+    assert main(["import", str(bag), "--out", "runs"]) == OK
+    shutil.copy(bag, "other.mcap")
     assert main(["import", "other.mcap", "--out", "runs"]) == OK
+    assert Path("runs/map.yaml").read_text() == kept
     assert len(read_run("runs/run_02.parquet")["t"]) == pytest.approx(300, abs=10)
 
 
@@ -120,7 +142,8 @@ def test_what_no_map_helps_is_said_at_once(bag, tmp_path, capsys, suffix):
 def test_what_is_missing_is_said_with_its_cost(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     messages = [one for one in lab_messages(made_up(6.0)) if one[1] not in ("/mocap/base", "/power")]
-    assert main(["import", str(write_mcap(tmp_path / "a.mcap", messages)), "--suggest", "--out", str(tmp_path / "runs")]) == OK
+    monkeypatch.chdir(tmp_path)
+    assert main(["import", str(write_mcap(tmp_path / "a.mcap", messages)), "--suggest"]) == OK
     said = capsys.readouterr().out
     assert "missing: cam_* of" in said
     assert "what floor and wheels do" in said

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import yaml
-from foreign_logs import lab_frame, made_up, rows_of
+from foreign_logs import lab_frame, lab_map, made_up, rows_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.data import convert, read_run, write_run
 from wlr_gym.data.format import RunMeta
-from wlr_gym.data.logs import export_run, import_log, suggest_map
-from wlr_gym.data.logs.map import map_text
+from wlr_gym.data.logs import export_run, import_log
+from wlr_gym.data.logs.map import content, map_text
 from wlr_gym.data.replay import robot_of
 from wlr_gym.robot import load_robot, robot_content
 
@@ -22,9 +22,9 @@ def lab(tmp_path, monkeypatch):
     lab_frame(made_up(4.0)).drop(columns="comment").to_csv("log.csv", index=False)
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "robot.lab.yaml").write_text(yaml.safe_dump(robot_content("nominal") | {"name": "lab", "gravity": 9.0}))
-    known = suggest_map("log.csv").map
+    known = content(lab_map("log.csv"))
     (tmp_path / "lab" / "map.yaml").write_text(map_text(known))
-    (tmp_path / "lab" / "named.yaml").write_text(map_text(known) + "meta: {robot: robot.lab.yaml}\n")
+    (tmp_path / "lab" / "named.yaml").write_text(map_text(known) + "meta: {robot: robot.lab.yaml, profile: {}}\n")
     return load_robot("lab/robot.lab.yaml")
 
 
@@ -63,7 +63,7 @@ def test_two_robots_of_one_import_are_refused(lab, tmp_path):
 
 @pytest.mark.parametrize("name", ["wlr-nominal", "nominal"])
 def test_a_map_names_a_robot_as_meta_yaml_does(lab, name):
-    known = yaml.safe_load(map_text(suggest_map("log.csv", {"meta": {"robot": name}}).map))
+    known = content(lab_map("log.csv", {"meta": {"robot": name}}))
     (imported,) = import_log("log.csv", "runs", known, robot="nominal")
     assert read_run(imported.path).meta.robot == "wlr-nominal"
     with pytest.raises(InputError, match=r"^map: unknown robot 'nobody'"):

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_logs import lab_frame, lab_messages, made_up, ns, write_mcap
+from foreign_logs import lab_frame, lab_map, lab_messages, made_up, ns, write_mcap
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
-from wlr_gym.data.logs import LogMap, import_log, read_logs, suggest_map
+from wlr_gym.data.logs import LogMap, import_log, read_logs
 from wlr_gym.data.logs.map import resolve
 from wlr_gym.data.logs.messages import make
 from wlr_gym.data.logs.rows import runs_of, wanted_fields
@@ -26,7 +26,7 @@ def messages():
 
 @pytest.fixture(scope="module")
 def known(messages, tmp_path_factory):
-    return suggest_map(write_mcap(tmp_path_factory.mktemp("whole") / "a.mcap", messages)).map
+    return lab_map(write_mcap(tmp_path_factory.mktemp("whole") / "a.mcap", messages))
 
 
 @pytest.fixture
@@ -143,7 +143,7 @@ def test_a_table_comes_in_parts_too(tmp_path, monkeypatch, small):
     monkeypatch.setattr("wlr_gym.data.logs.tables.ROWS", 100)
     path = tmp_path / "a.csv"
     lab_frame(made_up(12.0)).to_csv(path, index=False)
-    found = suggest_map(path).map
+    found = lab_map(path)
     parts = import_log(path, tmp_path / "runs", found)
     assert len(parts) == 2
     assert len(rows_of_all(parts)["t"]) == 600

@@ -3,10 +3,10 @@
 import numpy as np
 import pandas
 import pytest
-from foreign_logs import lab_frame, made_up
+from foreign_logs import lab_frame, lab_map, made_up
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.logs import import_log, read_logs, suggest_map
+from wlr_gym.data.logs import import_log, read_logs
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_a_row_that_was_cut_off_is_left_out_and_said(tmp_path, frame, text, enco
 
 def test_a_cut_table_is_proposed_and_imported(tmp_path, text):
     path = written(tmp_path / "a.csv", text[:-70])
-    (imported,) = import_log(path, tmp_path / "runs", suggest_map(path).map)
+    (imported,) = import_log(path, tmp_path / "runs", lab_map(path))
     assert any("cut off" in note for note in imported.notes)
 
 
@@ -184,7 +184,7 @@ def test_quaternions_of_tables(tmp_path):
     for k, part in enumerate("wxyz"):
         frame[f"att[{k}]"] = frame[f"q{part}"]
     path = written(tmp_path / "a.csv", frame.to_csv(index=False))
-    known = suggest_map(path).map
+    known = lab_map(path)
     for field, right in (("q.yaw", True), ("att[wxyz].yaw", True), ("att[xyzw].yaw", False)):
         channels = {**known.model_dump()["channels"], "cam_yaw": {"topic": "table", "field": field}}
         (imported,) = import_log(path, tmp_path / field, {**known.model_dump(), "channels": channels})
@@ -196,7 +196,7 @@ def test_quaternions_of_tables(tmp_path):
 def test_a_quaternion_with_empty_cells_is_a_lost_frame(tmp_path, frame, missing):
     yaw = 0.01 * np.arange(len(frame))
     posed = frame.assign(qw=np.cos(yaw / 2), qx=0.0, qy=0.0, qz=np.sin(yaw / 2), px=yaw, py=0.0)
-    known = suggest_map(written(tmp_path / "whole.csv", posed.to_csv(index=False))).map.model_dump()
+    known = lab_map(written(tmp_path / "whole.csv", posed.to_csv(index=False))).model_dump()
     pose = {name: {"topic": "table", "field": field} for name, field in
         (("cam_x", "px"), ("cam_y", "py"), ("cam_yaw", "q.yaw"))}  # fmt: skip
     for part, rows in missing.items():
@@ -216,7 +216,7 @@ def test_a_quaternion_with_empty_cells_is_a_lost_frame(tmp_path, frame, missing)
 def test_a_pose_of_a_table_is_of_columns_that_hold_one(tmp_path, frame, x, yaw, is_pose):
     way = np.linspace(0.0, 0.3, len(frame))
     path = written(tmp_path / "a.csv", frame.assign(**{x: way, x[:-1] + "y": 0.1 * way, yaw: way}).to_csv(index=False))
-    assert ("cam_x" in suggest_map(path).map.channels) == is_pose
+    assert ("cam" in lab_map(path, cam="m", cam_yaw="rad").channels) == is_pose
 
 
 def test_an_axis_stands_apart_from_the_letters_of_a_word(tmp_path, frame):
@@ -227,4 +227,4 @@ def test_an_axis_stands_apart_from_the_letters_of_a_word(tmp_path, frame):
         for axis in "xyz"
     }
     path = written(tmp_path / "a.csv", frame.rename(columns=long).to_csv(index=False))
-    assert {"gyro", "acc"} <= set(suggest_map(path).map.channels)
+    assert {"gyro", "acc"} <= set(lab_map(path).channels)

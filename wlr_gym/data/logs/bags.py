@@ -11,7 +11,6 @@ from typing import IO, Any
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.settings import read_yaml
-from wlr_gym.data.logs import bags as mcap_file
 from wlr_gym.data.logs.topics import Message, Share, cannot_read
 
 #: Types that ROS itself does not define and that old bags, which hold no definitions, are likely to have.
@@ -243,7 +242,7 @@ def bag_messages(path: Path, wants: Callable[[str], bool], notes: list[str], tel
         yield from _by_rosbags(path, wants, notes, tell)
         return
     for k, file in enumerate(files):
-        yield from mcap_file.mcap_messages(file, wants, notes, lambda share, k=k: tell((k + share) / len(files)))
+        yield from mcap_messages(file, wants, notes, lambda share, k=k: tell((k + share) / len(files)))
 
 
 def _mcap_files(path: Path) -> list[Path]:

@@ -7,21 +7,34 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from wlr_gym.base.checks import check_number
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_table
 from wlr_gym.data.format import COLUMNS, REQUIRED, RunMeta
-from wlr_gym.data.logs.map import CURRENTS, NO_PROFILE, LogMap, Resolved, check_effort, is_effort, map_text, read_map, resolve
+from wlr_gym.data.logs.map import (
+    CURRENTS,
+    NO_PROFILE,
+    LogMap,
+    Resolved,
+    check_effort,
+    content,
+    decided,
+    is_effort,
+    open_places,
+    parse_map,
+    read_map,
+    resolve,
+)
 from wlr_gym.data.logs.messages import RUN
 from wlr_gym.data.logs.open import first_messages, quiet, read_logs, read_recordings
 from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields, write_samples
@@ -62,14 +75,13 @@ class ImportedRun:
 def suggest_map(
     log: str | Path, given: Mapping[str, Any] | None = None, robot: str | None = None, tell: Share = quiet
 ) -> Proposal:
-    """Return a proposed map for a log; what ``given`` says is taken as it is.
+    """Return a proposed map for a log; what ``given`` (a map's content) says is taken as it is.
 
     Raises:
         InputError: a log that cannot be read, or that holds nothing known; see :func:`wlr_gym.data.logs.suggest.propose`.
     """
-    meta = parse_config(RunMeta, (given or {}).get("meta") or {}, "map: meta")
-    chosen = _robot_of(meta, robot)
-    return propose(next(read_logs(log, most=MOST, tell=tell)), chosen, given)
+    meta = parse_config(LogMap, decided(given or {}), "map").meta
+    return propose(next(read_logs(log, most=MOST, tell=tell)), _robot_of(meta, robot), given)
 
 
 def import_log(
@@ -86,8 +98,8 @@ def import_log(
     Args:
         log: what was recorded.
         out: folder of runs; made if it is not there.
-        map: what topics and fields mean: a map, what a map file says, or its path. None = the one in ``out``, else proposed; a
-            run of ours needs none.
+        map: what topics and fields mean: a map, what a map file says, or its path. None = the one in ``out``, else the proposed
+            one, where names decide all of it; a run of ours needs none.
         robot: that the runs are of: name or file; None = as the map's ``meta`` says (a path from the map file on, of a map
             that is no file from here), else the nominal one. It goes with the runs.
         split: s; a recording becomes runs of about this length, cut where the robot is quietest. None = one run, of long
@@ -96,37 +108,50 @@ def import_log(
         tell: called with the share that was read.
 
     Raises:
-        InputError: an unreadable log, a map that does not fit or names another robot, a run that a reader would refuse, another
-            map in ``out``; the message names file, topic and field, and nothing is written.
+        InputError: an unreadable log, a map that is not complete, does not fit or names another robot, a run that a reader
+            would refuse, another map in ``out``; the message names file, topic and field, and nothing is written.
     """
     log, out = Path(log), Path(out)
-    if split is not None and not split > 0.0:
-        raise InputError(f"split {split:g}: expected more than 0 s")
+    if split is not None:
+        check_number("split", split, "s", above=0.0)
     if map is None and is_own(log):
         if split is not None or robot is not None:
             raise InputError(f"{log}: a run that this library wrote comes back as it was: it takes neither split nor robot")
         return [_import_own(log, out, suffix, tell)]
-    if map is None and (out / MAP_FILE).is_file():
-        map = out / MAP_FILE
-    if map is None:
-        map = suggest_map(log, robot=robot).map
-    elif not isinstance(map, LogMap):
-        data = read_map(map) if isinstance(map, str | Path) else dict(map)
-        map = parse_config(LogMap, data, str(map) if isinstance(map, str | Path) else "map")
-    chosen = _robot_of(map.meta, robot)
-    meta = noted(chosen, map.meta)
-    resolved = resolve(map, chosen, "map")
-    check_map_file(out / MAP_FILE, map)
+    found = _map_of(map, log, out, robot)
+    chosen = _robot_of(found.meta, robot)
+    meta = noted(chosen, found.meta)
+    resolved = resolve(found, chosen, "map")
+    check_map_file(out / MAP_FILE, content(found))
     check_meta(out, meta)
-    record = _read_record(out)
+    record, read = _read_record(out), 0.0
+
+    def reading(share: float) -> None:
+        nonlocal read
+        read = max(read, share)
+        tell(_READING * read)
+
+    def making(share: float) -> None:
+        tell(_READING * read + (1.0 - _READING) * share * read)
+
     with _beside(out) as folder:
-        check_new = partial(_check_new, record=record, out=out)
-        made = list(_make_runs(log, map, resolved, chosen, split, suffix, folder, check_new, tell))
+        made: list[ImportedRun] = []
+        for recording in read_recordings(log, wanted_fields(resolved), tell=reading):
+            with closing(recording):
+                _check_new(recording, record, out)
+                first = len(made)
+                for one in runs_of(recording, found, resolved, split, making):
+                    findings = _check(one, recording.name, resolved, chosen)
+                    path = write_run(folder / f"{len(made)}{suffix}", one.table)
+                    write_samples(_samples_of(path), one)
+                    made.append(ImportedRun(path, recording.name, one.origin, one.facts, findings, one.notes))
+                made[first:] = [replace(one, notes=(*recording.notes, *one.notes)) for one in made[first:]]
+        tell(1.0)
         if not made:
             raise InputError(f"{log}: nothing in it")
         write_meta(out, note_robot(out, chosen, meta))
-        write_map(out / MAP_FILE, map)
-        is_named = robot is not None or map.meta.robot is not None
+        write_map(out / MAP_FILE, found)
+        is_named = robot is not None or found.meta.robot is not None
         said = (*(() if meta.states_profile else (NO_PROFILE,)), *(() if is_named else _unnamed_robot(resolved, chosen)))
         imported = []
         for one in made:
@@ -136,35 +161,58 @@ def import_log(
     return imported
 
 
-def check_map_file(path: Path, map: LogMap) -> None:
-    """Refuse to write a map where there is another one.
+def _map_of(map: LogMap | Mapping[str, Any] | str | Path | None, log: Path, out: Path, robot: str | None) -> LogMap:
+    """Return the map of an import, see :func:`import_log`."""
+    if isinstance(map, LogMap):
+        return map
+    if isinstance(map, Mapping):
+        return parse_map(map, "map")
+    if map is not None or (out / MAP_FILE).is_file():
+        path = Path(map or out / MAP_FILE)
+        return parse_map(read_map(path), str(path))
+    proposal = suggest_map(log, robot=robot)
+    if proposal.open:
+        hint = f"wlr import {log} --suggest writes the map that is proposed, and what the log shows of each"
+        raise InputError(f"{log}: needs a map: its names leave open {', '.join(proposal.open)}; {hint}")
+    return proposal.map
+
+
+def check_map_file(path: Path, data: Mapping[str, Any]) -> None:
+    """Refuse to write a map's content where there is another one.
 
     Raises:
         InputError: the file is there, and says something else.
     """
-    if path.exists() and _beside_robot(parse_config(LogMap, read_map(path), str(path))) != _beside_robot(map):
+    if path.exists() and _said(read_map(path), str(path)) != _said(data, "map"):
         hint = f"import with it (--map {path}), move it away, or name another folder (--out)"
         raise InputError(f"{path}: is there already, and is another map: {hint}")
 
 
-def write_map(path: Path, map: LogMap) -> None:
+def _said(data: Mapping[str, Any], where: str) -> object:
+    """Return what a map says, to be compared: a robot file that it names stands beside it."""
+    found = parse_config(LogMap, decided(data), where)
+    robot = own_robot(found.meta, Path())
+    meta = found.meta if robot is None else noted(robot, found.meta)
+    return found.model_copy(update={"meta": meta}), data if open_places(data) else None
+
+
+def write_map(path: Path, map: LogMap | Proposal) -> None:
     """Write a map, and a robot file that it names beside it; one that is there and says the same is left alone.
 
     Raises:
         InputError: the one that is there says something else.
     """
-    check_map_file(path, map)
-    if not path.exists():
-        robot = own_robot(map.meta, Path())
-        if robot is not None:
-            note_robot(path.parent, robot, map.meta)
-        write_text(path, map_text(_beside_robot(map)))
-
-
-def _beside_robot(map: LogMap) -> LogMap:
-    """Return a map as it is written: a robot file that it names stands beside it."""
-    robot = own_robot(map.meta, Path())
-    return map if robot is None else map.model_copy(update={"meta": noted(robot, map.meta)})
+    proposal = map if isinstance(map, Proposal) else Proposal(content(map), (), ())
+    check_map_file(path, proposal.content)
+    if path.exists():
+        return
+    meta = parse_config(RunMeta, decided(proposal.content).get("meta", {}), "map: meta")
+    robot = own_robot(meta, Path())
+    if robot is not None:
+        named = note_robot(path.parent, robot, meta)
+        of_map = {**proposal.content["meta"], "robot": named.robot, "robot_hash": named.robot_hash}
+        proposal = replace(proposal, content={**proposal.content, "meta": of_map})
+    write_text(path, proposal.text)
 
 
 def _robot_of(meta: RunMeta, robot: str | None) -> Robot:
@@ -222,50 +270,14 @@ def _beside(out: Path) -> Iterator[Path]:
         raise
 
 
-def _make_runs(
-    log: Path,
-    found: LogMap,
-    resolved: Mapping[str, Resolved],
-    robot: Robot,
-    split: float | None,
-    suffix: str,
-    folder: Path,
-    check_new: Callable[[TopicStore], None],
-    tell: Share,
-) -> Iterator[ImportedRun]:
-    """Yield the runs that a log makes, written into ``folder``; as much of it is in memory as a run needs."""
-    number, read = 0, 0.0
-
-    def reading(share: float) -> None:
-        nonlocal read
-        read = max(read, share)
-        tell(_READING * read)
-
-    def making(share: float) -> None:
-        tell(_READING * read + (1.0 - _READING) * share * read)
-
-    for recording in read_recordings(log, wanted_fields(resolved), tell=reading):
-        with closing(recording):
-            check_new(recording)
-            runs: list[ImportedRun] = []
-            for made in runs_of(recording, found, resolved, split, making):
-                number += 1
-                findings = _check(made, recording.name, resolved, robot)
-                path = write_run(folder / f"{number}{suffix}", made.table)
-                write_samples(samples_of(path), made)
-                runs.append(ImportedRun(path, recording.name, made.origin, made.facts, findings, made.notes))
-            yield from (replace(one, notes=(*recording.notes, *one.notes)) for one in runs)
-    tell(1.0)
-
-
-def samples_of(run: Path) -> Path:
+def _samples_of(run: Path) -> Path:
     """Return where the samples of an imported run are."""
     return run.with_name(f"{run.stem}.samples.parquet")
 
 
 def _moved(run: ImportedRun, path: Path) -> ImportedRun:
     """Move a run to its place, and its samples before it."""
-    os.replace(samples_of(run.path), samples_of(path))
+    os.replace(_samples_of(run.path), _samples_of(path))
     os.replace(run.path, path)
     return replace(run, path=path)
 

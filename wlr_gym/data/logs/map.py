@@ -1,8 +1,13 @@
-"""Units that logs use: what one of them is in SI units."""
+"""What a log's topics and fields mean: units of logs, the map from fields to the channels of a run as data, and its file.
+
+A map may hold lines that are still :data:`OPEN`, as proposed ones do; a run is made from a complete map only.
+"""
 
 from __future__ import annotations
 
 import math
+import re
+import textwrap
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +18,10 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from wlr_gym.base.checks import check_name
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_yaml
+from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
-from wlr_gym.data.logs.names import words
 from wlr_gym.data.runs import names_file
 from wlr_gym.physics.servo import current_law, effort_counts
 from wlr_gym.robot import JOINTS, LEGS, Robot
@@ -43,6 +48,11 @@ CURRENTS = ("A", "mA", "count")
 _STALLS = 2.0
 #: rad; a joint that moved by more shows its friction.
 _MOVED = 0.5
+
+
+def words(name: str) -> list[str]:
+    """Return the words of a name in lower case: ``FL_hipPos2`` is fl, hip, pos, 2."""
+    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+", name)]
 
 
 def units_of(column: str) -> Iterable[str]:
@@ -112,8 +122,7 @@ def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
     return float(current_law(robot).torque_constant[joint]) * (1e-3 if unit == "mA" else 1.0)
 
 
-# --- what a log's topics and fields mean: the map from them to the channels of a run, as data -------------------------
-
+# ---- the map ---------------------------------------------------------------------------------------------------------
 
 #: Names that stand for several channels.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -126,9 +135,16 @@ GROUPS: dict[str, tuple[str, ...]] = {
     **{kind: tuple(f"{kind}_{axis}" for axis in "xyz") for kind in ("gyro", "acc")},
     "cam": CAMERA[:3],
 }
+#: Value of what a map does not decide yet.
+OPEN = "open"
 #: Axes of a frame, as one of the log's.
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 _MAP_KEYS = (*(name for name in COLUMNS if name != "t"), *GROUPS)
+
+
+def _check_names(kind: str, names: Iterable[Any], valid: Iterable[str]) -> None:
+    for name in names:
+        check_name(kind, name, valid)
 
 
 class ChannelSource(SettingsModel):
@@ -205,19 +221,19 @@ class LogMap(SettingsModel):
     def _plain_names(cls, value: Any) -> Any:
         if not isinstance(value, Mapping):
             return value
-        _known(value, JOINTS, "joint")
+        _check_names("joint", value, JOINTS)
         return {joint: {"name": one} if isinstance(one, str | int) else one for joint, one in value.items()}
 
     @field_validator("channels")
     @classmethod
     def _known_channels(cls, value: dict[str, ChannelSource]) -> dict[str, ChannelSource]:
-        _known(value, _MAP_KEYS, "channel")
+        _check_names("channel", value, _MAP_KEYS)
         return value
 
     @field_validator("frames")
     @classmethod
     def _right_handed(cls, value: dict[str, tuple[Axis, Axis, Axis]]) -> dict[str, tuple[Axis, Axis, Axis]]:
-        _known(value, ("imu", "cam"), "frame")
+        _check_names("frame", value, ("imu", "cam"))
         for name, axes in value.items():
             order, flipped = "".join(axis[-1] for axis in axes), sum(axis.startswith("-") for axis in axes) % 2 == 1
             if sorted(order) != ["x", "y", "z"] or (order in ("xyz", "yzx", "zxy")) == flipped:
@@ -229,35 +245,47 @@ class LogMap(SettingsModel):
         return self.clocks.get(topic, TopicClock())
 
 
-def _known(names: Any, valid: Any, what: str) -> None:
-    for name in names:
-        if name not in valid:
-            raise unknown_name(what, str(name), valid)
+def open_places(data: Any, place: str = "") -> list[str]:
+    """Return what is still open in a map's content, as ``channels.vel.unit``."""
+    if isinstance(data, Mapping):
+        return [found for key, value in data.items() for found in open_places(value, f"{place}.{key}".lstrip("."))]
+    return [place] if data == OPEN else []
+
+
+def decided(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a map's content without its open lines: of channels only whole ones, of joints what is said of them."""
+    found = {key: decided(value) if isinstance(value, Mapping) else value for key, value in data.items() if value != OPEN}
+    if isinstance(channels := data.get("channels"), Mapping):
+        found["channels"] = {name: one for name, one in channels.items() if not open_places(one, name)}
+    if isinstance(joints := found.get("joints"), Mapping):
+        found["joints"] = {joint: one for joint, one in joints.items() if not isinstance(one, Mapping) or "name" in one}
+    return found
+
+
+def parse_map(data: Mapping[str, Any], where: str) -> LogMap:
+    """Return a map from its content.
+
+    Raises:
+        InputError: no map, or one with open lines; the message names them.
+    """
+    parse_config(LogMap, decided(data), where)
+    if places := open_places(data):
+        hint = "decide them (wlr import LOG --suggest writes a map that says what the log shows of each)"
+        raise InputError(f"{where}: still open: {', '.join(places)}; {hint}")
+    return parse_config(LogMap, data, where)
 
 
 def read_map(path: str | Path) -> dict[str, Any]:
-    """Read a map file as it is written, to lay it over a proposed one; a robot file's path goes on from here, not from the map.
+    """Read a map file as it is written, open lines included; a robot file's path goes on from here, not from the map.
 
     Raises:
         InputError: no YAML, an unknown key, a value of the wrong kind; the message names the nearest valid name.
     """
     data = read_yaml(path) or {}
-    robot = parse_config(LogMap, data, str(path)).meta.robot
+    robot = parse_config(LogMap, decided(data) if isinstance(data, Mapping) else data, str(path)).meta.robot
     if robot is not None and names_file(robot):
         data["meta"]["robot"] = str(Path(path).parent / robot)
     return data
-
-
-def combine(proposed: LogMap, given: Mapping[str, Any]) -> LogMap:
-    """Return the proposed map with what is given laid over it.
-
-    Raises:
-        InputError: what comes out is no map.
-    """
-    changes, joints = dict(given), given.get("joints")
-    if joints:  # by name in the long form, so that only what is said of them replaces what was proposed
-        changes["joints"] = {joint: {"name": str(one)} if isinstance(one, str | int) else one for joint, one in joints.items()}
-    return parse_config(LogMap, overlay(content(proposed), changes), "map")
 
 
 def content(found: LogMap) -> dict[str, Any]:
@@ -268,13 +296,32 @@ def content(found: LogMap) -> dict[str, Any]:
     return said
 
 
-def map_text(found: LogMap) -> str:
-    """Return the text of a map file."""
-    parts = []
-    for key, value in content(found).items():
-        style = None if isinstance(value, Mapping) else False  # one line for each of its entries
-        parts.append(yaml.safe_dump({key: value}, sort_keys=False, default_flow_style=style, width=140, allow_unicode=True))
-    return "".join(parts)
+def map_text(data: Mapping[str, Any], remarks: Mapping[str, str] | None = None) -> str:
+    """Return the text of a map file.
+
+    Args:
+        data: its content.
+        remarks: what stands above a line, by section and entry, as ``channels.vel``.
+    """
+    lines, remarks = [], remarks or {}
+
+    def dumped(entry: Mapping[str, Any], indent: str) -> list[str]:
+        style = None if isinstance(next(iter(entry.values())), Mapping | list | tuple) else False
+        text = yaml.safe_dump(dict(entry), sort_keys=False, default_flow_style=style, width=140, allow_unicode=True)
+        return textwrap.indent(text, indent).splitlines()
+
+    def remark(place: str, indent: str) -> list[str]:
+        return textwrap.wrap(remarks.get(place, ""), 120, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
+
+    for key, value in data.items():
+        lines += remark(key, "")
+        if not isinstance(value, Mapping):
+            lines += dumped({key: value}, "")
+            continue
+        lines.append(f"{key}:")
+        for name, entry in value.items():
+            lines += [*remark(f"{key}.{name}", "  "), *dumped({name: entry}, "  ")]
+    return "\n".join([*lines, ""])
 
 
 # ---- what it means for each channel ----------------------------------------------------------------------------------
@@ -345,8 +392,7 @@ def _resolve(found: LogMap, column: str, source: ChannelSource, robot: Robot, wh
     )
 
 
-# --- what a run lacks, and what that costs the gap workflow -----------------------------------------------------------
-
+# ---- what a run lacks ------------------------------------------------------------------------------------------------
 
 #: Channel or group of channels, all of it in words, and what an analysis loses without it.
 _COSTS = (

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.logs import bags
-from wlr_gym.data.logs import bags as mcap_file
 from wlr_gym.data.logs.tables import INFO, TABLE, read_lerobot, read_table
 from wlr_gym.data.logs.topics import BLOCK, Collector, Log, Message, Share, TopicStore
 
@@ -76,7 +75,7 @@ def _reader(path: Path) -> Callable[..., Iterator[Message]]:
             return bags.bag_messages
         raise InputError(f"{path}: no bag and no data set in it; expected {_KINDS}")
     if path.suffix.lower() == ".mcap":
-        return mcap_file.mcap_messages
+        return bags.mcap_messages
     if path.suffix.lower() in (".db3", ".bag"):
         return bags.bag_messages
     raise InputError(f"{path}: '{path.suffix}' files are not read; expected {_KINDS}")

@@ -1,244 +1,577 @@
-"""Propose a map for a log: which fields are which channels, and how sure that is."""
+"""Propose a map for a log: what names and types decide, and for all else a question with what the log shows of it.
+
+Fields are found by name. A unit is decided where a name states it, or where a standard message defines it and the numbers bear
+that out. Which way a joint counts, how a sensor is mounted, what another clock says: no log shows that for certain, so the map
+asks it (``open``), and no run is made before it is answered. Columns with the names of our own channels are those channels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import itertools
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.settings import parse_config
-from wlr_gym.data.format import CAMERA, COLUMNS
-from wlr_gym.data.logs.candidates import FieldCandidate, find_candidates, is_unnamed, may_be_pose
-from wlr_gym.data.logs.clocks import set_clocks
-from wlr_gym.data.logs.map import GROUPS, NO_PROFILE, ChannelSource, JointSource, LogMap, combine
-from wlr_gym.data.logs.signals import GUESS, SURE, LogSignals, Reason, roughly_one_clock
-from wlr_gym.data.logs.suggest_body import find_imu, find_pose, wheel_motion
-from wlr_gym.data.logs.suggest_joints import JointFindings, find_joints
-from wlr_gym.data.logs.suggest_wheels import find_sides
+from wlr_gym.base.settings import overlay
+from wlr_gym.data.check import integral
+from wlr_gym.data.format import COLUMNS
+from wlr_gym.data.logs.fields import FieldCandidate, find_candidates, is_unnamed, may_be_pose
+from wlr_gym.data.logs.map import (
+    GROUPS,
+    NO_PROFILE,
+    OPEN,
+    LogMap,
+    TopicClock,
+    decided,
+    effort_range,
+    map_text,
+    open_places,
+    parse_map,
+    units_of,
+)
+from wlr_gym.data.logs.rows import lost_frames, pose_angle
 from wlr_gym.data.logs.topics import Log
-from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameter_table import XYZ
+
+Array = NDArray[np.float64]
+Series = tuple[Array, Array]
 
 #: Messages per topic that are looked at: 100 s of an IMU at 200 Hz.
 MOST = 20_000
-#: s; motions that are shorter show nothing.
-_SHORTEST = 1.0
+#: s over which motions are compared, and from the start on that count as rest.
+_WINDOW, _START = 0.5, 0.5
+#: s; a topic that is delivered so much earlier or later than the joints may have another clock.
+_LATE = 0.02
+#: Share of headers not later than the one before, from which on they are no times; ns of a clock that began anew.
+_NO_TIMES, _ANEW = 0.02, -1_000_000_000
+#: rad; a robot that drives is not tilted by so much.
+_TILTED = 1.0
+#: Parts of a proposal, each a question or a set of channels that are read alike.
+_SETS = {
+    **{f"{kind}_{part}": GROUPS[f"{kind}_{part}"] for kind in ("cmd", "pos", "vel", "eff") for part in ("leg", "wheel")},
+    **{kind: GROUPS[kind] for kind in ("gyro", "acc")},
+    "cam": ("cam_x", "cam_y"),
+    "cam_yaw": ("cam_yaw",),
+    "volt": ("volt",),
+}
+_NEEDED = ("cmd_leg", "cmd_wheel", "pos_leg", "pos_wheel")
+#: What a wrong answer costs.
+_MATTERS = {
+    "cmd": "Every replay drives the simulator with these setpoints",
+    "pos": "Every replay is compared with these angles",
+    "vel": "The servos' speed control is judged by these rates",
+    "eff": "Friction and motors are judged by these efforts; A, mA and counts become N m by the robot's torque constants",
+    "gyro": "Turns, and slip in them, are judged by these rates",
+    "acc": "Tilt, shocks and masses are judged by these readings",
+    "cam": "The way, and slip on it, are judged by this pose",
+    "volt": "A weak supply looks like weak motors",
+    "sign": "A joint that counts the other way moves the other way in every replay",
+    "frames": "A sensor read along other axes shows turns and pushes that were none",
+    "clocks": "A clock that is off looks like a delay of the robot or of its sensors",
+}
+
+
+@dataclass(frozen=True)
+class MapLine:
+    """A line of a proposed map: its section and entry, such as ``channels.vel_leg``, whether it asks, and why it is so."""
+
+    place: str
+    asks: bool
+    why: str
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A proposed map, why it is as it is, and the topics that it does not use."""
+    """A proposed map.
 
-    map: LogMap
-    reasons: tuple[Reason, ...]
+    Attributes:
+        content: as a map file has it; ``open`` where it has to be decided.
+        lines: what decides them, or what the log shows of them.
+        unused: topics that it does not use.
+    """
+
+    content: dict[str, Any]
+    lines: tuple[MapLine, ...]
     unused: tuple[str, ...]
+
+    @property
+    def open(self) -> list[str]:
+        """Places that have to be decided, such as ``channels.vel_leg.unit``."""
+        return open_places(self.content)
+
+    @property
+    def map(self) -> LogMap:
+        """The map.
+
+        Raises:
+            InputError: some of it is open.
+        """
+        return parse_map(self.content, "map")
+
+    @property
+    def text(self) -> str:
+        """The map file, above each open line what the log shows of it."""
+        head = f"# Proposed by wlr import --suggest. Replace each '{OPEN}'; a run is made from a complete map only.\n"
+        text = map_text(self.content, {line.place: line.why for line in self.lines if line.asks})
+        return head + text if self.open else text
 
 
 def propose(log: Log, robot: Robot, given: Mapping[str, Any] | None = None) -> Proposal:
-    """Return a map for a log; what ``given`` says is taken as it is.
-
-    Names and types say which field is which channel. Units, signs, axes and clocks come from comparing motions: wheels
-    against the pose, rates against angles, the gyroscope against wheels, the accelerometer against gravity.
+    """Return a map for a log; what ``given`` says is taken as it is, its open lines are asked again.
 
     Args:
         log: all topics, all fields; the first :data:`MOST` messages of each are enough.
         robot: that the run is of.
-        given: a map file as it is written.
+        given: a map's content.
 
     Raises:
-        InputError: two robots, two joints of one name, nothing that is a channel, or less than 1 s.
+        InputError: two robots, two joints of one name, or nothing that is a channel.
     """
-    given = dict(given or {})
-    known = parse_config(LogMap, given, "map")
-    look = _look(log, robot, known)
-    _unnamed(look)
-    _no_pose(look)
-    _other_names(look)
-    body = find_pose(look)
-    joints = find_joints(look, body)
-    if body is None:
-        find_sides(look, joints)
-    wheels = wheel_motion(look, joints)
-    imu = find_imu(look, body, wheels)
-    set_clocks(look, body, wheels, imu.heading, imu.pushed)
-    units = dict(imu.units)
-    _voltage(look, units)
-    if not known.meta.states_profile:
-        look.note("meta.profile", GUESS, NO_PROFILE)
-    proposed = LogMap.model_validate(_content(look, joints, units))
-    used = {one.topic for one in look.chosen.values()}
-    unused = tuple(name for name in log.topics if name not in used)
-    return Proposal(combine(proposed, given), tuple(look.reasons), unused)
+    known = decided(given or {})
+    if "joints" in known:  # in the long form, so that what is not said of them is asked
+        plain = {joint: {"name": str(one)} if isinstance(one, str | int) else one for joint, one in known["joints"].items()}
+        known["joints"] = plain
+    return _Proposer(log, robot, known).propose()
 
 
-def _look(log: Log, robot: Robot, known: LogMap) -> LogSignals:
-    names = {joint.name: label for label, joint in known.joints.items()}
-    candidates = find_candidates(log, robot, known.namespace, names)
-    chosen = {column: found[0] for column, found in candidates.items()}
-    if not chosen:
-        topics = ", ".join(f"'{name}' ({topic.kind})" for name, topic in list(log.topics.items())[:12])
-        raise InputError(f"{log.name}: nothing in it is known for a channel; topics: {topics}")
-    for column in ("cam_z", "cam_pitch"):
-        if column in chosen and ("cam_x" not in chosen or chosen[column].topic != chosen["cam_x"].topic):
-            del chosen[column]
-    topics = sorted({one.topic for one in chosen.values()})
-    _leave_out_short(log, chosen)
-    rows = known.rows or (chosen["pos_leg_lf"].topic if "pos_leg_lf" in chosen else topics[0])
-    clocks = roughly_one_clock(log, topics, known.clocks, rows)
-    return LogSignals(log, robot, chosen, known, clocks, frames=dict(known.frames))
+@dataclass(eq=False)
+class _Proposer:
+    """A log that is being looked at: ``chosen`` has the field of each column, ``clocks`` what is known of them."""
 
+    log: Log
+    robot: Robot
+    known: dict[str, Any]
+    lines: list[MapLine] = field(default_factory=list)
+    content: dict[str, Any] = field(default_factory=lambda: defaultdict(dict))
 
-def _unnamed(look: LogSignals) -> None:
-    """Say which lists have as many elements as a robot has joints of a kind, but no names."""
-    for name, topic in look.log.topics.items():
-        stems = {field.rpartition("[")[0] for field in topic.fields if is_unnamed(topic, field)}
-        long = [stem for stem in sorted(stems) if any(f"{stem}[{len(LEGS) - 1}]" == field for field in topic.fields)]
-        if long and not any(one.topic == name and one.column.partition("_")[2] in JOINTS for one in look.chosen.values()):
-            text = f"topic '{name}': {', '.join(long)} have no names: say in the map which is which, by place"
-            look.note("joints", GUESS, f"{text}: joints: {{{JOINTS[0]}: '0', ...}}")
-
-
-def _no_pose(look: LogSignals) -> None:
-    """Say which topics have poses, where none of them is known to be the body's."""
-    others = [f"'{name}'" for name, topic in look.log.topics.items() if any(map(may_be_pose, topic.fields))]
-    if others and not look.has("cam_x") and not any(key.startswith("cam") for key in look.given.channels):
-        text = f"not proposed: the poses of {', '.join(others)} are not known to be the body's; name one in the map if it is"
-        look.note("cam", GUESS, text)
-
-
-def _other_names(look: LogSignals) -> None:
-    """Say which fields are taken for a channel of another name, where most have the very names of our channels."""
-    others = [one for column, one in look.chosen.items() if one.field != column]
-    for one in others if 2 * len(others) < len(look.chosen) else ():
-        text = f"'{one.field}' of topic '{one.topic}' is taken for it; most others have the very names of our channels"
-        look.note(one.column, GUESS, text)
-
-
-def _leave_out_short(log: Log, chosen: dict[str, FieldCandidate]) -> None:
-    """Leave out motions that are too short to be compared; refuse those of the joints."""
-    for column, one in list(chosen.items()):
-        received = log.topics[one.topic].received
-        seconds = float(np.ptp(received)) * 1e-9 if len(received) else 0.0
-        if seconds >= _SHORTEST or column.startswith(("cmd_", "volt")):
-            continue
-        if column.startswith("pos_"):
-            text = f"{seconds:.2f} s are too short to be looked at, expected {_SHORTEST:g} s: give a map (--map)"
-            raise InputError(f"{log.name}: topic '{one.topic}': {text}")
-        del chosen[column]
-
-
-def _voltage(look: LogSignals, units: dict[str, str]) -> None:
-    if not look.has("volt"):
-        return
-    middle = float(np.median(look.raw("volt")[1]))
-    units["volt"] = look.chosen["volt"].unit or ("mV" if middle > 100.0 else "V")
-    sure = SURE if 5.0 < middle * (1e-3 if units["volt"] == "mV" else 1.0) < 30.0 else GUESS
-    look.note("volt", sure, f"topic '{look.chosen['volt'].topic}', in {units['volt']}: {middle:.4g} in the median")
-
-
-# ---- the map ---------------------------------------------------------------------------------------------------------
-
-
-def _content(look: LogSignals, found: JointFindings, units: Mapping[str, str]) -> dict[str, Any]:
-    names = _joint_names(look)
-    channels = dict(_channels(look, found, units, names))
-    joints = {
-        joint: JointSource(
-            name=names.get(joint, joint),
-            sign=_sign(found.joint_sign.get(joint, 1)),
-            zero=round(found.joint_zero.get(joint, 0.0), 6),
+    def __post_init__(self) -> None:
+        given = parse_map(self.known, "map")
+        names = {joint: one.name for joint, one in given.joints.items()}
+        found = find_candidates(self.log, self.robot, given.namespace, names)
+        self.mapped = {column for key in given.channels for column in GROUPS.get(key, (key,))}
+        self.chosen = {column: fields[0] for column, fields in found.items() if column not in self.mapped}
+        for column in ("eff_" + joint for joint in JOINTS):
+            if column in self.chosen and not np.ptp(self.raw(column, TopicClock())[1]):
+                del self.chosen[column]  # drivers that know no effort send zeros
+        if not self.chosen and not self.mapped:
+            topics = ", ".join(f"'{name}' ({topic.kind})" for name, topic in list(self.log.topics.items())[:12])
+            raise InputError(f"{self.log.name}: nothing in it is known for a channel; topics: {topics}")
+        exact = sum(one.field == column for column, one in self.chosen.items())
+        self.ours = {column for column, one in self.chosen.items() if one.field == column and 2 * exact >= len(self.chosen)}
+        self.topics = dict.fromkeys(
+            [one.topic for one in self.chosen.values()] + [one.topic for one in given.channels.values()]
         )
-        for joint in JOINTS
-        if joint in names or joint in found.joint_zero or found.joint_sign.get(joint, 1) < 0
-    }
-    used = {source.topic for source in channels.values()}
-    clocks = {name: one for name, one in look.clocks.items() if name in used and (one.offset or one.use != "header")}
-    rows = channels["pos_leg_lf"].topic if "pos_leg_lf" in channels else None
-    return {
-        "rows": rows,
-        "every": _every(look, rows),
-        "joints": {joint: one.model_dump(exclude_defaults=True) for joint, one in joints.items()},
-        "channels": {name: one.model_dump(exclude_defaults=True) for name, one in _grouped(channels).items()},
-        "frames": {name: tuple(look.frames[name]) for name in ("cam", "imu") if name in look.frames},
-        "clocks": {name: one.model_dump() for name, one in clocks.items()},
-    }
+        self.topics = [name for name in self.topics if name in self.log.topics]
+        rows = self.chosen.get("pos_leg_lf") or next(
+            (given.channels[k] for k in ("pos_leg", "pos") if k in given.channels), None
+        )
+        self.rows = given.rows or (rows.topic if rows else "")
+        self.clocks = {name: given.use(name) for name in self.topics}
+        self.names, self.templates = _joint_fields(self.chosen, {joint: one.name for joint, one in given.joints.items()})
+
+    def propose(self) -> Proposal:
+        self._clocks()
+        self._rows()
+        self._joints()
+        for name, columns in _SETS.items():
+            self._set(name, [column for column in columns if column in self.chosen])
+        self._frames()
+        self._profile()
+        order = ("rows", "every", "joints", "channels", "frames", "clocks", "namespace", "meta")
+        content = overlay({key: self.content[key] for key in order if self.content.get(key)}, self.known)
+        unused = tuple(name for name in self.log.topics if name not in self.topics)
+        lines = sorted(self.lines, key=lambda line: order.index(line.place.partition(".")[0]))
+        return Proposal({key: content[key] for key in order if key in content}, tuple(lines), unused)
+
+    def note(self, place: str, why: str, asks: bool = True) -> None:
+        self.lines.append(MapLine(place, asks, why))
+
+    # ---- what the log has -------------------------------------------------------------------------------------------
+
+    def raw(self, column: str, clock: TopicClock | None = None) -> Series:
+        """Return times (s) and values of a column's field, as the log has them; what is not finite is left out."""
+        chosen = self.chosen[column]
+        topic, clock = self.log.topics[chosen.topic], clock or self.clocks[chosen.topic]
+        if chosen.field in topic.fields:
+            at, values = topic.series(chosen.field, clock.use, self.log.name)
+        else:
+            at, values = pose_angle(topic, chosen.field, clock.use, None, self.log.name)
+        keep = np.isfinite(values)
+        yaw = self.chosen.get("cam_yaw")
+        if column.startswith("cam") and yaw is not None and yaw.topic == chosen.topic:
+            keep &= ~np.isin(at, lost_frames(topic, yaw.field, clock.use, self.log.name))
+        at, values = at[keep], values[keep]
+        once = np.concatenate([[True], np.diff(at) > 0]) if len(at) else np.zeros(0, bool)
+        origin = min(int(one.received[0]) for one in self.log.topics.values() if len(one.received))
+        return np.asarray((at[once] - origin) * 1e-9 + clock.offset, np.float64), values[once]
+
+    def turned(self, column: str) -> Series:
+        """Return an angle, of a rate what it has turned by, as the log has them."""
+        t, values = self.raw(column)
+        return (
+            (t, integral(t, values) if len(t) else values) if column.startswith(("vel", "cmd_wheel", "gyro")) else (t, values)
+        )
+
+    # ---- sections ---------------------------------------------------------------------------------------------------
+
+    def _clocks(self) -> None:
+        late = {name: _behind(self.log, name) for name in self.topics}
+        base = late.get(self.rows) or 0.0
+        for name in (one for one in self.topics if one not in self.known.get("clocks", {})):
+            if late[name] is None and self.log.topics[name].stamped is not None:
+                self.clocks[name] = TopicClock(use="log")
+                self.content["clocks"][name] = {"use": "log"}
+                self.note(f"clocks.{name}", "its headers repeat or go back: they are no times", asks=False)
+            elif late[name] is not None and abs(apart := late[name] - base) > _LATE:
+                self.clocks[name] = TopicClock(offset=apart)
+                self.content["clocks"][name] = OPEN
+                shown = f"messages arrive {_ms(late[name])} after their header's time, the joints' {_ms(base)} (medians)"
+                added = f"{{offset: S}} adds S ({apart:.3f} would make them arrive as the joints' do)"
+                text = f"{{use: header}} trusts the headers, {{use: log}} the recorder's clock, {added}: {shown}"
+                self.note(f"clocks.{name}", f"{text}. {_MATTERS['clocks']}")
+
+    def _rows(self) -> None:
+        if not self.rows or "pos_leg_lf" not in self.chosen:
+            return
+        self.content["rows"] = self.rows
+        t, _ = self.raw("pos_leg_lf")
+        rate = 1.0 / float(np.median(np.diff(t))) if len(t) > 1 else 50.0
+        every = max(round(rate / 50.0), 1)
+        if every > 1:
+            self.content["every"] = every
+        which = f"every {every}th" if every > 1 else "each"
+        self.note("rows", f"topic '{self.rows}', {rate:.0f} messages a second; {which} makes a row", asks=False)
+
+    def _joints(self) -> None:
+        """Ask which way each joint counts, and a leg's angle where ours is 0; nothing of joints that are all in our names."""
+        place = len(self.lines)
+        for joint in JOINTS:
+            columns = [column for column in self.chosen if column.partition("_")[2] == joint]
+            said = self.known.get("joints", {}).get(joint, {})
+            name = said.get("name", self.names.get(joint, joint))
+            entry = {"name": name}
+            wanted = ("sign", "zero") if joint in LEGS else ("sign",)
+            asked = [key for key in wanted if key not in said] if not set(columns) <= self.ours else []
+            if asked:
+                entry |= dict.fromkeys(asked, OPEN)
+                self.note(f"joints.{joint}", self._joint_shown(joint))
+            if asked or (joint in self.names and joint not in self.known.get("joints", {})):
+                self.content["joints"][joint] = entry
+        if len(self.lines) > place:
+            legs = "of a leg 1 where the number grows as the wheel goes from the front over below to the back"
+            zero = "zero: the log's angle (rad) where the leg points straight forward"
+            text = f"sign: {legs}, of a wheel 1 where it grows as the wheel rolls forward, else -1. {zero}. {_MATTERS['sign']}"
+            self.lines.insert(place, MapLine("joints", True, text))
+
+    def _set(self, name: str, columns: Sequence[str]) -> None:
+        """Add the channels of a set, with their unit where it is decided, and ask it where it is not."""
+        kind = name.partition("_")[0]
+        missing = [
+            column for column in _SETS[name] if name in _NEEDED and column not in self.chosen and column not in self.mapped
+        ]
+        for column in [name] if len(missing) == len(_SETS[name]) else missing:
+            self.content["channels"][column] = {"topic": OPEN, "field": OPEN}
+            self.note(f"channels.{column}", f"no field is known to be it{self._unnamed()}. {_MATTERS[kind]}")
+        if not columns:
+            return
+        entries = {column: {"topic": self.chosen[column].topic, "field": self._field(column)} for column in columns}
+        first = entries[columns[0]]
+        together = len(columns) == len(_SETS[name]) and "{" in first["field"] and all(one == first for one in entries.values())
+        units = {column: self._unit(column) for column in columns}
+        groups = {name: columns} if together and len(set(units.values())) == 1 else {column: [column] for column in columns}
+        is_angle = name == "cam_yaw" and self.chosen[name].field in self.log.topics[self.chosen[name].topic].fields
+        asks_sign = is_angle and name not in self.ours
+        asked = []
+        for key, members in groups.items():
+            unit, entry = units[members[0]], dict(entries[members[0]])
+            if unit != COLUMNS[members[0]].unit:
+                entry["unit"] = unit
+            if asks_sign:
+                entry["sign"] = OPEN
+            self.content["channels"][key] = entry
+            if OPEN in entry.values():
+                asked.append((key, members))
+        source = f"{', '.join(dict.fromkeys(self._source(column) for column in columns))}"
+        count = f"{len(columns)} of {len(_SETS[name])} joints; " if kind in ("cmd", "pos", "vel", "eff") and missing else ""
+        if not asked:
+            by = "as in our own names" if set(columns) <= self.ours else f"in {', '.join(dict.fromkeys(units.values()))}"
+            self.note(f"channels.{next(iter(groups))}", f"{count}{source}, {by}", asks=False)
+            return
+        key, members = asked[0]
+        question = f"{', '.join(units_of(members[0]))}?" if OPEN in [units[one] for one in members] else ""
+        question += " sign: 1, or -1 where it turns clockwise?" if asks_sign else ""
+        shown = "; ".join(filter(None, (f"{count}{source}", self._range(columns), *self._compared(name, columns))))
+        self.note(f"channels.{key}", f"{question.strip()} {shown}. {_MATTERS[kind]}")
+
+    def _frames(self) -> None:
+        given = self.known.get("frames", {})
+        imu = [f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in XYZ]
+        have = [column for column in imu if column in self.chosen]
+        if have and not set(have) <= self.ours and "imu" not in given:
+            self.content["frames"]["imu"] = OPEN
+            axes = "the log's axes that our x (forward), y (left) and z (up) are: [x, y, z] where it is mounted so"
+            self.note("frames.imu", f"{axes}. {'; '.join(self._imu_shown())}. {_MATTERS['frames']}")
+        if "cam_z" in self.chosen and "cam_x" in self.chosen and "cam" not in given:
+            spread = [float(np.ptp(values)) if len(values) else 0.0 for _, values in map(self.raw, (f"cam_{a}" for a in XYZ))]
+            shown = ", ".join(f"{axis} goes over {size:.3g}" for axis, size in zip(XYZ, spread, strict=True))
+            shown += ": the one that hardly changes points up"
+            is_tilted = (tilt := self._tilt()) > _TILTED
+            if is_tilted:
+                shown += f"; its quaternion tilts the robot by {np.degrees(tilt):.0f} deg: are its parts in another order?"
+            if is_tilted or spread[2] > 0.3 * min(spread[:2]) or spread[2] == max(spread):
+                self.content["frames"]["cam"] = OPEN
+                text = "the pose's axes that our x, y and z (up) are: [x, y, z], or [x, -z, y] where its y points up"
+                self.note("frames.cam", f"{text}. {shown}. {_MATTERS['frames']}")
+        others = [f"'{name}'" for name, topic in self.log.topics.items() if any(map(may_be_pose, topic.fields))]
+        if others and "cam_x" not in self.chosen and not any(column.startswith("cam") for column in self.mapped):
+            text = f"not proposed: the poses of {', '.join(others)} are not known to be the body's, measured; name one if it is"
+            self.note("channels.cam", text, asks=False)
+
+    def _tilt(self) -> float:
+        """Return how far the pose's quaternion tilts the robot off upright in the median, rad; no run begins on its side."""
+        chosen = self.chosen["cam_yaw"]
+        topic, field = self.log.topics[chosen.topic], f"{chosen.field.rpartition('.')[0]}.tilt"
+        return float(np.median(pose_angle(topic, field, self.clocks[chosen.topic].use, None, self.log.name)[1]))
+
+    def _profile(self) -> None:
+        if "profile" not in self.known.get("meta", {}):
+            self.content["meta"]["profile"] = OPEN
+            text = "the servos' profile: {wheel_acceleration: rad/s2, leg_velocity: rad/s, leg_acceleration: rad/s2}, {} = none"
+            steps = [self._steps(leg) for leg in LEGS if f"cmd_{leg}" in self.chosen and f"pos_{leg}" in self.chosen]
+            shown = f"; leg setpoints jump by up to {max(s[0] for s in steps):.3g}, and legs move by up to " if steps else ""
+            shown += f"{max(s[1] for s in steps):.3g} a second, as logged" if steps else ""
+            self.note("meta.profile", f"{text}{shown}. Without this line {NO_PROFILE.partition(': ')[2]}")
+
+    # ---- what is decided --------------------------------------------------------------------------------------------
+
+    def _unit(self, column: str) -> str:
+        """Return the unit of a column's field, as its name or its type states it, else that it is open."""
+        one, si = self.chosen[column], COLUMNS[column].unit
+        if column in self.ours or (column == "cam_yaw" and one.field not in self.log.topics[one.topic].fields):
+            return si
+        if one.unit is not None:
+            return one.unit
+        kind = self.log.topics[one.topic].kind
+        tests: dict[str, Callable[[], bool]] = {"acc": self._reads_gravity, "cam": self._is_quick, "volt": self._is_supply}
+        standard = {"acc": r"sensor_msgs/.*Imu", "cam": r"geometry_msgs/.*Pose.*", "volt": r"sensor_msgs/.*BatteryState"}
+        name = column.partition("_")[0]
+        return si if name in tests and re.fullmatch(standard[name], kind) and tests[name]() else OPEN
+
+    def _reads_gravity(self) -> bool:
+        return abs(float(np.linalg.norm(self._gravity())) / 9.81 - 1.0) < 0.15
+
+    def _gravity(self) -> Array:
+        return np.array([np.median(self.raw(f"acc_{axis}")[1]) for axis in XYZ])
+
+    def _is_quick(self) -> bool:
+        """Whether the pose moves as fast as the robot can in m: in cm it would crawl at a hundredth of that, or race."""
+        fastest = self.robot.servo.wheel.no_load_speed * self.robot.wheel.radius
+        steps = [np.diff(_resampled(self.raw(f"cam_{axis}"))) for axis in XYZ if f"cam_{axis}" in self.chosen]
+        speed = np.sqrt(sum(step**2 for step in steps)) / _WINDOW
+        return bool(len(speed)) and 0.05 < float(np.quantile(speed, 0.95)) / fastest < 1.5
+
+    def _is_supply(self) -> bool:
+        return 5.0 < float(np.median(self.raw("volt")[1])) < 60.0
+
+    # ---- what is shown ----------------------------------------------------------------------------------------------
+
+    def _source(self, column: str) -> str:
+        one = self.chosen[column]
+        kind = self.log.topics[one.topic].kind
+        topic = "" if kind == one.topic else f"topic '{one.topic}' ({kind}), "
+        return f"{topic}'{self._field(column)}'"
+
+    def _range(self, columns: Sequence[str]) -> str:
+        return "; ".join(f"{column.partition('_')[2] or column} {_range(self.raw(column))}" for column in columns)
+
+    def _compared(self, name: str, columns: Sequence[str]) -> Iterable[str]:
+        """Yield how a set's numbers go with what they should go with."""
+        kind = name.partition("_")[0]
+        other = {"cmd": "pos", "vel": "pos"}.get(kind)
+        found = []
+        for column in columns:
+            if other and (angle := column.replace(kind, other)) in self.chosen:
+                found.append(_likeness(self.turned(column), self.turned(angle)))
+            elif kind == "gyro" and "cam_yaw" in self.chosen:
+                found.append(_likeness(self.turned(column), self.raw("cam_yaw")))
+        found = [one for one in found if one is not None]
+        if found and kind == "gyro":
+            ratio, correlation = max(found, key=lambda one: abs(one[1]))
+            yield f"at best it turns {abs(ratio):.3g} times as much as the pose (correlation {correlation:.2f})"
+        elif found:
+            ratio, correlation = (float(np.median(part)) for part in np.array(found).T)
+            what = "setpoints vary" if kind == "cmd" else "they turn"
+            yield f"{what} {abs(ratio):.3g} times as much as the angles (correlation {correlation:.2f})"
+        if kind == "eff":
+            yield f"the motor stalls at {effort_range(columns[0], self.robot)[0]:.3g} N m"
+        if name == "cam_yaw" and (course := self._course()) is not None:
+            yield f"it turns {'with' if course > 0 else 'against'} the course of x, y (correlation {course:.2f})"
+
+    def _course(self) -> float | None:
+        """Return the correlation of a heading's turns with those of the way (x, y) that is driven, forth or back."""
+        x, y, yaw = (self.raw(f"cam_{axis}") for axis in ("x", "y", "yaw"))
+        if min(len(one[0]) for one in (x, y, yaw)) < 10:
+            return None
+        grid = _grid(x, y, yaw)
+        steps = np.array([np.interp(grid + _WINDOW, *one) - np.interp(grid, *one) for one in (x, y)])
+        moving = np.hypot(*steps) > 0.3 * np.quantile(np.hypot(*steps), 0.95) if len(grid) else np.zeros(0, bool)
+        if moving.sum() < 10:
+            return None
+        course = np.unwrap(2.0 * np.arctan2(steps[1], steps[0])[moving]) / 2.0  # the same forth and back
+        heading = np.interp(grid[moving] + 0.5 * _WINDOW, yaw[0], yaw[1])
+        spreads = float(np.std(course)), float(np.std(heading))
+        return float(np.corrcoef(course, heading)[0, 1]) if min(spreads) > 1e-6 else None
+
+    def _joint_shown(self, joint: str) -> str:
+        shown = []
+        for kind in ("pos", "cmd"):
+            if f"{kind}_{joint}" in self.chosen:
+                shown.append(f"{kind} {_range(self.raw(f'{kind}_{joint}'))}")
+        pair = [f"{kind}_{joint}" for kind in ("cmd", "pos")]
+        if all(column in self.chosen for column in pair) and (like := _likeness(*map(self.turned, pair))) is not None:
+            shown.append(f"setpoint and angle go together by {like[1]:.2f} (correlation)")
+        first = (LEGS if joint in LEGS else WHEELS)[0]
+        columns = [f"pos_{joint}", f"pos_{first}"]
+        if joint != first and all(one in self.chosen for one in columns) and (like := _likeness(*map(self.turned, columns))):
+            shown.append(f"it goes with {first} by {like[1]:.2f}")
+        if joint in WHEELS and columns[0] in self.chosen and (like := self._rolls(columns[0])) is not None:
+            shown.append(f"with the pose's way forward by {like[1]:.2f}, {abs(like[0]):.3g} for 1 of the pose")
+        return "; ".join(shown) or "no field of it is known"
+
+    def _rolls(self, column: str) -> tuple[float, float] | None:
+        """Return how a wheel's angle goes with the way along the heading, where a pose shows it."""
+        if not all(f"cam_{axis}" in self.chosen for axis in ("x", "y", "yaw")) or self._unit("cam_yaw") != "rad":
+            return None
+        x, y, yaw = (self.raw(f"cam_{axis}") for axis in ("x", "y", "yaw"))
+        if min(len(one[0]) for one in (x, y, yaw)) < 10:
+            return None
+        heading = np.interp(x[0], *yaw)
+        steps = np.diff(x[1]) * np.cos(heading[1:]) + np.diff(np.interp(x[0], *y)) * np.sin(heading[1:])
+        return _likeness(self.turned(column), (x[0], np.concatenate([[0.0], np.cumsum(steps)])))
+
+    def _imu_shown(self) -> Iterable[str]:
+        if all(f"acc_{axis}" in self.chosen for axis in XYZ):
+            gravity = self._gravity()
+            yield f"acc reads {', '.join(f'{value:.3g}' for value in gravity)} in the median (up is where it is positive)"
+        if all(f"gyro_{axis}" in self.chosen for axis in XYZ):
+            sizes = [float(np.std(self.raw(f"gyro_{axis}")[1])) for axis in XYZ]
+            yield f"gyro varies by {', '.join(f'{size:.3g}' for size in sizes)} (a robot that drives turns about up)"
+
+    def _steps(self, leg: str) -> tuple[float, float]:
+        """Return the largest jump of a leg's setpoint between two, and how far the leg goes at most in a second."""
+        jumps, (t, values) = np.abs(np.diff(self.raw(f"cmd_{leg}")[1])), self.raw(f"pos_{leg}")
+        grid = np.arange(t[0], t[-1] - 0.1, 0.02) if len(t) else np.zeros(0)
+        rates = np.abs(np.interp(grid + 0.1, t, values) - np.interp(grid, t, values)) / 0.1 if len(grid) else np.zeros(0)
+        return float(jumps.max(initial=0.0)), float(rates.max(initial=0.0))
+
+    def _unnamed(self) -> str:
+        """Return which lists have as many elements as a robot has joints of a kind, but no names."""
+        said = []
+        for name, topic in self.log.topics.items():
+            stems = sorted({field.rpartition("[")[0] for field in topic.fields if is_unnamed(topic, field)})
+            long = [stem for stem in stems if f"{stem}[{len(LEGS) - 1}]" in topic.fields]
+            said += [f"topic '{name}': {', '.join(long)}"] if long else []
+        hint = f"say which is which, by place, and suggest again: joints: {{{JOINTS[0]}: '0', ...}}"
+        return f"; lists without names: {'; '.join(said)}; {hint}" if said else ""
+
+    # ---- fields as the map has them ---------------------------------------------------------------------------------
+
+    def _field(self, column: str) -> str:
+        """Return a field, the joint's name in it as ``{joint}``, where three differ in nothing else the axis as ``{axis}``."""
+        one, kind = self.chosen[column], column.partition("_")[0]
+        if column in self.templates:
+            return self.templates[column]
+        axes = "xy" if column in ("cam_x", "cam_y") else XYZ if kind in ("gyro", "acc") else ()
+        fields = [self.chosen[f"{kind}_{axis}"].field for axis in axes if f"{kind}_{axis}" in self.chosen]
+        for place in range(len(fields[0]) if len(fields) == len(axes) > 0 else 0):
+            template = fields[0][:place] + "{axis}" + fields[0][place + 1 :]
+            if [template.replace("{axis}", axis) for axis in axes] == fields:
+                return template
+        return one.field
 
 
-def _every(look: LogSignals, rows: str | None) -> int:
-    """Return of how many messages one makes a row, so that there are about 50 a second."""
-    if rows is None or len(look.log.topics[rows].received) < 3:
-        return 1
-    t, _ = look.raw("pos_leg_lf")
-    rate = 1.0 / float(np.median(np.diff(t)))
-    every = max(round(rate / 50.0), 1)
-    which = f"every {every}th" if every > 1 else "each"
-    look.note("rows", SURE, f"topic '{rows}', {rate:.0f} messages a second; {which} makes a row")
-    return every
+def _joint_fields(chosen: Mapping[str, FieldCandidate], known: Mapping[str, str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return joint -> its name in the log, and column -> field with that name as ``{joint}``, where all its fields have one.
+
+    The name is ours, stands in brackets, or is what the fields of a set of joints differ in: ``fl`` of ``fl_hip_pos``.
+    """
+    ways: list[dict[str, tuple[str, str]]] = [{}, {}, {}]  # column -> name, template
+    for columns in _SETS.values():
+        found = {column: chosen[column] for column in columns if column in chosen and column.partition("_")[2] in JOINTS}
+        fields = [one.field for one in found.values()]
+        before = re.sub(r"[^\W_]+$", "", _common_start(fields))
+        after = re.sub(r"^[^\W_]+", "", _common_start([field[::-1] for field in fields])[::-1])
+        for column, one in found.items():
+            label = column.partition("_")[2]
+            if label in one.field:
+                ways[0][column] = label, one.field.replace(label, "{joint}")
+            if one.joint is not None:
+                ways[1][column] = one.joint, one.field.replace(f"[{one.joint}]", "[{joint}]", 1)
+            ways[2][column] = one.field[len(before) : len(one.field) - len(after)], f"{before}{{joint}}{after}"
+    names, templates = {}, {}
+    for joint in JOINTS:
+        columns = [column for column in chosen if column.partition("_")[2] == joint]
+        for way in ways:
+            found = {way.get(column, ("", ""))[0] for column in columns}
+            if len(found) == 1 and known.get(joint, min(found)) in found - {""}:
+                names[joint] = min(found)
+                templates |= {column: way[column][1] for column in columns}
+                break
+    return names, templates
 
 
-def _joint_names(look: LogSignals) -> dict[str, str]:
-    """Return the joints' names where all fields of a joint have the same one."""
-    names: dict[str, set[str | None]] = {}
-    for column, one in look.chosen.items():
-        label = column.partition("_")[2]
-        if label in JOINTS:
-            names.setdefault(label, set()).add(one.joint)
-    return {joint: str(next(iter(found))) for joint, found in names.items() if len(found) == 1 and None not in found}
+def _common_start(texts: Sequence[str]) -> str:
+    same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*texts, strict=False))
+    return "".join(letters[0] for letters in same)
 
 
-def _channels(
-    look: LogSignals, found: JointFindings, units: Mapping[str, str], names: Mapping[str, str]
-) -> Iterator[tuple[str, ChannelSource]]:
-    for column, one in look.chosen.items():
-        kind, _, label = column.partition("_")
-        if column in ("cam_z", "cam_pitch"):
-            continue  # where the marker sits above the body is not known
-        field, sign, unit = one.field, 1, one.unit
-        if label in JOINTS:
-            unit, sign = found.unit[column], found.sign.get(column, 1)
-            if label in names and one.joint is not None:
-                field = field.replace(one.joint, "{joint}")
-        elif kind in ("gyro", "acc") and label in XYZ:
-            unit = units.get(kind)
-            field = _axis_field(look, kind)
-            sign = look.acc_sign if kind == "acc" else 1
-        elif column == "volt":
-            unit = units.get("volt")
-        elif column in CAMERA and column != "cam_yaw":
-            field = _pose_field(field)
-        si = COLUMNS[column].unit
-        yield column, ChannelSource(topic=one.topic, field=field, unit=None if unit == si else unit, sign=_sign(sign))
+def _behind(log: Log, name: str) -> float | None:
+    """Return how far the recorder's clock is ahead of a topic's headers, s; None where they are no times."""
+    topic = log.topics[name]
+    if topic.stamped is None or len(topic.stamped) < 2:
+        return None
+    steps = np.diff(topic.stamped)
+    if (steps <= 0).mean() > _NO_TIMES or steps.min() < _ANEW:
+        return None
+    return float(np.median(topic.received - topic.stamped)) * 1e-9
 
 
-def _axis_field(look: LogSignals, kind: str) -> str:
-    """Return a field with its axis as ``{axis}``, where the three differ in nothing else."""
-    fields = [look.chosen[f"{kind}_{axis}"].field for axis in XYZ]
-    for place in range(len(fields[0])):
-        template = fields[0][:place] + "{axis}" + fields[0][place + 1 :]
-        if [template.replace("{axis}", axis) for axis in XYZ] == fields:
-            return template
-    return fields[0]
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.1f} ms" if abs(seconds) < 10.0 else f"{seconds:.3f} s"
 
 
-def _pose_field(field: str) -> str:
-    """Return a field of a pose with its axis as ``{axis}``, where it is one of a vector."""
-    ends = tuple(f"{vector}.{axis}" for vector in ("position", "translation") for axis in XYZ)
-    return f"{field[:-1]}{{axis}}" if field.endswith(ends) else field
+def _range(series: Series) -> str:
+    """Return from where to where values go, and where they are at the start, in words."""
+    t, values = series
+    if not len(t):
+        return "has no values"
+    start = float(np.median(values[t <= t[0] + _START]))
+    return f"{values.min():.4g} to {values.max():.4g} ({start:.4g} at the start)"
 
 
-def _grouped(channels: Mapping[str, ChannelSource]) -> dict[str, ChannelSource]:
-    """Return the channels with one entry for those that come from the same place in the same way."""
-    left, grouped = dict(channels), {}
-    for group, members in GROUPS.items():
-        first = left.get(members[0])
-        if first is not None and "{" in first.field and all(left.get(name) == first for name in members):
-            grouped[group] = first
-            left = {name: source for name, source in left.items() if name not in members}
-    return grouped | left
+def _grid(*series: Series) -> Array:
+    """Return where windows begin that all signals cover, 0.1 s apart."""
+    begin, end = max(t[0] for t, _ in series), min(t[-1] for t, _ in series)
+    return np.arange(begin, end - _WINDOW, 0.1)
 
 
-def _sign(value: int) -> Any:
-    return -1 if value < 0 else 1
+def _resampled(series: Series) -> Array:
+    """Return a signal's values a window apart."""
+    t, values = series
+    return np.interp(np.arange(t[0], t[-1], _WINDOW), t, values) if len(t) else values
+
+
+def _likeness(first: Series, second: Series) -> tuple[float, float] | None:
+    """Return how many times as far one signal goes as another, window by window, and their correlation; None = it stands."""
+    if min(len(first[0]), len(second[0])) < 10 or len(grid := _grid(first, second)) < 10:
+        return None
+    a, b = (np.interp(grid + _WINDOW, *one) - np.interp(grid, *one) for one in (first, second))
+    sizes = float(a @ a), float(b @ b)
+    return None if min(sizes) < 1e-18 else (float(a @ b) / sizes[1], float(a @ b) / float(np.sqrt(sizes[0] * sizes[1])))
