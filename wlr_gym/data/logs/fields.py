@@ -127,7 +127,7 @@ def stated_unit(name: str, column: str) -> str | None:
     parts = re.split(r"[\s_.]+", name.lower().strip())
     bracket = re.search(r"[\[(]([^\])]+)[\])]$", name.lower().strip())
     ends = [bracket.group(1).strip() if bracket else "", "/".join(parts[-2:]), parts[-1], *words(name)[-1:]]
-    return next((_UNITS[end] for end in ends if _UNITS.get(end) in units_of(column)), None)
+    return next((_UNITS[end] for end in ends if _UNITS.get(end, "") in units_of(column)), None)
 
 
 def find_candidates(

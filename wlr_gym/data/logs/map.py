@@ -281,7 +281,7 @@ def read_map(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: no YAML, an unknown key, a value of the wrong kind; the message names the nearest valid name.
     """
-    data = read_yaml(path) or {}
+    data: dict[str, Any] = read_yaml(path) or {}
     robot = parse_config(LogMap, decided(data) if isinstance(data, Mapping) else data, str(path)).meta.robot
     if robot is not None and names_file(robot):
         data["meta"]["robot"] = str(Path(path).parent / robot)

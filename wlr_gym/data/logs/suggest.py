@@ -225,14 +225,15 @@ class _Proposer:
         late = {name: _behind(self.log, name) for name in self.topics}
         base = late.get(self.rows) or 0.0
         for name in (one for one in self.topics if one not in self.known.get("clocks", {})):
-            if late[name] is None and self.log.topics[name].stamped is not None:
+            own = late[name]
+            if own is None and self.log.topics[name].stamped is not None:
                 self.clocks[name] = TopicClock(use="log")
                 self.content["clocks"][name] = {"use": "log"}
                 self.note(f"clocks.{name}", "its headers repeat or go back: they are no times", asks=False)
-            elif late[name] is not None and abs(apart := late[name] - base) > _LATE:
+            elif own is not None and abs(apart := own - base) > _LATE:
                 self.clocks[name] = TopicClock(offset=apart)
                 self.content["clocks"][name] = OPEN
-                shown = f"messages arrive {_ms(late[name])} after their header's time, the joints' {_ms(base)} (medians)"
+                shown = f"messages arrive {_ms(own)} after their header's time, the joints' {_ms(base)} (medians)"
                 added = f"{{offset: S}} adds S ({apart:.3f} would make them arrive as the joints' do)"
                 text = f"{{use: header}} trusts the headers, {{use: log}} the recorder's clock, {added}: {shown}"
                 self.note(f"clocks.{name}", f"{text}. {_MATTERS['clocks']}")
