@@ -1,8 +1,7 @@
 """From bags to a gap report: ``report_on`` is all of it. Three minutes (``--quick``: imports only, some seconds).
 
-Give bags of your robot (.mcap, .db3, .bag, folders of rosbag2, CSV), and a map of what their fields mean: ``--suggest`` of
-``wlr import`` writes one that asks what names leave open (docs/own_logs.md). Without any, bags of a simulated robot with a fault
-are made.
+Give bags of your robot (.mcap, .db3, .bag, folders of rosbag2, CSV), and a map of what their fields mean (docs/own_logs.md):
+``wlr import BAG --suggest`` writes one that asks what names leave open. Without any, bags of a simulated robot are made.
 
     python examples/bag_to_gap.py [BAG ... --map map.yaml] [--quick]
 """
