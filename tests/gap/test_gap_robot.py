@@ -43,9 +43,8 @@ from wlr_gym.physics.effects import (
 )
 from wlr_gym.physics.effects.effect import WHEEL_SETS, Search, multiply, steps
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
-from wlr_gym.robot.parameter_table import SPECS
+from wlr_gym.robot.parameter_table import SPECS, read_tolerances
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.robot.tolerance import read_tolerances
 
 NOMINAL = Parameters.nominal(ROBOT)
 KNOBS = {knob.quantity.name: knob for knob in knobs(ROBOT, PHYSICS_STEP)}

@@ -9,7 +9,7 @@ from wlr_gym.base.settings import overlay
 from wlr_gym.cli import BAD_INPUT, FAILED, OK, main
 from wlr_gym.physics.feasibility import examine_robot
 from wlr_gym.robot import Robot, load_robot
-from wlr_gym.robot.interchange.robot_file import robot_over
+from wlr_gym.robot.interchange.recognition import robot_over
 from wlr_gym.robot.outline import QUESTIONS, derived_numbers
 
 REFUSED, FAULT, WARNING = "refused", "fault", "warning"

@@ -9,7 +9,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.interchange import parse_urdf, recognise, urdf_text
-from wlr_gym.robot.interchange.robot_file import robot_over, robot_text
+from wlr_gym.robot.interchange.recognition import robot_over, robot_text
 
 LINK = """
 <link name="{name}">

@@ -6,7 +6,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot import LEGS, WHEELS, load_robot
-from wlr_gym.robot.tolerance import KEYS, UNITS, ParameterTolerance, read_tolerances
+from wlr_gym.robot.parameter_table import KEYS, UNITS, ParameterTolerance, read_tolerances
 
 UNIT = {key: rows[0].unit for key, rows in KEYS.items()}
 #: Unit -> the units of the parameter table that it may state, and its size in them.

@@ -110,7 +110,7 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     """
     from wlr_gym.physics.feasibility import examine_robot
     from wlr_gym.robot import load_robot
-    from wlr_gym.robot.interchange.robot_file import base_beside, of_all, robot_over, robot_text
+    from wlr_gym.robot.interchange.recognition import base_beside, of_all, robot_over, robot_text
     from wlr_gym.robot.outline import QUESTIONS, derived_numbers, question_of
 
     check_new_file(options.out, options.force, endings=ENDINGS)
@@ -243,7 +243,7 @@ def import_robot(options: RobotImportOptions) -> int:
     """
     from wlr_gym.physics.feasibility import examine_robot
     from wlr_gym.robot.interchange import recognise
-    from wlr_gym.robot.interchange.robot_file import base_beside, of_all, robot_over, robot_text
+    from wlr_gym.robot.interchange.recognition import base_beside, of_all, robot_over, robot_text
 
     check_new_file(options.out, options.force, endings=ENDINGS)
     found = recognise(_read(options.file), idealise=options.idealise)

@@ -29,7 +29,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import FlowPort, Hardware
 from wlr_gym.hardware.serial_frames import Device, FrameFormat, FrameStream, SerialDevice, lock
 from wlr_gym.robot import Robot
-from wlr_gym.robot.sensors import FlowSensor
+from wlr_gym.robot.description import FlowSensor
 
 Array = NDArray[np.float64]
 

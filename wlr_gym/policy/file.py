@@ -13,7 +13,7 @@ from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import versions
 from wlr_gym.policy.agents import Config, Contract
 from wlr_gym.robot import load_robot
-from wlr_gym.robot.fingerprint import HASH_FORM
+from wlr_gym.robot.description import HASH_FORM
 
 FORMAT = 1
 CONTRACT_FILE = "contract.json"

@@ -1,8 +1,17 @@
 """The robot as data: its description, the table of its physical parameters, slip. No simulator, no equation of motion."""
 
-from wlr_gym.robot.description import Robot, RobotSource, Vector3, load_robot, physical_faults, robot_content, standing_height
-from wlr_gym.robot.fingerprint import robot_hash, servo_hash
-from wlr_gym.robot.joints import (
+from wlr_gym.robot.description import (
+    Robot,
+    RobotSource,
+    Vector3,
+    load_robot,
+    physical_faults,
+    robot_content,
+    robot_hash,
+    servo_hash,
+    standing_height,
+)
+from wlr_gym.robot.parameter_table import (
     CORNER_NAMES,
     CORNER_SIGNS,
     CORNERS,

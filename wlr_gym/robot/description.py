@@ -1,25 +1,129 @@
-"""The robot's numbers, loaded from ``configs/robot/*.yaml``. SI units and radians; frames as in REP-103.
-
-Joint order everywhere (actions, observations, logs): the four legs, then the four wheels, each lf, rf, lr, rr
-(left/right, front/rear). Leg angle: right-handed about body +y of the vector hip -> wheel centre, 0 forward, pi/2
-straight down. Wheel angle: right-handed about body +y, relative to its leg; positive rolls forward.
-"""
+"""What a robot can measure, and how badly: the section ``sensors`` of its file."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, field_serializer, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_serializer,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, layers_of, overlay, parse_config, read_config
-from wlr_gym.robot.joints import JOINTS
-from wlr_gym.robot.parameter_table import TABLE, range_in_words, spec_of
-from wlr_gym.robot.sensors import SensorSet, Vector3
-from wlr_gym.robot.tolerance import KEYS, ParameterTolerance, read_tolerances
+from wlr_gym.robot.parameter_table import JOINTS, KEYS, TABLE, ParameterTolerance, range_in_words, read_tolerances, spec_of
+
+Vector3 = tuple[float, float, float]
+
+
+class Encoder(SettingsModel):
+    """One register count of position (rad) and velocity (rad/s)."""
+
+    position: float = Field(ge=0)
+    velocity: float = Field(ge=0)
+
+
+class EffortSensor(SettingsModel):
+    """1 sigma noise of the torque estimate (N m)."""
+
+    leg_noise: float = Field(ge=0)
+    wheel_noise: float = Field(ge=0)
+
+
+class ImuSensor(SettingsModel):
+    """Bandwidth (Hz), noise per 50 Hz sample and constant bias, 1 sigma (rad/s, m/s2)."""
+
+    bandwidth: float = Field(gt=0)
+    gyro_noise: float = Field(ge=0)
+    accel_noise: float = Field(ge=0)
+    gyro_bias: float = Field(ge=0)
+    accel_bias: float = Field(ge=0)
+
+
+class CameraSensor(SettingsModel):
+    """Frame rate (Hz) and 1 sigma noise of the floor pose (m, rad)."""
+
+    rate: float = Field(gt=0)
+    position_noise: float = Field(ge=0)
+    yaw_noise: float = Field(ge=0)
+
+
+class FlowSensor(SettingsModel):
+    """Optical-flow sensor that looks along body -z. Numbers: data sheet of the PixArt PMW3901MB unless marked [chosen].
+
+    Attributes:
+        position: of its lens in the body frame (m).
+        field_of_view: full angle (rad), seen by a row of ``pixels``.
+        counts_per_pixel: counts of motion per pixel of shift; not in the data sheet, found by others on the chip.
+        rate: frames per second.
+        noise: 1 sigma of one frame's counts at rest on good texture [chosen]; frames are independent.
+        speed_noise: further 1 sigma, share of the frame's counts [chosen].
+        quality, quality_noise: surface quality on good texture, share of the register's range, and its 1 sigma [chosen].
+        least_quality: below it a reading is not valid: 0x19 of 255.
+        least_height: shortest distance to the floor at which it works (m).
+        greatest_rate: fastest turn of the floor that it measures (rad/s).
+    """
+
+    position: Vector3
+    field_of_view: float = Field(0.733, gt=0, lt=3.0)
+    pixels: int = Field(35, ge=1)
+    counts_per_pixel: float = Field(10.0, gt=0)
+    rate: float = Field(121.0, gt=0)
+    noise: float = Field(0.65, ge=0)
+    speed_noise: float = Field(0.03, ge=0)
+    quality: float = Field(0.35, gt=0, le=1)
+    quality_noise: float = Field(0.03, ge=0)
+    least_quality: float = Field(0.098, ge=0, le=1)
+    least_height: float = Field(0.08, ge=0)
+    greatest_rate: float = Field(7.4, gt=0)
+
+    @property
+    def count(self) -> float:
+        """One count of motion (rad)."""
+        return self.field_of_view / self.pixels / self.counts_per_pixel
+
+
+class SensorSet(SettingsModel):
+    """What the robot can measure, and how badly; ``volt_count`` is one register count of the supply (V).
+
+    ``flow`` is an optical-flow sensor, where one is fitted.
+    """
+
+    control_rate: float = Field(gt=0)
+    encoder: Encoder
+    effort: EffortSensor
+    volt_noise: float = Field(ge=0)
+    volt_count: float = Field(0.1, ge=0)
+    imu: ImuSensor
+    camera: CameraSensor
+    flow: FlowSensor | None = None
+
+    @property
+    def flow_noise(self) -> float:
+        """1 sigma of an optical-flow reading of one control period, at rest on good texture (rad/s); 0 without a sensor."""
+        return 0.0 if self.flow is None else self.flow.noise * self.flow.count * (self.flow.rate * self.control_rate) ** 0.5
+
+    @property
+    def has_flow(self) -> float:
+        """1 where an optical-flow sensor is fitted, else 0."""
+        return 0.0 if self.flow is None else 1.0
+
+    @model_serializer(mode="wrap")
+    def _without_what_is_not_fitted(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content = write(self)
+        return content if self.flow is not None else {key: value for key, value in content.items() if key != "flow"}
+
+
+# --- the robot's numbers, loaded from ``configs/robot/*.yaml``. SI units and radians; frames as in REP-103 ------------
 
 
 class Body(SettingsModel):
@@ -309,3 +413,43 @@ def _read(source: str | Path | Mapping[str, Any]) -> Robot:
 def standing_height(robot: Robot, leg_angle: float) -> float:
     """Height of the body origin above a level floor with all legs at ``leg_angle``, contacts unloaded (m)."""
     return robot.leg.length * math.sin(leg_angle) + robot.wheel.radius - robot.hip_position.z
+
+
+# --- fingerprints of a robot: equal where a simulator reads equal numbers. Policy files carry them, and are refused els
+
+
+#: Of the canonical form; a fingerprint begins with it.
+HASH_FORM = "2"
+#: Keys of a robot file that no motion depends on.
+NOT_MOVING = ("name", "joints", "dynamixel_ids", "tolerances", "sensors.flow")
+#: Keys of a motor that no motion depends on.
+CURRENTS = ("stall_current", "no_load_current", "current_count", "load_count")
+
+
+def robot_hash(robot: Robot) -> str:
+    """Return the fingerprint of the numbers of a robot that a simulator reads."""
+    return _fingerprint("robot", robot)
+
+
+def servo_hash(robot: Robot) -> str:
+    """Return the fingerprint of the numbers of a robot's servos."""
+    return _fingerprint("servo", robot.servo)
+
+
+def _fingerprint(title: str, model: BaseModel) -> str:
+    lines = [f"{title} {HASH_FORM}", *sorted(_lines(model, ""))]
+    return f"{HASH_FORM}-{hashlib.sha256(chr(10).join(lines).encode()).hexdigest()[:16]}"
+
+
+def _lines(model: BaseModel, above: str) -> Iterator[str]:
+    """Yield ``key = value`` of what differs from its default; the keys of ``above`` come before."""
+    for name, field in type(model).model_fields.items():
+        value: Any = getattr(model, name)
+        if above + name in NOT_MOVING or name in CURRENTS or value == field.get_default(call_default_factory=True):
+            continue
+        if isinstance(value, BaseModel):
+            yield from _lines(value, f"{above}{name}.")
+        elif isinstance(value, dict):
+            yield from (f"{above}{name}.{key} = {value[key]!r}" for key in value)
+        else:
+            yield f"{above}{name} = {value!r}"

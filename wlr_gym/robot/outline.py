@@ -10,7 +10,7 @@ from typing import Any
 from wlr_gym.base.errors import InputError, nearest, unknown_name
 from wlr_gym.base.settings import nested
 from wlr_gym.robot.description import Motor, Robot
-from wlr_gym.robot.tolerance import UNITS
+from wlr_gym.robot.parameter_table import UNITS
 
 Answers = dict[str, Any]
 

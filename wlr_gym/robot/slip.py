@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.robot.joints import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE
+from wlr_gym.robot.parameter_table import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from observed_runs import PERIOD, Runs, changed, estimated, observe, simulate, w
 from wlr_gym.perception.observer import SlipObserver, trust
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import load_robot
-from wlr_gym.robot.sensors import FlowSensor
+from wlr_gym.robot.description import FlowSensor
 
 POSE, IS_NEW = SENSOR_LAYOUT.slices["camera_pose"], SENSOR_LAYOUT.slices["camera_is_new"].start
 FLOW, FLOW_IS_NEW = SENSOR_LAYOUT.slices["flow"], SENSOR_LAYOUT.slices["flow_is_new"].start

@@ -15,8 +15,8 @@ from wlr_gym.perception.vision.motion import STANDING, leg_readings
 from wlr_gym.perception.vision.slip import measure_slip
 from wlr_gym.perception.vision.tracking import angles
 from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameter_table import read_tolerances
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.robot.tolerance import read_tolerances
 
 
 @pytest.fixture(scope="module")

@@ -30,8 +30,8 @@ from wlr_gym.physics.plants.forces import Force, force_values, make_force
 from wlr_gym.physics.plants.simulator import Simulator
 from wlr_gym.physics.servo import winding
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.robot.description import FlowSensor
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.robot.sensors import FlowSensor
 
 #: Frames after which the last bit changes of a chip without noise.
 IMU_DITHER = 3

@@ -36,7 +36,7 @@ from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PART
 from wlr_gym.perception.vision.video import Frames
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
-from wlr_gym.robot.joints import CORNER_NAMES
+from wlr_gym.robot.parameter_table import CORNER_NAMES
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:

@@ -1,22 +1,311 @@
-"""The numbers of a robot file in a tree of links, and what of the tree a robot file has no number for."""
+"""A robot as links and joints, as other programs' files describe it. SI units; no file format is known here."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.settings import nested
-from wlr_gym.robot.interchange.links import LinkShape, LinkTree, RigidLink, fuse_fixed
-from wlr_gym.robot.interchange.topology import Assembly, find_assemblies
-from wlr_gym.robot.joints import CORNER_SIGNS, LEGS, WHEELS
+from wlr_gym.base.files import refuse_existing
+from wlr_gym.base.settings import nested, overlay, parse_config
+from wlr_gym.robot.description import Robot, load_robot
+from wlr_gym.robot.parameter_table import CORNER_NAMES, CORNER_SIGNS, CORNERS, LEGS, WHEELS, spec_of
 
 Array = NDArray[np.float64]
+JointKind = Literal["hinge", "slide", "ball", "fixed"]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A frame seen from another one: its origin (3,) in m, and the rotation (3, 3) whose columns are its axes."""
+
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+
+    def __matmul__(self, inner: Placement) -> Placement:
+        """Return ``inner``, which is seen from this frame, as seen from the other one."""
+        return Placement(self.position + self.rotation @ inner.position, self.rotation @ inner.rotation)
+
+    def point(self, place: Array) -> Array:
+        """Return a point of this frame as seen from the other one."""
+        return self.position + self.rotation @ place
+
+
+@dataclass(frozen=True)
+class LinkShape:
+    """One simple shape of a link.
+
+    Attributes:
+        kind: ``box``, ``cylinder``, ``capsule``, ``sphere`` or ``mesh``.
+        size: m. Box: its three lengths; cylinder and capsule: radius and length along their own z axis; sphere: radius.
+        placement: its centre and axes in the link's frame.
+        points: (N, 3) corners of a mesh in its own axes, m; of other shapes none.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    placement: Placement
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+@dataclass(frozen=True)
+class RigidLink:
+    """One rigid body.
+
+    Attributes:
+        name: as in the file.
+        mass: kg.
+        com: (3,) centre of mass in the link's frame, m.
+        inertia: (3, 3) about the centre of mass, axes of the link's frame, kg m2.
+        shapes: of it; of a mesh only what the format's reader knows.
+    """
+
+    name: str
+    mass: float = 0.0
+    com: Array = field(default_factory=lambda: np.zeros(3))
+    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    shapes: tuple[LinkShape, ...] = ()
+
+
+@dataclass(frozen=True)
+class LinkJoint:
+    """One joint, and where its child is when its angle is 0. Numbers that the file does not have are None.
+
+    Attributes:
+        name: as in the file.
+        kind: ``fixed``, ``hinge``, ``slide`` or ``ball``.
+        parent, child: names of links.
+        placement: of the child's frame in the parent's at angle 0.
+        axis: (3,) unit vector through the child's origin, in the child's frame.
+        limits: rad.
+        effort: N m, largest torque of its drive.
+        velocity: rad/s, largest speed of its drive.
+        damping: N m s/rad.
+        friction: N m, of dry gears.
+        armature: kg m2, inertia of the rotor at the joint.
+        home: rad, its angle in the pose that the file is written in.
+    """
+
+    name: str
+    kind: JointKind
+    parent: str
+    child: str
+    placement: Placement
+    axis: Array
+    limits: tuple[float, float] | None = None
+    effort: float | None = None
+    velocity: float | None = None
+    damping: float | None = None
+    friction: float | None = None
+    armature: float | None = None
+    home: float | None = None
+
+
+@dataclass(frozen=True)
+class LinkTree:
+    """Links and joints of one robot.
+
+    Attributes:
+        name: of the robot.
+        source: path of the file, as messages name it.
+        links: by name.
+        joints: in the order of the file.
+        numbers: what else of a robot file the format could hold: dotted key -> value.
+    """
+
+    name: str
+    source: str
+    links: Mapping[str, RigidLink]
+    joints: tuple[LinkJoint, ...]
+    numbers: Mapping[str, float | list[float]] = field(default_factory=dict)
+
+    def root(self) -> RigidLink:
+        """Return the link that is nobody's child.
+
+        Raises:
+            InputError: none, or several.
+        """
+        children = {joint.child for joint in self.joints}
+        roots = [link for name, link in self.links.items() if name not in children]
+        if len(roots) != 1:
+            names = ", ".join(link.name for link in roots) or "none"
+            raise InputError(f"{self.source}: expected one link that is no joint's child, found {len(roots)}: {names}")
+        return roots[0]
+
+
+def fuse_fixed(tree: LinkTree) -> LinkTree:
+    """Return the tree with every link on a fixed joint made a part of its parent.
+
+    Raises:
+        InputError: a joint names a link that is not there, a link has two parents, or the joints go round in a circle.
+    """
+    _check_names(tree)
+    links, joints = dict(tree.links), list(tree.joints)
+    while fixed := next((joint for joint in joints if joint.kind == "fixed"), None):
+        joints.remove(fixed)
+        links[fixed.parent] = _merged(links[fixed.parent], links.pop(fixed.child), fixed.placement)
+        joints = [
+            replace(joint, parent=fixed.parent, placement=fixed.placement @ joint.placement)
+            if joint.parent == fixed.child
+            else joint
+            for joint in joints
+        ]
+    return replace(tree, links=links, joints=tuple(joints))
+
+
+def _check_names(tree: LinkTree) -> None:
+    above: dict[str, str] = {}
+    for joint in tree.joints:
+        for role, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in tree.links:
+                raise InputError(f"{tree.source}: joint '{joint.name}': its {role} '{name}' is no link of the file")
+        if joint.child in above:
+            raise InputError(f"{tree.source}: link '{joint.child}' is the child of two joints: expected a tree")
+        above[joint.child] = joint.parent
+    for name in tree.links:
+        seen, link = set(), name
+        while link in above:
+            if link in seen:
+                raise InputError(f"{tree.source}: link '{link}' is above itself: expected a tree")
+            seen.add(link)
+            link = above[link]
+
+
+def _merged(parent: RigidLink, child: RigidLink, placement: Placement) -> RigidLink:
+    """Return both links as one rigid body in the parent's frame."""
+    shapes = tuple(replace(shape, placement=placement @ shape.placement) for shape in child.shapes)
+    if child.mass == 0.0 and not child.inertia.any():
+        return replace(parent, shapes=(*parent.shapes, *shapes))
+    com = placement.point(child.com)
+    inertia = placement.rotation @ child.inertia @ placement.rotation.T
+    mass = parent.mass + child.mass
+    middle = (parent.mass * parent.com + child.mass * com) / mass if mass else parent.com
+    inertia = parent.inertia + inertia + _shift(parent.mass, parent.com - middle) + _shift(child.mass, com - middle)
+    return RigidLink(parent.name, mass, middle, inertia, (*parent.shapes, *shapes))
+
+
+def _shift(mass: float, offset: Array) -> Array:
+    """Inertia (3, 3) of a mass point about a point that is ``offset`` away."""
+    return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+
+
+# --- four legs of one hinge, each with a driven wheel: found in a tree of links, or what differs is named -------------
+
+
+#: What is expected, in words.
+EXPECTED = "expected four legs of one hinge each, with one wheel each: 8 hinges"
+#: rad; axes that are further from the body's y axis are another robot's.
+AXIS_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """One leg with its wheel, at joint angles 0, in the frame of the body link.
+
+    Attributes:
+        leg_joint, wheel_joint: as in the file.
+        leg, wheel: links.
+        leg_frame, wheel_frame: placements of the links.
+        leg_sign, wheel_sign: 1 where the joint's axis is the body's +y axis, -1 where it is the opposite.
+    """
+
+    leg_joint: LinkJoint
+    wheel_joint: LinkJoint
+    leg: RigidLink
+    wheel: RigidLink
+    leg_frame: Placement
+    wheel_frame: Placement
+    leg_sign: float
+    wheel_sign: float
+
+    @property
+    def wheel_centre(self) -> Array:
+        """The wheel's centre of mass in the body link's frame (3,), m."""
+        return self.wheel_frame.point(self.wheel.com)
+
+
+def find_assemblies(tree: LinkTree) -> tuple[RigidLink, list[Assembly]]:
+    """Return the body link and its legs with their wheels, in the order lf, rf, lr, rr.
+
+    Args:
+        tree: without fixed joints (:func:`wlr_gym.robot.interchange.recognition.fuse_fixed`).
+
+    Raises:
+        InputError: another robot; the message names the joint, link or axis that differs.
+    """
+    where, body = tree.source, tree.root()
+    for joint in tree.joints:
+        if joint.kind != "hinge":
+            raise InputError(f"{where}: joint '{joint.name}' is a {joint.kind}: {EXPECTED}")
+    below: dict[str, list[LinkJoint]] = {name: [] for name in tree.links}
+    for joint in tree.joints:
+        below[joint.parent].append(joint)
+    hips = below[body.name]
+    if len(hips) != 4:
+        names = ", ".join(f"'{joint.name}'" for joint in hips) or "none"
+        raise InputError(f"{where}: {len(hips)} joints on body '{body.name}' ({names}), {len(tree.joints)} in all: {EXPECTED}")
+    assemblies = [_assembly(tree, joint, below) for joint in hips]
+    return body, _in_corner_order(assemblies, where)
+
+
+def _assembly(tree: LinkTree, hip: LinkJoint, below: dict[str, list[LinkJoint]]) -> Assembly:
+    axles = below[hip.child]
+    if not axles:
+        raise InputError(f"{tree.source}: link '{hip.child}' of joint '{hip.name}' carries no wheel: {EXPECTED}")
+    if len(axles) > 1:
+        names = ", ".join(f"'{joint.name}'" for joint in axles)
+        raise InputError(
+            f"{tree.source}: link '{hip.child}' carries {len(axles)} joints ({names}): expected one wheel; {EXPECTED}"
+        )
+    (axle,) = axles
+    if further := below[axle.child]:
+        raise InputError(
+            f"{tree.source}: leg '{hip.name}' has more than one hinge: '{further[0].name}' follows '{axle.name}': {EXPECTED}"
+        )
+    leg_frame = hip.placement
+    wheel_frame = leg_frame @ axle.placement
+    signs = _sign(tree.source, hip, leg_frame), _sign(tree.source, axle, wheel_frame)
+    return Assembly(hip, axle, tree.links[hip.child], tree.links[axle.child], leg_frame, wheel_frame, *signs)
+
+
+def _sign(where: str, joint: LinkJoint, frame: Placement) -> float:
+    """Return whether a joint's axis is +y or -y of the body."""
+    axis = frame.rotation @ joint.axis
+    if np.hypot(axis[0], axis[2]) > AXIS_TOLERANCE:
+        text = ", ".join(f"{value:.4g}" for value in axis)
+        raise InputError(
+            f"{where}: joint '{joint.name}' turns about ({text}) of the body: expected its y axis, (0, 1, 0) or (0, -1, 0), "
+            "with x forward, y to the left and z up (REP-103)"
+        )
+    return float(np.sign(axis[1]))
+
+
+def _in_corner_order(assemblies: list[Assembly], where: str) -> list[Assembly]:
+    """Sort by the hips' places about their middle."""
+    hips = np.array([[one.leg_frame.position[0], one.wheel_centre[1]] for one in assemblies])
+    middle = hips.mean(axis=0)
+    found: dict[str, Assembly] = {}
+    for one, place in zip(assemblies, hips - middle, strict=True):
+        corner = ("l" if place[1] > 0 else "r") + ("f" if place[0] > 0 else "r")
+        if corner in found:
+            raise InputError(
+                f"{where}: joints '{found[corner].leg_joint.name}' and '{one.leg_joint.name}' are both at the "
+                f"{CORNER_NAMES[corner]}: expected one leg at each corner, with x forward and y to the left (REP-103)"
+            )
+        found[corner] = one
+    return [found[corner] for corner in CORNERS]
+
+
+# --- the numbers of a robot file in a tree of links, and what of the tree a robot file has no number for --------------
+
 
 #: Digits that imported numbers keep: what rotations and sums add to the last ones is no part of the file.
 DIGITS = 14
@@ -366,3 +655,85 @@ def _read_home(assemblies: Sequence[Assembly], offsets: Sequence[float], reader:
         reader.notes.append(f"home.leg_angle: legs at {', '.join(f'{angle:.4g}' for angle in angles)} rad: taken from the base")
         return
     reader.put("home.leg_angle", angles[0])
+
+
+# --- text of a robot file over a base, and the robot that it is -------------------------------------------------------
+
+
+#: Width at which a comment starts.
+_COMMENT = 42
+
+
+def robot_text(
+    name: str, base: str, numbers: Mapping[str, Any], *, title: Iterable[str] = (), comments: Mapping[str, str] | None = None
+) -> str:
+    """Return a robot file (YAML).
+
+    Args:
+        name: of the robot.
+        base: config name or path of the robot that has all other numbers.
+        numbers: keys of a robot file -> values, nested as in one.
+        title: lines at its top, as comments.
+        comments: dotted key -> comment beside it.
+    """
+    lines = [*(f"# {line}".rstrip() for line in title), "", f"base: {_scalar(base)}", f"name: {_scalar(name)}", ""]
+    return "\n".join([*lines, *_lines(numbers, "", comments or {})]) + "\n"
+
+
+def _lines(numbers: Mapping[str, Any], above: str, comments: Mapping[str, str]) -> Iterator[str]:
+    indent = "  " * above.count(".")
+    for key, value in numbers.items():
+        if isinstance(value, Mapping):
+            yield f"{indent}{key}:"
+            yield from _lines(value, f"{above}{key}.", comments)
+            if not above:
+                yield ""
+            continue
+        line, comment = f"{indent}{key}: {_scalar(value)}", comments.get(above + key)
+        yield f"{line:<{_COMMENT}} # {comment}" if comment else line
+
+
+def _scalar(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
+
+
+def base_beside(base: str, out: Path) -> str:
+    """Return how a file at ``out`` names its base: a path is seen from the file's own folder."""
+    if not base.endswith((".yaml", ".yml")):
+        return base
+    return Path(os.path.relpath(base, out.parent)).as_posix()
+
+
+def of_all(numbers: Mapping[str, Any], base: str) -> dict[str, Any]:
+    """Return numbers that also remove what the base says of single legs, wheels or servos where they state it of all."""
+    removed = {}
+    for element in load_robot(base, check=False).individual:
+        spec = spec_of(element)
+        found: Any = numbers
+        for key in str(spec.sources[spec.elements.index(element) % len(spec.sources)]).split("."):
+            found = found.get(key) if isinstance(found, Mapping) else None
+        if found is not None:
+            removed[element] = None
+    return {**numbers, "individual": removed} if removed else dict(numbers)
+
+
+def robot_over(base: str, name: str, numbers: Mapping[str, Any], where: Path, *, check: bool = True) -> Robot:
+    """Return the robot that a file at ``where`` with these numbers over ``base`` would be.
+
+    Raises:
+        InputError: as :func:`wlr_gym.robot.load_robot` of that file.
+    """
+    below = load_robot(base, check=False).model_dump(mode="json")
+    robot = parse_config(Robot, overlay(below, {**numbers, "name": name}), str(where))
+    return load_robot(robot, check=check)
+
+
+def new_file(path: Path, *, force: bool) -> None:
+    """Refuse a file that is there, unless it may be replaced, and a folder that is not.
+
+    Raises:
+        InputError: naming it.
+    """
+    refuse_existing(path, force)
+    if not path.parent.is_dir():
+        raise InputError(f"--out {path}: folder {path.parent} does not exist")

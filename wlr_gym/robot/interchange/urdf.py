@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot.description import Robot
-from wlr_gym.robot.interchange.links import JointKind, LinkJoint, LinkShape, LinkTree, Placement, RigidLink
-from wlr_gym.robot.joints import CORNER_SIGNS, LEGS, WHEELS
+from wlr_gym.robot.interchange.recognition import JointKind, LinkJoint, LinkShape, LinkTree, Placement, RigidLink
+from wlr_gym.robot.parameter_table import CORNER_SIGNS, LEGS, WHEELS
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
