@@ -171,7 +171,10 @@ def spawn_seeds(seed: int | None, count: int, *names: str | int) -> NDArray[np.u
     return z ^ (z >> np.uint64(31))
 
 
-# --- compiled draws of many named streams at once, on the counter-based generator of ``wlr_gym.base.random`` ----------
+# ---- draws of many named streams at once -----------------------------------------------------------------------------
+
+# Nothing is consumed from a shared generator: a new stream shifts no other, and a robot draws the same numbers alone or in a
+# batch.
 
 
 _EPISODE = stream_number("episode")

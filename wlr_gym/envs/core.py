@@ -366,7 +366,7 @@ def _mapping(name: str, given: Any) -> Mapping[str, Any]:
     return given
 
 
-# --- snapshots of environments: what a batch of robots must have alike to take one, and where its state lives ---------
+# ---- snapshots: what robots must have alike to take one, and where their state lives ---------------------------------
 
 
 #: Names of the plant's arrays in a snapshot begin with this.
@@ -424,7 +424,7 @@ class Snapshots:
         core.episodes.note_begun(np.isin(np.arange(core.count), index))
 
 
-# --- what is left of a task on a real robot, which has sensors and no truth: the terms that can be measured -----------
+# ---- a task on a real robot, which has sensors and no truth ----------------------------------------------------------
 
 
 #: Channel of the truth -> sensor that measures it.

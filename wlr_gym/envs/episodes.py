@@ -1,7 +1,4 @@
-"""Episodes of N robots, and what the robots are asked within them.
-
-Seeds, lengths and ends are :class:`Episodes`; :class:`Commands` draws what the robots are to follow.
-"""
+"""The episodes of N robots: their seeds and ends, the commands within them, and what of the robots is drawn anew for each."""
 
 from __future__ import annotations
 
@@ -146,7 +143,7 @@ def _word(seed: int) -> int:
     return seed if seed < 2**64 else int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
 
 
-# --- commands: drawn, held for a time, and followed with a limited rate of change -------------------------------------
+# ---- commands: drawn, held for a time, and followed with a limited rate of change ------------------------------------
 
 
 Seeds = NDArray[np.uint64]
@@ -285,7 +282,9 @@ class Commands:
         return values
 
 
-# --- parameters and initial states of the robots: what randomisation draws, then the effects, then which sensors the ta
+# ---- parameters and initial states -----------------------------------------------------------------------------------
+
+# What randomisation draws, then the effects, then which sensors the task gives the robots, then what the user sets.
 
 
 Array = NDArray[np.float64]

@@ -1,4 +1,8 @@
-"""What all interfaces of a batch offer beyond their libraries' own interfaces."""
+"""Environments as Gymnasium knows them: :class:`WlrEnv` (one robot), :class:`WlrVectorEnv` (a batch), and those that ship.
+
+Below are first what all interfaces share, that of Stable-Baselines3 (``sb3.py``) included: their further methods, what they
+say in ``info``, and pictures.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +111,7 @@ class TaskMethods:
         return self.core.contract()
 
 
-# --- what environments say beside observation and reward: the ``info`` of all interfaces, batched. Fresh objects every
+# ---- info: what environments say beside observation and reward, batched; fresh objects every time --------------------
 
 
 Array = NDArray[np.float64]
@@ -205,7 +209,7 @@ def row_of(found: Any, row: int) -> Any:
     return value.copy() if np.ndim(value) else float(value)
 
 
-# --- what an environment shows of its robots: pictures, or a window ---------------------------------------------------
+# ---- pictures, or a window -------------------------------------------------------------------------------------------
 
 
 Picture = NDArray[np.uint8]
@@ -295,7 +299,7 @@ class Pictures:
         return {"time": float(core.time[row]), "command": command}
 
 
-# --- one robot as a ``gymnasium.Env`` ---------------------------------------------------------------------------------
+# ---- one robot -------------------------------------------------------------------------------------------------------
 
 
 # Gymnasium's ``spec`` is a plain attribute; this one completes what is written to it.
@@ -392,7 +396,7 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):  # pyright: ignor
         self.core.close()
 
 
-# --- a batch of robots as a ``gymnasium.vector.VectorEnv`` ------------------------------------------------------------
+# ---- a batch of robots -----------------------------------------------------------------------------------------------
 
 
 # Gymnasium's ``spec`` is a plain attribute; this one completes what is written to it.
@@ -610,7 +614,11 @@ def _merge(infos: dict[str, Any], others: dict[str, Any]) -> None:
             infos[key] = np.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, infos[key])
 
 
-# --- environment classes of the shipped tasks. A task of one's own needs none: see ``register_task`` ------------------
+# ---- the shipped tasks; a task of your own needs no class: see register_task -----------------------------------------
+
+# Each takes the keywords of wlr_gym.envs.settings.EnvironmentOptions. What an environment observes, rewards and measures is
+# data: ``describe()`` prints its tables, ``wlr envs ID`` and docs/environments.md show them. Vector classes name Gymnasium's
+# class among their bases a second time: skrl recognises an environment by its direct bases.
 
 
 # pyright: reportIncompatibleVariableOverride=false

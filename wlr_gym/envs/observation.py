@@ -1,4 +1,8 @@
-"""The observation: readings with noise and bias, kept for a while, and shown as old as their devices make them."""
+"""What a policy sees and what it sets.
+
+Readings get noise and bias, are kept for a while, and are shown as old as their devices make them; actions are checked, and
+turned into setpoints of the joints.
+"""
 
 from __future__ import annotations
 
@@ -226,7 +230,7 @@ def _shown(task: Task, read: list[ObservationColumn]) -> NDArray[np.void]:
     return np.array(rows, SHOWN)
 
 
-# --- actions: checked, and turned into setpoints of the joints --------------------------------------------------------
+# ---- actions ------------------------------------------------ -------------------------------------------------------
 
 
 #: Actions may exceed +-1 by rounding only.

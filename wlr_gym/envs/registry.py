@@ -83,7 +83,7 @@ def enter(env_id: str, task: str, single: str, vector: str, **keywords: Any) -> 
     ENVIRONMENTS[env_id] = task
 
 
-# --- tasks of users, registered from their files ----------------------------------------------------------------------
+# ---- tasks of users --------------------------------------------------------------------------------------------------
 
 
 def register_task(path: str | Path) -> str:

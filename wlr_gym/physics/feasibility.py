@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 
-# --- one thing that is wrong or odd about a robot: the number, and what was expected ----------------------------------
+# ---- findings --------------------------------------------------------------------------------------------------------
 
 
 Level = Literal["fault", "warning"]
@@ -67,7 +67,9 @@ def warning(key: str, value: float | None, unit: str, text: str) -> RobotFinding
     return RobotFinding("warning", key, value, unit, text)
 
 
-# --- the robot at rest on a level floor with its legs at given angles: where it stands, and what each wheel and leg car
+# ---- the robot at rest on a level floor with its legs at given angles ------------------------------------------------
+
+# Front legs share one angle, rear legs another; the body pitches until all wheels touch the floor. Contacts are rigid.
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ def hip_torque(robot: Robot, angle: float, load: float) -> float:
     return abs(math.cos(angle)) * abs(load * leg.length - own)
 
 
-# --- how fast, how steep, how hard a robot drives, turns and stands, by its masses, motors and friction ---------------
+# ---- how fast, how steep, how hard a robot drives, turns and stands --------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -288,7 +290,7 @@ def capability_of(robot: Robot) -> Capability:
     )
 
 
-# --- which numbers of a robot file are odd by themselves, or beside a neighbour: units, sizes, inertias. No mechanics -
+# ---- numbers that are odd by themselves, or beside a neighbour: units, sizes, inertias; no mechanics -----------------
 
 
 class Mistake(NamedTuple):
@@ -469,7 +471,7 @@ def _places(robot: Robot) -> Iterator[RobotFinding]:
         yield warning("leg.com_along_leg", leg.com_along_leg, "m", f"is beyond the wheel: the leg is {leg.length:.4g} m long")
 
 
-# --- what stands against a robot: impossible numbers first; then, if it can be simulated, what it cannot do, by mechani
+# ---- the examination: impossible numbers first; then what the robot cannot do, by mechanics --------------------------
 
 
 #: Of the weight; a wheel that carries less is said.
@@ -633,7 +635,7 @@ def _contact(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
         yield warning("ground.normal_damping", ground.normal_damping, "N s/m", text)
 
 
-# --- motors -----------------------------------------------------------------------------------------------------------
+# ---- motors ----------------------------------------------------------------------------------------------------------
 
 
 def _motors(robot: Robot) -> Iterator[RobotFinding]:

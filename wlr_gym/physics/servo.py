@@ -34,7 +34,7 @@ CYCLE = 1e-3
 BRAKING_RESERVE = 1.02
 
 
-# --- motor ------------------------------------------------------------------------------------------------------------
+# ---- motor -----------------------------------------------------------------------------------------------------------
 
 
 def motor_constants(stall_torque: Value, no_load_speed: Value, nominal_voltage: Value) -> tuple[Value, Value]:
@@ -145,7 +145,7 @@ def reference_per_rate(robot: Robot, parameters: Parameters) -> Array:
     return constant / np.maximum(position_gains(parameters), 1e-9)
 
 
-# --- profile generator ------------------------------------------------------------------------------------------------
+# ---- profile generator -----------------------------------------------------------------------------------------------
 
 
 def profile_limits(profile_velocity: ArrayLike, profile_acceleration: ArrayLike) -> tuple[Array, Array]:
@@ -274,7 +274,7 @@ def _rectangle(to_goal: Value, limit: Value, step: Value) -> tuple[Value, ...]:
     return travel, speed, speed, arrived
 
 
-# --- readings ---------------------------------------------------------------------------------------------------------
+# ---- readings --------------------------------------------------------------------------------------------------------
 
 
 def effort_counts(robot: Robot) -> Array:

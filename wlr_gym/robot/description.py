@@ -1,4 +1,9 @@
-"""What a robot can measure, and how badly: the section ``sensors`` of its file."""
+"""The robot's numbers, loaded from ``configs/robot/*.yaml``. SI units and radians; frames as in REP-103.
+
+Joint order everywhere (actions, observations, logs): the four legs, then the four wheels, each lf, rf, lr, rr
+(left/right, front/rear). Leg angle: right-handed about body +y of the vector hip -> wheel centre, 0 forward, pi/2
+straight down. Wheel angle: right-handed about body +y, relative to its leg; positive rolls forward.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +28,9 @@ from wlr_gym.base.settings import SettingsModel, layers_of, overlay, parse_confi
 from wlr_gym.robot.parameter_table import JOINTS, KEYS, TABLE, ParameterTolerance, range_in_words, read_tolerances, spec_of
 
 Vector3 = tuple[float, float, float]
+
+
+# ---- sensors: what a robot can measure, and how badly ----------------------------------------------------------------
 
 
 class Encoder(SettingsModel):
@@ -123,7 +131,7 @@ class SensorSet(SettingsModel):
         return content if self.flow is not None else {key: value for key, value in content.items() if key != "flow"}
 
 
-# --- the robot's numbers, loaded from ``configs/robot/*.yaml``. SI units and radians; frames as in REP-103 ------------
+# ---- the robot -------------------------------------------------------------------------------------------------------
 
 
 class Body(SettingsModel):
@@ -415,7 +423,13 @@ def standing_height(robot: Robot, leg_angle: float) -> float:
     return robot.leg.length * math.sin(leg_angle) + robot.wheel.radius - robot.hip_position.z
 
 
-# --- fingerprints of a robot: equal where a simulator reads equal numbers. Policy files carry them, and are refused els
+# ---- fingerprints: equal where a simulator reads equal numbers; policy files carry them ------------------------------
+
+# The canonical form is one line ``key = value`` per number, sorted, under a title with the version of the form. A number that
+# has its declared default is left out, so that a new field with a default changes the fingerprint of no robot that does not
+# use it. Not in it: name, bus addresses, order of joints (there is one only) and tolerances; nor what turns a motor's torque
+# into its current and into counts, which changes energy and the rounding of a sensor, but no motion: a policy from
+# ``nominal`` fits ``emanual``; nor an optical-flow sensor: a policy that does not read one fits a robot that has it.
 
 
 #: Of the canonical form; a fingerprint begins with it.

@@ -1,4 +1,8 @@
-"""Names and order of the joints: the four legs, then the four wheels, each lf, rf, lr, rr (left/right, front/rear)."""
+"""THE parameter table: every physical number a simulator reads, once, one line each. Joints by name, and tolerances.
+
+Names are dotted, with the joint, wheel or axis in brackets: ``wheel.radius[wheel_lf]``, ``ground.mu_x[wheel_rr]``,
+``body.com_offset[x]``. Values for a batch of robots: :class:`wlr_gym.robot.parameters.Parameters`.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, nearest, unknown_name
 
+#: Names and order of the joints: the four legs, then the four wheels, each lf, rf, lr, rr (left/right, front/rear).
 CORNERS = ("lf", "rf", "lr", "rr")
 #: Corners in words.
 CORNER_NAMES: dict[str, str] = dict(zip(CORNERS, ("left front", "right front", "left rear", "right rear"), strict=True))
@@ -31,7 +36,7 @@ def full_name(joint: str) -> str:
     return f"{joint} ({CORNER_NAMES[joint.rpartition('_')[2]]})"
 
 
-# --- tHE parameter table: every physical number a simulator reads, once, one line each --------------------------------
+# ---- the table -------------------------------------------------------------------------------------------------------
 
 
 Labels = tuple[str, ...]
@@ -249,7 +254,10 @@ def unknown_parameter(name: str) -> InputError:
     return unknown_name("parameter", name, [*SPECS])
 
 
-# --- how well a number of the robot is known: the tolerances of a robot file, read and checked once, for all who use th
+# ---- tolerances: how well a number of the robot is known -------------------------------------------------------------
+
+# A tolerance is 1 sigma: relative (``0.05``, ``5 %``) or with a unit of the parameter's dimension (``0.2 deg``, ``3 mm``,
+# ``2 mN m``); one for all, or one each for legs and wheels (``0.01 N m s/rad (legs), 2e-3 N m s/rad (wheels)``).
 
 
 #: Symbol -> its size in SI, and the SI symbol of that dimension.

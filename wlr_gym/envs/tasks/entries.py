@@ -268,7 +268,7 @@ def _range(area: AreaConfig, field: str, where: str) -> Range | None:
     return limits
 
 
-# --- distributions and tolerances that randomisation events draw from: quantile functions of one uniform number -------
+# ---- distributions and tolerances that events draw from: quantile functions of one uniform number --------------------
 
 
 def uniform(u: Array, low: Array, high: Array, cut: Array) -> Array:

@@ -1,6 +1,8 @@
 """Named signals that rewards, terminations, measures and computed observations are written with.
 
 The same term runs on numpy arrays (one value per robot) and on trace nodes: only ``read`` differs.
+
+Below them stands what several terms make of the signals: where the robot is, and what a task asks for beyond constant speeds.
 """
 
 from __future__ import annotations
@@ -129,7 +131,7 @@ def norm(x: Value, y: Value) -> Value:
     return ops.sqrt(x * x + y * y)
 
 
-# --- where a robot is, from its true state or from the slip observer's estimate: the same terms run on both -----------
+# ---- where a robot is: the same terms run on its true state and on the slip observer's estimate ----------------------
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,9 @@ def wrapped(angle: Value) -> Value:
     return ops.arctan2(ops.sin(angle), ops.cos(angle))
 
 
-# --- what a task asks for beyond constant speeds: paths on the floor, leg angles that change with time, climbing and ho
+# ---- paths, leg angles that change with time, climbing and holding ---------------------------------------------------
+
+# Everything is a closed function of the held commands, the time and the pose, so nothing is stored from step to step.
 
 
 #: m along the path from the robot to where its curvature is previewed.

@@ -1,4 +1,8 @@
-"""What a task's file says: a YAML file that lists terms with weights, parameters, scales, noise, latency and history."""
+"""Tasks: their files in ``configs/task/``, checked, and what a file means for a robot.
+
+:class:`TaskConfig` is the file, :class:`Task` the file resolved for a robot: the columns of its observations and of its action.
+How well an episode went is said here too, by one definition for environments and cards.
+"""
 
 from __future__ import annotations
 
@@ -312,7 +316,7 @@ def _check_commands(config: TaskConfig, where: str) -> None:
                 raise InputError(f"{where}: {term} needs the command '{command}', which commands.terms does not give")
 
 
-# --- a task, resolved for a robot: the columns of its observations and of its action ----------------------------------
+# ---- a task, resolved for a robot ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -520,7 +524,7 @@ def bounds(columns: tuple[ObservationColumn, ...]) -> tuple[np.ndarray, np.ndarr
     return -high, high
 
 
-# --- how well an episode went: its tracking error, and whether it was a success. One definition, for environments and c
+# ---- tracking error and success of an episode ------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]

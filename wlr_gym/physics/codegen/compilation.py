@@ -1,4 +1,8 @@
-"""Compile generated source with numba and keep it: the second start loads machine code from the per-user cache."""
+"""From straight-line source to machine code that is kept: the second start loads it from the per-user cache.
+
+Three parts: modules of generated source, compiled by numba and cached; blocks of straight-line source, lowered to LLVM without
+numba's own analysis of them; and what numba lacks.
+"""
 
 from __future__ import annotations
 
@@ -117,7 +121,11 @@ def _write_whole(path: Path, text: str) -> None:
     os.replace(temporary, path)
 
 
-# --- straight-line source as LLVM instructions, without numba's own analysis of it: four fifths of a large kernel's com
+# ---- straight-line source as LLVM instructions -----------------------------------------------------------------------
+
+# numba's own analysis takes four fifths of a large kernel's compile time. The source is what ``emit`` prints. Each operation
+# becomes the one instruction that numba would choose: strict IEEE, ``fma`` with one rounding. The results are numba's own, to
+# the bit (``tests/physics/codegen/test_straight_line.py``).
 
 
 _NUMBERS = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
@@ -217,7 +225,7 @@ class _Lowering:
         return self.builder.call(function, arguments)
 
 
-# --- what numba lacks: fused multiply-add, choice without a branch, arrays by address, whole vector registers ---------
+# ---- what numba lacks: fused multiply-add, choice without a branch, arrays by address, whole vector registers --------
 
 
 @intrinsic

@@ -1,4 +1,4 @@
-"""What an effect is: data about it, and a function that writes it into the parameter table."""
+"""What an effect is: data about it, a function that writes it into the parameter table, and how runs are searched for it."""
 
 from __future__ import annotations
 
@@ -196,7 +196,10 @@ def xyz(
     }
 
 
-# --- what a search for a missing effect must know of it: where to look, where to start, which motion shows it ---------
+# ---- how a search looks for an effect that is missing ----------------------------------------------------------------
+
+# A first guess comes from projecting the measured gap on simulated responses to small changes of the model. A place's response
+# serves every set that holds it, so all sets cost no more than the single places.
 
 
 Places = tuple[str, ...]

@@ -1,4 +1,7 @@
-"""Effects in the joints: gears, motors, their supply, and how commands reach them."""
+"""The library of effects: joints, floor, body and sensors, one definition each.
+
+Names, parameters and places are the project's fixed vocabulary.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +88,7 @@ def _ripple(values: Sequence[float]) -> dict[str, float]:
     return {"amplitude": math.hypot(sine, cosine), "order": order, "phase": math.atan2(cosine, sine)}
 
 
-JOINTS_EFFECTS: tuple[Effect, ...] = (
+JOINT_EFFECTS: tuple[Effect, ...] = (
     Effect(
         "coulomb_friction",
         "dry friction in a joint on top of its own",
@@ -204,7 +207,7 @@ JOINTS_EFFECTS: tuple[Effect, ...] = (
 )
 
 
-# --- effects of the floor, and of the wheels on it --------------------------------------------------------------------
+# ---- floor, and the wheels on it -------------------------------------------------------------------------------------
 
 
 #: Plausible coefficients of a floor.
@@ -456,7 +459,7 @@ GROUND_EFFECTS: tuple[Effect, ...] = (
 )
 
 
-# --- effects on the body: what it carries and what pulls at it --------------------------------------------------------
+# ---- body: what it carries and what pulls at it ----------------------------------------------------------------------
 
 
 def _add_payload(parameters: Parameters, where: Sequence[str], values: Values) -> None:
@@ -630,7 +633,7 @@ BODY_EFFECTS: tuple[Effect, ...] = (
 )
 
 
-# --- effects in the sensors: the robot moves as before, what it reads is wrong ----------------------------------------
+# ---- sensors: the robot moves as before, what it reads is wrong ------------------------------------------------------
 
 
 _ANGLES = {
@@ -646,7 +649,7 @@ def _imu_guesses(where: Places, observed: Observed) -> list[Guess]:
     return [along(turn, *({**neutral, axis: turn} for axis in _ANGLES))]
 
 
-SENSORS_EFFECTS: tuple[Effect, ...] = (
+SENSOR_EFFECTS: tuple[Effect, ...] = (
     Effect(
         "joint_zero_offset",
         "zero of the encoder is wrong; the servo regulates the reading",
@@ -721,7 +724,7 @@ SENSORS_EFFECTS: tuple[Effect, ...] = (
 )
 
 
-# --- the library: every named effect, one definition each. Names, parameters and places are the project's fixed vocabul
+# ---- all of them -----------------------------------------------------------------------------------------------------
 
 
 class Library(dict[str, Effect]):
@@ -735,7 +738,7 @@ class Library(dict[str, Effect]):
 
 #: Effects by name, joints first, then ground, body and sensors.
 EFFECTS = Library(
-    {effect.name: effect for family in (JOINTS_EFFECTS, GROUND_EFFECTS, BODY_EFFECTS, SENSORS_EFFECTS) for effect in family}
+    {effect.name: effect for family in (JOINT_EFFECTS, GROUND_EFFECTS, BODY_EFFECTS, SENSOR_EFFECTS) for effect in family}
 )
 
 #: What is missing but in no library: a formula for a generalised force (:mod:`wlr_gym.physics.plants.forces`).
@@ -747,7 +750,7 @@ def stage(name: str) -> int:
     return STAGES.index(EFFECTS[name].stage) if name in EFFECTS else len(STAGES)
 
 
-# --- words about effects and formulas, made from the data they run on: for the documentation and the command line -----
+# ---- words about effects, for the documentation and the command line -------------------------------------------------
 
 
 _PLACES = {JOINTS: "joints", LEGS: "legs", WHEELS: "wheels"}

@@ -235,7 +235,7 @@ def _require_keys(data: Mapping[str, Any], valid: Sequence[str] | Mapping[str, A
             raise unknown_name("key", str(key), valid, place)
 
 
-# --- unknown effects: a formula for a generalised force, as the gap workflow reports what no named effect explains ----
+# ---- unknown effects: a formula for a generalised force --------------------------------------------------------------
 
 
 KEYS = ("name", "where", "formula", "parameters", "units")

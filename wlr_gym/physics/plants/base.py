@@ -402,7 +402,7 @@ class Plant(Protocol):
         ...
 
 
-# --- which real robot ``backend="dynamixel"`` drives, and how it is connected -----------------------------------------
+# ---- which real robot ``backend="dynamixel"`` drives, and how it is connected ----------------------------------------
 
 
 @dataclass(frozen=True)

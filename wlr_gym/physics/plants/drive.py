@@ -344,7 +344,7 @@ def finish(
     return out
 
 
-# --- gears between motors and joints: what they pass on, and teeth that meet where they have play. See ``drive.py`` ---
+# ---- gears: what they pass on, and teeth that meet where they have play ----------------------------------------------
 
 
 #: Damping of meeting teeth over sqrt(stiffness x rotor inertia): 0.7 of critical for the rotor against a wall.

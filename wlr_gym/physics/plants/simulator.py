@@ -293,7 +293,7 @@ def _checked(seeds: Any, count: int) -> NDArray[np.uint64]:
     return found
 
 
-# --- delayed setpoints: a command acts some time after it was written, per joint and robot ----------------------------
+# ---- delayed setpoints: a command acts some time after it was written, per joint and robot ---------------------------
 
 
 class Setpoints(Protocol):

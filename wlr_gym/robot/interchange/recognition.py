@@ -1,4 +1,8 @@
-"""A robot as links and joints, as other programs' files describe it. SI units; no file format is known here."""
+"""A robot as links and joints, as other programs' files describe it, and the robot file that says the same. SI units.
+
+No file format is known here. Four legs of one hinge, each with a driven wheel, are found in a tree of links, or what differs is
+named; then the numbers of a robot file are read off, and what has no number there is listed.
+"""
 
 from __future__ import annotations
 
@@ -197,7 +201,7 @@ def _shift(mass: float, offset: Array) -> Array:
     return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
 
 
-# --- four legs of one hinge, each with a driven wheel: found in a tree of links, or what differs is named -------------
+# ---- topology --------------------------------------------------------------------------------------------------------
 
 
 #: What is expected, in words.
@@ -304,7 +308,7 @@ def _in_corner_order(assemblies: list[Assembly], where: str) -> list[Assembly]:
     return [found[corner] for corner in CORNERS]
 
 
-# --- the numbers of a robot file in a tree of links, and what of the tree a robot file has no number for --------------
+# ---- numbers ---------------------------------------------------------------------------------------------------------
 
 
 #: Digits that imported numbers keep: what rotations and sums add to the last ones is no part of the file.
@@ -432,7 +436,7 @@ def recognise(tree: LinkTree, *, idealise: bool = False) -> ImportedRobot:
     return ImportedRobot(tree.name, nested(reader.numbers), joints, reader.notes)
 
 
-# --- body -------------------------------------------------------------------------------------------------------------
+# ---- body ------------------------------------------------------------------------------------------------------------
 
 
 def _hips(assemblies: Sequence[Assembly]) -> Array:
@@ -498,7 +502,7 @@ def _require_mass(link: RigidLink, source: str) -> None:
         raise InputError(f"{source}: link '{link.name}': mass = {link.mass:g} kg: expected more than 0")
 
 
-# --- legs -------------------------------------------------------------------------------------------------------------
+# ---- legs ------------------------------------------------------------------------------------------------------------
 
 
 def _leg_geometry(one: Assembly, source: str) -> tuple[float, float]:
@@ -556,7 +560,7 @@ def _leg_axes(angle: float) -> Array:
     return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
 
-# --- wheels -----------------------------------------------------------------------------------------------------------
+# ---- wheels ----------------------------------------------------------------------------------------------------------
 
 
 def _read_wheels(assemblies: Sequence[Assembly], reader: _Reader) -> None:
@@ -603,7 +607,7 @@ def _wheel_size(one: Assembly, reader: _Reader) -> tuple[float, float | None]:
     return radius, width
 
 
-# --- drives -----------------------------------------------------------------------------------------------------------
+# ---- drives ----------------------------------------------------------------------------------------------------------
 
 
 #: Field of a joint -> key of a motor in a robot file, and its unit.
@@ -657,7 +661,7 @@ def _read_home(assemblies: Sequence[Assembly], offsets: Sequence[float], reader:
     reader.put("home.leg_angle", angles[0])
 
 
-# --- text of a robot file over a base, and the robot that it is -------------------------------------------------------
+# ---- a robot file over a base ----------------------------------------------------------------------------------------
 
 
 #: Width at which a comment starts.

@@ -30,7 +30,7 @@ _KINDS: dict[str, JointKind] = {"fixed": "fixed", "revolute": "hinge", "continuo
 ElementTree.register_namespace("drake", DRAKE)
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
+# ---- writing ---------------------------------------------------------------------------------------------------------
 
 
 def urdf_text(robot: Robot) -> str:
@@ -115,7 +115,7 @@ def _text(values: object) -> str:
     return " ".join(repr(float(value)) for value in np.asarray(values, np.float64).ravel())
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
+# ---- reading ---------------------------------------------------------------------------------------------------------
 
 
 def parse_urdf(text: str, source: str) -> LinkTree:

@@ -158,7 +158,10 @@ def climb_command(signals: Signals) -> list[Value]:
     return [climb_speed(signals)]
 
 
-# --- the hand-written controller as an observation: its action and what it remembers, for a policy that acts on top of
+# ---- the hand-written controller, for a policy that acts on top of it ------------------------------------------------
+
+# The law of the agent ``slip_compensating`` (wlr_gym.policy.control), whose gains the task's ``controller`` gives. What it
+# remembers is its own value of the step before, so that the policy needs no memory.
 
 
 #: What the controller remembers: integrals of the errors of yaw rate (rad/s) and forward velocity (m/s), times their gains, and

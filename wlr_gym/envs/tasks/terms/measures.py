@@ -1,4 +1,9 @@
-"""Scalar terms: functions of named signals that are traced into one compiled kernel per task."""
+"""Scalar terms: functions of named signals that are traced into one compiled kernel per task. Measures and terminations.
+
+Measures are signed errors and other quantities, in SI units, that evaluations report and a task's success is judged by. They
+speak of the true motion, and do not enter the reward. An episode ends (``terminated``) in the step in which a termination term
+is greater than zero.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +81,7 @@ def registered(
     return enter
 
 
-# --- measures: signed errors and other quantities, in SI units, that evaluations report and a task's success is judged
+# ---- measures --------------------------------------------------------------------------------------------------------
 
 
 MEASURES: dict[str, ScalarTerm] = {}
@@ -137,7 +142,7 @@ def slip_speed(signals: Signals) -> Value:
     return mean([norm(x, y) for x, y in zip(slip[0::2], slip[1::2], strict=True)]) / period
 
 
-# --- termination terms: the episode ends (``terminated``) in the step in which a term is greater than zero ------------
+# ---- terminations ----------------------------------------------------------------------------------------------------
 
 
 TERMINATIONS: dict[str, ScalarTerm] = {}

@@ -341,7 +341,7 @@ def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]
     return lower, inverse_diagonal
 
 
-# --- the kick's friction: one pass of exact block coordinate descent over contacts, gears and rolling resistance ------
+# ---- friction: one pass of exact block coordinate descent over contacts, gears and rolling resistance ----------------
 
 
 def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:

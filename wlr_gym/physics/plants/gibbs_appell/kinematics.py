@@ -1,4 +1,4 @@
-"""The engine's lanes by name: what a step keeps, what it reads, and what it shows.
+"""The engine's lanes by name (what a step keeps, reads and shows), and the geometry of the wheels on the floor.
 
 Every function of the step maps lanes (state, parameters, inputs; each a scalar) to new lanes.
 """
@@ -91,7 +91,7 @@ FORMULA_INPUTS: tuple[str, ...] = tuple(f"formula_input_{name}" for name in INPU
 FORMULA_OUTPUTS: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
 
 
-# --- vectors, turns, and the geometry of the wheels on the floor, as generic scalar arithmetic ------------------------
+# ---- vectors, turns, and the wheels on the floor ---------------------------------------------------------------------
 
 
 def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:

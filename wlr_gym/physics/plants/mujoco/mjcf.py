@@ -238,7 +238,9 @@ def _set_contact_springs(model: mujoco.MjModel, row: Parameters) -> None:
         model.pair_solref[pair] = -scale * stiffness, -scale * damping
 
 
-# --- robots as MJCF files: the MuJoCo plant's model written in full digits, and models of others read as links and join
+# ---- files: the plant's model written in full digits, and models of others read as links and joints ------------------
+
+# MuJoCo compiles what is read, so default classes, frames, includes, meshes and inertias from shapes mean what they mean there.
 
 
 # pyright: reportAttributeAccessIssue=false
@@ -256,7 +258,7 @@ _JOINT = mujoco.mjtJoint
 _SPAN = 1e-9
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
+# ---- writing ---------------------------------------------------------------------------------------------------------
 
 
 def mjcf_text(robot: Robot) -> str:
@@ -326,7 +328,7 @@ def _write(element: ElementTree.Element, **numbers: Any) -> None:
             element.set(name, " ".join(repr(float(value)) for value in np.ravel(values)[:count]))
 
 
-# --- reading ----------------------------------------------------------------------------------------------------------
+# ---- reading ---------------------------------------------------------------------------------------------------------
 
 
 def read_mjcf(path: str | Path) -> LinkTree:
@@ -504,7 +506,7 @@ def _turned(axis: Array, angle: float) -> Array:
     return quaternion
 
 
-# --- gravity, home pose, floor ----------------------------------------------------------------------------------------
+# ---- gravity, home pose, floor ---------------------------------------------------------------------------------------
 
 
 def _scene_numbers(model: Any, base: int, source: str) -> dict[str, float | list[float]]:

@@ -177,7 +177,7 @@ class MujocoPlant(Simulator):
         """Nothing to release."""
 
 
-# --- a batch of robots in MuJoCo: one model, per-robot numbers as expanded fields, live arrays for the substep kernel -
+# ---- a batch in MuJoCo: one model, per-robot numbers as expanded fields, live arrays for the substep kernel ----------
 
 
 # pyright: reportAttributeAccessIssue=false

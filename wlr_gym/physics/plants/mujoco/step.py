@@ -363,7 +363,7 @@ def formula_inputs(lanes: Lanes) -> Out:
     return {name: seen[name] for name in INPUTS_OF_FORMULAS}
 
 
-# --- forces under a wheel that MuJoCo does not have: rolling resistance and tyre creep; see ``step.py`` ---------------
+# ---- under a wheel: rolling resistance and tyre creep, which MuJoCo does not have ------------------------------------
 
 
 #: Gains of the integral hold of rolling resistance on the spin and on its change, in wheel inertia over the step.
