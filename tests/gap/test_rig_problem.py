@@ -16,7 +16,7 @@ from wlr_gym.gap.rig.pendulum_recordings import read_recordings
 from wlr_gym.gap.rig.problem import LOST, law_candidates
 from wlr_gym.gap.selection.search import search_effects
 from wlr_gym.gap.validation.data_split import named_split
-from wlr_gym.physics.effects.effect import PatchEffect
+from wlr_gym.physics.effects import PatchEffect
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "xl330_pendulum"
 LOADED = Bench(load_ratio=0.15)

@@ -117,7 +117,7 @@ class Settings:
                 raise unknown_name("wheel", str(wheel), WHEELS, "free_wheels")
         if self.episode_length is not None and not 0 < self.episode_length < float("inf"):
             raise InputError(f"episode_length = {self.episode_length!r}: expected a time above 0 s")
-        if read_view(self.view).path:
+        if self.view is not None and read_view(self.view).path:
             raise InputError("view: path = True: only films show a path (wlr play --video FILE --path), no environment does")
         if self.is_real:
             self._check_real()

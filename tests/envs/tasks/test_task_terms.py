@@ -17,7 +17,7 @@ from wlr_gym.envs.tasks.compiled_terms import compile_computed, compile_scores
 from wlr_gym.envs.tasks.signals import PlanarPose, Signals, true_pose
 from wlr_gym.envs.tasks.task import limits_of, scales_of, succeeded
 from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, ScalarTerm
-from wlr_gym.envs.tasks.terms.computed import ComputedTerm
+from wlr_gym.envs.tasks.terms.observations import ComputedTerm
 from wlr_gym.learning.evaluation.metrics import errors_of
 from wlr_gym.learning.evaluation.rollout import Measure
 from wlr_gym.robot import load_robot

@@ -9,7 +9,7 @@ from simulators import ROBOT
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantOptions
-from wlr_gym.physics.plants.gibbs_appell.kernel import OUTPUTS
+from wlr_gym.physics.plants.gibbs_appell.kernel import outputs
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT
 from wlr_gym.robot import JOINTS, WHEELS
@@ -28,8 +28,8 @@ def kernel_name(element):
 
 
 def test_kernel_writes_its_columns_in_the_layouts_order():
-    assert list(OUTPUTS[: TRUTH_LAYOUT.width]) == [kernel_name(element) for element in TRUTH_LAYOUT.elements]
-    raw = OUTPUTS[TRUTH_LAYOUT.width :]
+    assert list(outputs()[: TRUTH_LAYOUT.width]) == [kernel_name(element) for element in TRUTH_LAYOUT.elements]
+    raw = outputs()[TRUTH_LAYOUT.width :]
     assert len(raw) == RAW_LAYOUT.width + 1  # the heading's cosine and sine stand for the yaw
     assert raw[-2:] == ("heading_cosine", "heading_sine")
 

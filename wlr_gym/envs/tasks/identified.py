@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.envs.tasks.entries import EventConfig
+from wlr_gym.physics import effects
 from wlr_gym.physics.codegen.expression import finite_number
-from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, TABLE
 from wlr_gym.robot.parameters import HIGH, Parameters
@@ -128,8 +128,8 @@ def _effect_events(entry: Any, robot: Parameters, place: str) -> list[EventConfi
     name: Any = _mapping(entry, place).get("name")
     if name == "unknown_effect":
         raise InputError(f"{place}: a formula has no place in the parameter table: pass the result's patch as effects= instead")
-    if name not in EFFECTS:
-        raise unknown_name("effect", str(name), EFFECTS, place)
+    if name not in effects.EFFECTS:
+        raise unknown_name("effect", str(name), effects.EFFECTS, place)
     given = _mapping(entry.get("parameters") or {}, f"{place}.parameters")
     estimates = {key: _estimate(value, "value", f"{place} ({name}).{key}") for key, value in given.items()}
     values = {key: value for key, (value, _, _) in estimates.items()}
@@ -139,7 +139,7 @@ def _effect_events(entry: Any, robot: Parameters, place: str) -> list[EventConfi
         raise InputError(f"{place}: {error}") from None
     variance = np.zeros(len(elements))
     for key, (_, low, high) in estimates.items():
-        bounds = EFFECTS[name].parameters[key]
+        bounds = effects.EFFECTS[name].parameters[key]
         ends = [values | {key: min(max(end, bounds.low), bounds.high)} for end in (low, high)]
         first, last = (_numbers(name, entry.get("where"), end, robot, elements, operations) for end in ends)
         variance += ((last - first) / _TWO_SIDED_95) ** 2
@@ -182,4 +182,4 @@ def _numbers(
 
 def _applied(name: str, where: Any, values: Mapping[str, float], start: Array) -> Array:
     entry = {"name": name, "parameters": dict(values)} | ({} if where is None else {"where": where})
-    return apply_patch(load_patch([entry]), Parameters(start[None].copy())).values[0]
+    return effects.apply_patch(effects.load_patch([entry]), Parameters(start[None].copy())).values[0]

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import reduce
+from functools import cache, reduce
 from typing import Any
 
 import numpy as np
@@ -58,8 +58,8 @@ class Unit:
         return self * other**-1
 
     def __str__(self) -> str:
-        if self in _NAMED:
-            return _NAMED[self]
+        if self in _named_units():
+            return _named_units()[self]
 
         def powers(sign: int) -> list[str]:
             found = [(name, sign * x) for name, x in zip(_BASE, self.exponents, strict=True) if sign * x > 0]
@@ -108,10 +108,11 @@ def _power(factor: str, whole: str) -> Unit:
     return Unit(tuple(map(Fraction, UNITS[match[1]]))) ** int(match[2] or 1)
 
 
-#: Units that have a shorter name than their product of powers.
-_NAMED: dict[Unit, str] = {PURE: "pure number"} | {
-    parse_unit(text): text for text in ("N", "N m", "N s/m", "N m s/rad", "W", "V", "ohm", "V s")
-}
+@cache
+def _named_units() -> dict[Unit, str]:
+    """Units that have a shorter name than their product of powers."""
+    named = ("N", "N m", "N s/m", "N m s/rad", "W", "V", "ohm", "V s")
+    return {PURE: "pure number"} | {parse_unit(text): text for text in named}
 
 
 # ---- the tree --------------------------------------------------------------------------------------------------------

@@ -75,39 +75,14 @@ class Effect:
     stage: str = "addition"
     search: Search | None = None
 
+    @property
+    def order(self) -> int:
+        """Place of its stage in the order of application."""
+        return STAGES.index(self.stage)
+
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise unknown_name("stage", self.stage, STAGES, f"effect '{self.name}'")
-
-
-@dataclass(frozen=True)
-class PatchEffect:
-    """One effect of a patch.
-
-    Attributes:
-        name: of the library, or ``unknown_effect``.
-        where: places it acts on.
-        parameters: its numbers, SI; optional ones that are left out are neutral.
-        formula, units: law of an unknown effect and the units of its parameters; empty for an effect of the library.
-        place: where it was read, for messages; does not count in comparisons.
-    """
-
-    name: str
-    where: tuple[str, ...]
-    parameters: Mapping[str, float]
-    formula: str = ""
-    units: Mapping[str, str] = field(default_factory=dict)
-    place: str = field(default="", compare=False)
-
-    def content(self) -> dict[str, Any]:
-        """Return the effect as plain YAML types."""
-        content: dict[str, Any] = {"name": self.name, "where": list(self.where)}
-        if self.formula:
-            content["formula"] = self.formula
-        content["parameters"] = dict(self.parameters)
-        if self.units:
-            content["units"] = dict(self.units)
-        return content
 
 
 # ---- the usual ways to write into the table --------------------------------------------------------------------------

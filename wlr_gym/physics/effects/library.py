@@ -15,7 +15,6 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.physics.effects.effect import (
     JOINT_SETS,
     LEG_SETS,
-    STAGES,
     WHEEL_SETS,
     Change,
     Coordinate,
@@ -740,14 +739,6 @@ class Library(dict[str, Effect]):
 EFFECTS = Library(
     {effect.name: effect for family in (JOINT_EFFECTS, GROUND_EFFECTS, BODY_EFFECTS, SENSOR_EFFECTS) for effect in family}
 )
-
-#: What is missing but in no library: a formula for a generalised force (:mod:`wlr_gym.physics.plants.forces`).
-UNKNOWN_EFFECT = "unknown_effect"
-
-
-def stage(name: str) -> int:
-    """Return the place of an effect in the order of application; formulas come last."""
-    return STAGES.index(EFFECTS[name].stage) if name in EFFECTS else len(STAGES)
 
 
 # ---- words about effects, for the documentation and the command line -------------------------------------------------

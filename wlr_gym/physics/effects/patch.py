@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -25,11 +25,48 @@ from wlr_gym.base.files import write_text
 from wlr_gym.base.paths import find_config
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.physics.codegen.expression import finite_number
-from wlr_gym.physics.effects.effect import Effect, EffectParameter, PatchEffect
-from wlr_gym.physics.effects.library import EFFECTS, UNKNOWN_EFFECT, stage
-from wlr_gym.physics.plants.forces import COORDINATES, Force, make_force
+from wlr_gym.physics.plants.base import COORDINATES
 from wlr_gym.robot.parameter_table import range_in_words, unit_in_words
 from wlr_gym.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from wlr_gym.physics.effects.effect import Effect, EffectParameter
+    from wlr_gym.physics.plants.forces import Force
+
+#: What is missing but in no library: a formula for a generalised force (:mod:`wlr_gym.physics.plants.forces`).
+UNKNOWN_EFFECT = "unknown_effect"
+#: Keys of such an effect in a patch file.
+KEYS = ("name", "where", "formula", "parameters", "units")
+
+
+@dataclass(frozen=True)
+class PatchEffect:
+    """One effect of a patch.
+
+    Attributes:
+        name: of the library, or ``unknown_effect``.
+        where: places it acts on.
+        parameters: its numbers, SI; optional ones that are left out are neutral.
+        formula, units: law of an unknown effect and the units of its parameters; empty for an effect of the library.
+        place: where it was read, for messages; does not count in comparisons.
+    """
+
+    name: str
+    where: tuple[str, ...]
+    parameters: Mapping[str, float]
+    formula: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+    place: str = field(default="", compare=False)
+
+    def content(self) -> dict[str, Any]:
+        """Return the effect as plain YAML types."""
+        content: dict[str, Any] = {"name": self.name, "where": list(self.where)}
+        if self.formula:
+            content["formula"] = self.formula
+        content["parameters"] = dict(self.parameters)
+        if self.units:
+            content["units"] = dict(self.units)
+        return content
 
 
 @dataclass(frozen=True)
@@ -79,7 +116,7 @@ def load_patch(source: Source) -> Patch:
         case None:
             return Patch()
         case str() | Path():
-            if source in (*EFFECTS, UNKNOWN_EFFECT):
+            if source in (*_library(), UNKNOWN_EFFECT):
                 raise InputError(
                     f"'{source}' is an effect, not a patch: write a file with its numbers (wlr effects {source}), "
                     f"or give it as a mapping in Python: {{'name': '{source}', 'parameters': {{...}}}}"
@@ -146,10 +183,10 @@ def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
         InputError: an effect that these parameters cannot take, or a result outside the bounds of the table.
     """
     patched = parameters.copy()
-    for effect in sorted(patch.effects, key=lambda effect: stage(effect.name)):
-        if effect.name == UNKNOWN_EFFECT:
-            continue
-        kind = EFFECTS[effect.name]
+    named = [effect for effect in patch.effects if effect.name != UNKNOWN_EFFECT]
+    kinds = _library() if named else {}
+    for effect in sorted(named, key=lambda effect: kinds[effect.name].order):
+        kind = kinds[effect.name]
         neutral = {name: float(spec.neutral) for name, spec in kind.parameters.items() if spec.optional}
         try:
             kind.apply(patched, effect.where, {**neutral, **effect.parameters})
@@ -157,6 +194,13 @@ def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
         except InputError as error:
             raise InputError(f"{effect.place or effect.name}: {error}") from None
     return patched
+
+
+def _library() -> Mapping[str, Effect]:
+    """Return the library, which loads when a patch has effects."""
+    from wlr_gym.physics.effects.library import EFFECTS
+
+    return EFFECTS
 
 
 # ---- reading ---------------------------------------------------------------------------------------------------------
@@ -185,10 +229,10 @@ def _parse_effect(entry: Any, source: str, index: int) -> PatchEffect:
     place = f"{source}: effect {index + 1} ({name})"
     if name == UNKNOWN_EFFECT:
         _require_keys(entry, KEYS, place)
-        return parse_formula(entry, _parse_where(entry.get("where"), PLACES, place), place)
-    if name not in EFFECTS:
-        raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT], f"{source}: effect {index + 1}")
-    effect = EFFECTS[name]
+        return parse_formula(entry, _parse_where(entry.get("where"), tuple(COORDINATES), place), place)
+    if name not in _library():
+        raise unknown_name("effect", name, [*_library(), UNKNOWN_EFFECT], f"{source}: effect {index + 1}")
+    effect = _library()[name]
     _require_keys(entry, ("name", "where", "parameters"), place)
     where = _parse_where(entry.get("where"), effect.where, place)
     return PatchEffect(name, where, _parse_parameters(entry, effect, place), place=place)
@@ -238,9 +282,6 @@ def _require_keys(data: Mapping[str, Any], valid: Sequence[str] | Mapping[str, A
 # ---- unknown effects: a formula for a generalised force --------------------------------------------------------------
 
 
-KEYS = ("name", "where", "formula", "parameters", "units")
-
-
 def parse_formula(entry: Mapping[str, Any], where: tuple[str, ...], place: str) -> PatchEffect:
     """Return the checked unknown effect of a patch file.
 
@@ -252,6 +293,8 @@ def parse_formula(entry: Mapping[str, Any], where: tuple[str, ...], place: str) 
     Raises:
         InputError: see :func:`wlr_gym.physics.plants.forces.make_force`.
     """
+    from wlr_gym.physics.plants.forces import make_force
+
     formula = entry.get("formula")
     if not isinstance(formula, str):
         raise InputError(f"{place}: 'formula' is {formula!r}: expected text such as '-k * (leg_angle - a0)'")
@@ -265,6 +308,8 @@ def parse_formula(entry: Mapping[str, Any], where: tuple[str, ...], place: str) 
 
 def force_of(effect: PatchEffect) -> Force:
     """Return the force of an unknown effect."""
+    from wlr_gym.physics.plants.forces import make_force
+
     return make_force(effect.where, effect.formula, effect.parameters, effect.units)
 
 
@@ -273,6 +318,3 @@ def _mapping(entry: Mapping[str, Any], key: str, place: str) -> dict[str, Any]:
     if given is not None and not (isinstance(given, Mapping) and all(isinstance(name, str) for name in given)):
         raise InputError(f"{place}: '{key}' must be a mapping of the formula's constants, got {given!r}")
     return dict(given or {})
-
-
-PLACES = tuple(COORDINATES)

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions
-from wlr_gym.physics.plants.forces import Force
 from wlr_gym.robot import RobotSource, load_robot
+
+if TYPE_CHECKING:
+    from wlr_gym.physics.plants.forces import Force
 
 #: Backend -> "module:class", imported when it is first made.
 BACKENDS = {

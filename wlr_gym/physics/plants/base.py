@@ -117,6 +117,35 @@ TRUTH_LAYOUT = Layout(
 )
 
 
+#: Where a force given as a formula (:mod:`wlr_gym.physics.plants.forces`) may act -> unit of its value.
+#: Joints: like the motor's torque, on the child link, its opposite on the parent.
+#: ``body_force``: on the body origin, along the body's axes; ``floor_force``: on the body origin, along the floor's axes;
+#: ``body_torque``: on the body, about its own x, y and z axes.
+COORDINATES: dict[str, str] = {
+    **dict.fromkeys(JOINTS, "N m"),
+    **{f"body_force_{axis}": "N" for axis in XYZ},
+    **{f"floor_force_{axis}": "N" for axis in XYZ},
+    **{f"body_torque_{axis}": "N m" for axis in ("roll", "pitch", "yaw")},
+}
+
+#: What a simulator hands over per robot and physics step, at the step's start: quantities of ``TRUTH_LAYOUT`` by column
+#: (motor torques and normal forces are those of the step before), and the supply voltage (V).
+INPUTS: tuple[str, ...] = (
+    *(f"position_{a}" for a in XYZ),
+    *(f"quaternion_{a}" for a in "wxyz"),
+    *(f"linear_velocity_in_body_{a}" for a in XYZ),
+    *(f"angular_velocity_in_body_{a}" for a in XYZ),
+    *(f"joint_position_{j}" for j in range(8)),
+    *(f"joint_velocity_{j}" for j in range(8)),
+    *(f"motor_torque_{j}" for j in range(8)),
+    *(f"contact_force_{i}_z" for i in range(4)),
+    *(f"slip_velocity_{i}_{a}" for i in range(4) for a in "xy"),
+    "supply_voltage",
+)
+#: What formulas know besides: time since the start of the run or episode (s), and how far each joint is wound up.
+MEMORY: tuple[str, ...] = ("time", *(f"wind_up_{j}" for j in range(8)))
+
+
 class UnknownChannelError(InputError, AttributeError):
     """A channel that does not exist. Also an AttributeError: that is what ``hasattr`` and ``getattr`` ask for."""
 

@@ -4,9 +4,15 @@
 """
 
 from wlr_gym.envs.tasks.terms.commands import COMMANDS
-from wlr_gym.envs.tasks.terms.computed import COMPUTED, CONTROLLER, computed
 from wlr_gym.envs.tasks.terms.measures import MEASURES, POSITIVE, TERMINATIONS, ScalarTerm, registered
-from wlr_gym.envs.tasks.terms.observations import POLICY_TERMS, PRIVILEGED_TERMS, ObservationTerm
+from wlr_gym.envs.tasks.terms.observations import (
+    COMPUTED,
+    CONTROLLER,
+    POLICY_TERMS,
+    PRIVILEGED_TERMS,
+    ObservationTerm,
+    computed,
+)
 from wlr_gym.envs.tasks.terms.rewards import REWARDS
 
 #: Group of a task's terms that are single numbers -> those there are.

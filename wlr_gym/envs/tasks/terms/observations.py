@@ -7,13 +7,27 @@ robot refuses a policy that needs one.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from wlr_gym.envs.tasks.scaling import QUANTITIES
+from wlr_gym.envs.tasks.signals import (
+    PREVIEW,
+    PlanarPose,
+    Signals,
+    Value,
+    climb_speed,
+    error_from_path,
+    estimated_pose,
+    leg_references,
+    true_pose,
+)
+from wlr_gym.envs.tasks.terms.measures import refuse_another
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
+from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
-from wlr_gym.robot import LEGS, WHEELS, Robot
+from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
 
 RobotNumber = Callable[[Robot], float]
 
@@ -183,3 +197,306 @@ def limit_for(term: ObservationTerm, robot: Robot, drawn: Sequence[float] = ()) 
     if term.name in ("leg_position", "leg_reference"):
         reached = [abs(limit - robot.home.leg_angle) for limit in robot.leg_limits]
     return max([term.limit, *(1.25 * value for value in reached), *map(abs, drawn)])
+
+
+# --- computed observations: functions of named signals, traced into one compiled kernel per task ----------------------
+
+
+Function = Callable[[Signals], list[Value]]
+
+
+@dataclass(frozen=True)
+class ComputedTerm:
+    """Some numbers computed from signals.
+
+    Attributes:
+        function: ``function(signals)`` returns one value per element; written with ``wlr_gym.physics.codegen.ops``.
+        elements: ``name[label]`` of each number.
+    """
+
+    function: Function
+    elements: tuple[str, ...]
+
+
+COMPUTED: dict[str, ComputedTerm] = {}
+
+
+def computed(*labels: str, unit: str, frame: str, limit: float, estimated: bool = False) -> Callable[[Function], Function]:
+    """Return a decorator that makes a function an observation term under its own name, for policies and critics.
+
+    Args:
+        labels: of its numbers; none for a single number.
+        unit, frame: for the tables; the first line of the docstring says the rest.
+        limit: values are clipped to +-limit (in ``unit``), so that the observation space is bounded.
+        estimated: made of the slip observer's estimate, and so as old as the joint readings that is made of.
+    """
+
+    def enter(function: Function) -> Function:
+        name = function.__name__
+        elements = tuple(f"{name}[{label}]" for label in labels) or (name,)
+        doc = (inspect.getdoc(function) or "").partition("\n")[0]
+        device = "joints" if estimated else ""
+        if name in POLICY_TERMS:
+            refuse_another(function, COMPUTED[name].function if name in COMPUTED else None)
+        COMPUTED[name] = ComputedTerm(function, elements)
+        POLICY_TERMS[name] = PRIVILEGED_TERMS[name] = ObservationTerm(
+            name, "computed", elements, unit, frame, limit, doc, device=device
+        )
+        return function
+
+    return enter
+
+
+@computed(unit="m/s", frame="body", limit=2.0)
+def speed_command(signals: Signals) -> list[Value]:
+    """Commanded forward velocity."""
+    return [signals.command("linear_velocity_x")]
+
+
+# ---- sensors ----
+
+
+@computed(unit="-", frame="-", limit=1.0)
+def camera_present(signals: Signals) -> list[Value]:
+    """1 where the robot has a camera, else 0."""
+    return [signals.is_present("camera")]
+
+
+@computed(unit="-", frame="-", limit=1.0)
+def flow_present(signals: Signals) -> list[Value]:
+    """1 where the robot has an optical-flow sensor, else 0."""
+    return [signals.is_present("flow")]
+
+
+# ---- paths ----
+
+
+def _path_error(signals: Signals, pose: PlanarPose) -> list[Value]:
+    error = error_from_path(signals, pose)
+    return [error.lateral, error.heading]
+
+
+@computed("lateral", "heading", unit="m, rad", frame="path", limit=4.0, estimated=True)
+def path_error(signals: Signals) -> list[Value]:
+    """Estimated distance from the path and heading against it, positive to the left."""
+    return _path_error(signals, estimated_pose(signals))
+
+
+@computed("lateral", "heading", unit="m, rad", frame="path", limit=4.0)
+def true_path_error(signals: Signals) -> list[Value]:
+    """True distance from the path and heading against it, positive to the left."""
+    return _path_error(signals, true_pose(signals))
+
+
+@computed(*(f"{distance:g} m" for distance in PREVIEW), unit="1/m", frame="path", limit=10.0, estimated=True)
+def path_curvature(signals: Signals) -> list[Value]:
+    """Curvature of the path at distances ahead, positive to the left."""
+    return list(error_from_path(signals, estimated_pose(signals)).curvature)
+
+
+# ---- a straight course ----
+
+
+@computed("lateral", "heading", unit="m, rad", frame="start", limit=4.0, estimated=True)
+def course_error(signals: Signals) -> list[Value]:
+    """Estimated distance from the line straight ahead of the start and heading against it, positive to the left."""
+    pose = estimated_pose(signals)
+    return [pose.y, pose.yaw]
+
+
+@computed("lateral", "heading", unit="m, rad", frame="start", limit=4.0)
+def true_course_error(signals: Signals) -> list[Value]:
+    """True distance from the line straight ahead of the start and heading against it, positive to the left."""
+    pose = true_pose(signals)
+    return [pose.y, pose.yaw]
+
+
+# ---- leg angles ----
+
+
+@computed(*LEGS, unit="rad", frame="joint", limit=2.0)
+def leg_reference(signals: Signals) -> list[Value]:
+    """Commanded leg angle at this time, from the home angle."""
+    return [angle - signals.robot("home.leg_angle") for angle, _ in leg_references(signals)]
+
+
+@computed(*LEGS, unit="rad/s", frame="joint", limit=5.0)
+def leg_reference_rate(signals: Signals) -> list[Value]:
+    """Commanded leg rate at this time."""
+    return [rate for _, rate in leg_references(signals)]
+
+
+# ---- slopes ----
+
+
+@computed(unit="m/s", frame="body", limit=2.0)
+def climb_command(signals: Signals) -> list[Value]:
+    """Commanded forward velocity at this time: climbing, then holding."""
+    return [climb_speed(signals)]
+
+
+# ---- the hand-written controller, for a policy that acts on top of it ------------------------------------------------
+
+# The law of the agent ``slip_compensating`` (wlr_gym.policy.control), whose gains the task's ``controller`` gives. What it
+# remembers is its own value of the step before, so that the policy needs no memory.
+
+
+#: What the controller remembers: integrals of the errors of yaw rate (rad/s) and forward velocity (m/s), times their gains, and
+#: by how much the front wheels slip more than the rear ones (m/s), where load is shifted.
+MEMORY = ("yaw_rate_integral", "velocity_integral", "slip_difference")
+#: Where the legs sweep also integrals of the errors of their angles (rad), times their gain.
+LEG_MEMORY = tuple(f"{leg}_integral" for leg in LEGS)
+#: Ends the name of a term that holds a controller's action.
+CONTROLLER = "_controller"
+
+_LABELS = (*JOINTS, *MEMORY)
+_UNITS = ", ".join(["-"] * len(JOINTS) + ["rad/s", "m/s", "m/s"])
+
+
+@dataclass(frozen=True)
+class WantedMotion:
+    """What the controller is to do.
+
+    Attributes:
+        forward: velocity, m/s. turn: yaw rate, rad/s.
+        legs: angle from home (rad) and rate (rad/s) of each leg. sweeping: integrate their errors.
+    """
+
+    forward: Value
+    turn: Value
+    legs: Sequence[tuple[Value, Value]] = ((0.0, 0.0),) * 4
+    sweeping: bool = False
+
+
+@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+def velocity_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that follows the commanded velocity, and what it remembers."""
+    turn = signals.command("yaw_rate") + _steer(signals, 0.0, 0.0)
+    return _feedback(signals, "velocity_controller", WantedMotion(signals.command("linear_velocity_x"), turn))
+
+
+@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+def path_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that follows the path, and what it remembers."""
+    forward = signals.command("linear_velocity_x")
+    error = error_from_path(signals, estimated_pose(signals))
+    turn = error.curvature[0] * forward + _steer(signals, error.lateral, error.heading)
+    return _feedback(signals, "path_controller", WantedMotion(forward, turn))
+
+
+@computed(*_LABELS, *LEG_MEMORY, unit=f"{_UNITS}, rad, rad, rad, rad", frame="-", limit=1.0, estimated=True)
+def posture_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that keeps straight on while the legs move, and what it remembers."""
+    home = signals.robot("home.leg_angle")
+    legs = [(angle - home, rate) for angle, rate in leg_references(signals)]
+    motion = WantedMotion(signals.command("linear_velocity_x"), _course(signals), legs, sweeping=True)
+    return _feedback(signals, "posture_controller", motion)
+
+
+@computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
+def slope_controller(signals: Signals) -> list[Value]:
+    """Action of the controller that climbs and holds, and what it remembers."""
+    return _feedback(signals, "slope_controller", WantedMotion(climb_speed(signals), _course(signals)))
+
+
+def _course(signals: Signals) -> Value:
+    pose = estimated_pose(signals)
+    return _steer(signals, pose.y, pose.yaw)
+
+
+def _steer(signals: Signals, lateral: Value, heading: Value) -> Value:
+    """Yaw rate that leads back to a line, rad/s; on a slope gravity tells which way is up."""
+    leftward_force = signals.sensors("accelerometer")[1]
+    return signals.gain("uphill") * leftward_force - signals.gain("lateral") * lateral - signals.gain("heading") * heading
+
+
+def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
+    gain = signals.gain
+    yaw_rate, velocity = signals.sensors("gyro")[2], signals.estimate("linear_velocity_in_body")[0]
+    yaw_integral, velocity_integral, slip_difference = (signals.remembered(f"{name}[{label}]") for label in MEMORY)
+    error = motion.turn - yaw_rate
+    yaw_integral = _integral(signals, yaw_integral, gain("yaw_rate_i") * error)
+    turn = gain("steering") * motion.turn + gain("yaw_rate_p") * error + yaw_integral
+    error = motion.forward - velocity
+    velocity_integral = _integral(signals, velocity_integral, gain("velocity_i") * error)
+    forward = motion.forward + gain("velocity_p") * error + velocity_integral
+    share = ops.where_positive(gain("load_shift"), ops.minimum(signals.control_period / gain("load_shift_time"), 1.0), 0.0)
+    shifted = _lean(signals, slip_difference)
+    slip_difference = slip_difference + share * (_slip_difference(signals) - slip_difference)
+    hip_x, hip_y = signals.robot("hip_position.x"), signals.robot("hip_position.y")
+    reach = hip_x * hip_x / hip_y
+    allowed = gain("slip_limit") + reach * ops.absolute(turn / ops.maximum(gain("steering"), 1.0))
+    lean = _lean(signals, slip_difference)
+    legs, wheels = [], []
+    corrections: list[Value] = []
+    for index, ((front, left), (offset, rate)) in enumerate(zip(CORNER_SIGNS, motion.legs, strict=True)):
+        side = hip_y * left
+        travel = velocity - yaw_rate * side
+        rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
+        inward = gain("legs_inward") * front
+        reach, reach_rate = (
+            (inward, 0.0) if motion.sweeping else _reach_under(signals, f"{name}[{LEGS[index]}]", index, shifted)
+        )
+        offset = offset + reach + lean
+        rate = rate + reach_rate
+        setpoint = offset
+        if motion.sweeping:
+            corrections.append(_leg_correction(signals, name, index, offset))
+            setpoint = offset + corrections[index]
+        legs.append(setpoint / signals.task("action.leg_scale"))
+        wheels.append(_wheel_rate(signals, rolling, offset, rate) / signals.task("action.wheel_scale"))
+    return [
+        *(ops.clip(action, -1.0, 1.0) for action in legs + wheels),
+        yaw_integral,
+        velocity_integral,
+        slip_difference,
+        *corrections,
+    ]
+
+
+def _leg_correction(signals: Signals, name: str, leg: int, offset: Value) -> Value:
+    """What is added to a leg's setpoint (rad): the integral of the error of its measured angle."""
+    error = signals.robot("home.leg_angle") + offset - signals.sensors("joint_position")[LEG_SLICE][leg]
+    return _integral(signals, signals.remembered(f"{name}[{LEG_MEMORY[leg]}]"), signals.gain("leg_i") * error)
+
+
+def _reach_under(signals: Signals, action: str, leg: int, shifted: Value) -> tuple[Value, Value]:
+    """How far a leg reaches under the body after the next step (rad from home), and how fast it moves (rad/s).
+
+    Args:
+        action: name of the leg's action in what the controller remembers: it says where the leg was sent.
+        leg: index. shifted: what of that was load shift, rad.
+    """
+    gain, period = signals.gain, signals.control_period
+    wanted, within = gain("legs_inward") * CORNER_SIGNS[leg][0], gain("lean_time")
+    start = signals.sensors("joint_position")[LEG_SLICE][leg] - signals.robot("home.leg_angle")
+    sent = signals.remembered(action) * signals.task("action.leg_scale") - shifted
+    before = ops.where_positive(signals.time - 0.5 * period, sent, start)
+    step = ops.absolute(wanted) * period / ops.maximum(within, period)
+    after = before + ops.clip(wanted - before, 0.0 - step, step)
+    even = within * ops.absolute(wanted)  # positive = not at once
+    return ops.where_positive(even, after, wanted), ops.where_positive(even, (after - before) / period, 0.0)
+
+
+def _integral(signals: Signals, value: Value, rate: Value) -> Value:
+    limit = signals.gain("integral_limit")
+    return ops.clip(value + signals.control_period * rate, 0.0 - limit, limit)
+
+
+def _wheel_rate(signals: Signals, rolling: Value, offset: Value, leg_rate: Value) -> Value:
+    """Rate of a wheel against its leg (rad/s) that moves the hip ahead at ``rolling``; see ``Chassis.wheel_rate``."""
+    angle = signals.robot("home.leg_angle") + offset
+    return (rolling - signals.robot("leg.length") * ops.sin(angle) * leg_rate) / signals.robot("wheel.radius") - leg_rate
+
+
+def _slip_difference(signals: Signals) -> Value:
+    slip = signals.estimate("slip_velocity")[0::2]
+    return sum((front * ops.absolute(s) for (front, _), s in zip(CORNER_SIGNS, slip, strict=True)), 0.0) * 0.5
+
+
+def _lean(signals: Signals, slip_difference: Value) -> Value:
+    """Angle (rad) by which all legs lean so that load moves to the axle that slips less; arcsin by arctan2."""
+    bound = signals.gain("largest_shift")
+    shift = ops.clip(0.0 - signals.gain("load_shift") * slip_difference, 0.0 - bound, bound)
+    sine = 2.0 * signals.robot("hip_position.x") * shift / signals.robot("leg.length")
+    return ops.arctan2(sine, ops.sqrt(1.0 - sine * sine))

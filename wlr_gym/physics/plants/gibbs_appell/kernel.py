@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -191,7 +192,12 @@ def _without_unread(outputs: dict[str, Any], *readers: dict[str, Any]) -> dict[s
     return {name: value for name, value in outputs.items() if name in read or name in STORED}
 
 
-OUTPUTS: tuple[str, ...] = tuple(source.observe(_Lanes(Graph()), 1.0, frozenset()))
+@cache
+def outputs() -> tuple[str, ...]:
+    """Return the names of what is shown of a state, in storage order."""
+    return tuple(source.observe(_Lanes(Graph()), 1.0, frozenset()))
+
+
 _SCALARS = ("step", "time", "duration")
 
 
@@ -238,7 +244,7 @@ def driver_source(features: frozenset[str], precision: str, width: int, blocks: 
 def _places(blocks: Mapping[str, Mapping[str, Any]], width: int) -> dict[str, int]:
     """Where each lane starts in the flat scratch array."""
     formula = (*FORMULA_INPUTS, *FORMULA_OUTPUTS) if "sense" in blocks else ()
-    names = dict.fromkeys([*STORED, *INPUTS, *PARAMETER_LANES, *blocks["prepare"], *blocks["setup"], *OUTPUTS, *formula])
+    names = dict.fromkeys([*STORED, *INPUTS, *PARAMETER_LANES, *blocks["prepare"], *blocks["setup"], *outputs(), *formula])
     return {name: index * width for index, name in enumerate(names)}
 
 
@@ -250,9 +256,9 @@ def _driver(start: Mapping[str, int], width: int, precision: str, apply_formulas
         "inputs": start[INPUTS[0]],
         "parameters": start[PARAMETER_LANES[0]],
         "parameter_count": len(PARAMETER_LANES) * width,
-        "truth": start[OUTPUTS[0]],
+        "truth": start[outputs()[0]],
         "truth_count": TRUTH_LAYOUT.width,
-        "raw": start[OUTPUTS[TRUTH_LAYOUT.width]],
+        "raw": start[outputs()[TRUTH_LAYOUT.width]],
         "raw_count": RAW_LAYOUT.width - 1,
         "cosine": start["heading_cosine"],
         "sine": start["heading_sine"],

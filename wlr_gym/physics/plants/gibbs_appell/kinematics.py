@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
 from wlr_gym.physics.plants import drive
-from wlr_gym.physics.plants.forces import COORDINATES
-from wlr_gym.physics.plants.forces import INPUTS as INPUTS_OF_FORMULAS
+from wlr_gym.physics.plants.base import COORDINATES
+from wlr_gym.physics.plants.base import INPUTS as INPUTS_OF_FORMULAS
 
 CORNERS = range(4)
 AXES = "xyz"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,15 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.snapshot import RowStore, Snapshot
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground
-from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
-from wlr_gym.physics.plants.forces import MEMORY, Force, compile_forces
+from wlr_gym.physics.plants.base import MEMORY, Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.gibbs_appell import kernel
 from wlr_gym.physics.plants.gibbs_appell.kinematics import STORED, TURN
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from wlr_gym.physics.plants.forces import Force, ForceKernel
 
 Array = NDArray[np.float64]
 
@@ -126,7 +128,11 @@ class GibbsAppellPlant(Simulator):
         self._chunks = self._shared_out(self._tiles)
         self._helpers = min(self.options.threads, len(self._chunks)) - 1
         self._pool = ThreadPoolExecutor(self._helpers, thread_name_prefix="wlr-engine") if self._helpers else None
-        self._formulas = compile_forces(forces, self.options.precision) if forces else None
+        self._formulas: ForceKernel | None = None
+        if forces:
+            from wlr_gym.physics.plants.forces import compile_forces
+
+            self._formulas = compile_forces(forces, self.options.precision)
         values = self._formulas.values if self._formulas else np.zeros(0)
         self.set_force_values(np.tile(values, (count, 1)))
         self._memory = np.zeros((self._tiles, len(MEMORY), self._width), self._float)

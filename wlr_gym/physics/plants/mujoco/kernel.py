@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops, source_of, straight_line_source
 from wlr_gym.physics.model.dynamics import gravity_in_floor
-from wlr_gym.physics.plants import drive, forces, ground
+from wlr_gym.physics.plants import base, drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import kinematics
 from wlr_gym.physics.plants.gibbs_appell import step as engine
@@ -201,7 +201,7 @@ def kernel_source() -> str:
     observed = {name: f"truth[{k}]" for k, name in enumerate(blocks["observe"])}
     for k, name in enumerate(list(observed)[TRUTH_LAYOUT.width :]):
         observed[name] = f"raw[{k}]" if k < RAW_LAYOUT.width - 1 else name
-    named = {name: f"inputs[{k} * count + i]" for k, name in enumerate(forces.INPUTS)}
+    named = {name: f"inputs[{k} * count + i]" for k, name in enumerate(base.INPUTS)}
     rows = [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(_ROWS)]
     lines = []
     for block, outputs in blocks.items():
@@ -246,6 +246,6 @@ def load_kernel() -> ModuleType:
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    source, engine, kinematics, forces, servo, drive, ground, ops, graph, sys.modules[__name__]
+    source, engine, kinematics, base, servo, drive, ground, ops, graph, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join([source_of(*TRACED), *PARAMETER_LANES, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"])

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
-from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, Sensors
-from wlr_gym.physics.plants.forces import COORDINATES, INPUTS, MEMORY, Force, compile_forces
+from wlr_gym.physics.plants.base import COORDINATES, INPUTS, MEMORY, Capabilities, PlantOptions, PlantState, Sensors
+from wlr_gym.physics.plants.forces import Force, compile_forces
 from wlr_gym.physics.plants.mujoco.kernel import PARAMETER_LANES, addresses, load_kernel, pack
 from wlr_gym.physics.plants.mujoco.mjcf import build_model, principal_inertia
 from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH, STATE, TICK_SUMS

@@ -27,7 +27,7 @@ from typing import Any
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.plants import drive, ground
-from wlr_gym.physics.plants.forces import COORDINATES
+from wlr_gym.physics.plants.base import COORDINATES
 from wlr_gym.physics.plants.gibbs_appell import step as engine
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     AXES,
