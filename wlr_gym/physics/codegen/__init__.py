@@ -5,7 +5,7 @@ On nodes it builds an expression graph with shared sub-expressions, which :func:
 :func:`load_module` compiles with numba and caches. One source thus serves the readable reference and the fast kernel.
 """
 
-from wlr_gym.physics.codegen.compilation import load_module, source_of
-from wlr_gym.physics.codegen.graph import Graph, Node, emit, hoist, live_nodes, straight_line_source
+from wlr_gym.physics.codegen.compilation import emit, load_module, source_of, straight_line_source
+from wlr_gym.physics.codegen.ops import Graph, Node, hoist, live_nodes
 
 __all__ = ["Graph", "Node", "emit", "hoist", "live_nodes", "load_module", "source_of", "straight_line_source"]

@@ -1,19 +1,110 @@
-"""Scalar functions that work alike on floats, numpy arrays and traced nodes."""
+"""Scalar arithmetic that works alike on floats, numpy arrays and traced nodes.
+
+On nodes it builds an expression graph in which common sub-expressions are shared; :mod:`.compilation` prints and compiles it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from math import factorial
 from typing import Any
 
 import numpy as np
 
-from wlr_gym.physics.codegen.graph import Node
-
 Value = Any  # float | numpy array | Node
+Operand = Any  # Node | float; Any keeps arithmetic on mixed operands readable
 Lanes = Mapping[str, Value]
 Out = dict[str, Value]
 Vector = list[Value]
+
+
+class Graph:
+    """Owner of nodes: equal expressions become the same node."""
+
+    def __init__(self) -> None:
+        self._table: dict[tuple[Any, ...], Node] = {}
+
+    def node(self, op: str, *operands: Operand) -> Node:
+        """Return the node ``op(operands)``, shared with an equal one built before."""
+        key = (op, *(("node", x.index) if isinstance(x, Node) else ("value", x) for x in operands))
+        found = self._table.get(key)
+        if found is None:
+            found = self._table[key] = Node(self, op, operands, len(self._table))
+        return found
+
+    def input(self, name: str) -> Node:
+        """Return the node that stands for the input ``name``."""
+        return self.node("input", name)
+
+
+class Node:
+    """One scalar expression. Arithmetic with numbers folds constants and drops neutral terms."""
+
+    __slots__ = ("graph", "index", "op", "operands")
+    __array_ufunc__ = None  # numpy scalars defer to the reflected operators below
+
+    def __init__(self, graph: Graph, op: str, operands: tuple[Operand, ...], index: int) -> None:
+        self.graph: Graph = graph
+        self.op: str = op
+        self.operands: tuple[Operand, ...] = operands
+        self.index: int = index
+
+    def __add__(self, other: Operand) -> Operand:
+        if not isinstance(other, Node):
+            return self if other == 0 else self.graph.node("add", self, float(other))
+        if other.op == "neg":
+            return self - other.operands[0]
+        if self.op == "neg":
+            return other - self.operands[0]
+        return self.graph.node("add", *sorted((self, other), key=lambda node: node.index))
+
+    __radd__ = __add__
+
+    def __sub__(self, other: Operand) -> Operand:
+        if not isinstance(other, Node):
+            return self if other == 0 else self.graph.node("add", self, -float(other))
+        if other is self:
+            return 0.0
+        if other.op == "neg":
+            return self + other.operands[0]
+        return self.graph.node("sub", self, other)
+
+    def __rsub__(self, other: float) -> Operand:
+        return -self if other == 0 else self.graph.node("sub", float(other), self)
+
+    def __neg__(self) -> Operand:
+        return self.operands[0] if self.op == "neg" else self.graph.node("neg", self)
+
+    def __mul__(self, other: Operand) -> Operand:
+        if not isinstance(other, Node):
+            if other == 0:
+                return 0.0
+            if abs(other) == 1:
+                return self if other == 1 else -self
+            if self.op == "neg":
+                return self.operands[0] * -other
+            return self.graph.node("mul", self, float(other))
+        if self.op == "neg":
+            return -(self.operands[0] * other)
+        if other.op == "neg":
+            return -(self * other.operands[0])
+        return self.graph.node("mul", *sorted((self, other), key=lambda node: node.index))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Operand) -> Operand:
+        if not isinstance(other, Node):
+            return self * (1.0 / other)
+        return self.graph.node("div", self, other)
+
+    def __rtruediv__(self, other: float) -> Operand:
+        return 0.0 if other == 0 else self.graph.node("div", float(other), self)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a traced value has no truth value: use ops.where_positive instead of a Python branch")
+
+
+# ---- functions --------------------------------------------------------------------------------------------------------
 
 
 def _apply(op: str, reference: Callable[..., Any], *operands: Value) -> Value:
@@ -149,3 +240,74 @@ def saturation(x: Value) -> Value:
         return np.tanh(x)
     e = _expm1_of_minus(2.0 * x)
     return -e / (2.0 + e)
+
+
+# ---- parts of a graph -------------------------------------------------------------------------------------------------
+
+
+def live_nodes(roots: Iterable[Operand]) -> list[Node]:
+    """Return every node the roots depend on, operands before users."""
+    return ordered(roots, lambda node: list(node.operands))
+
+
+def ordered(roots: Iterable[Operand], children: Callable[[Node], list[Operand]]) -> list[Node]:
+    """Return every node that is reached from the roots by ``children``, these before it."""
+    order: list[Node] = []
+    seen: set[int] = set()
+    for root in roots:
+        stack: list[tuple[Node, bool]] = [(root, False)] if isinstance(root, Node) else []
+        while stack:
+            node, ready = stack.pop()
+            if ready:
+                order.append(node)
+            elif node.index not in seen:
+                seen.add(node.index)
+                stack.append((node, True))
+                stack.extend((x, False) for x in reversed(children(node)) if isinstance(x, Node))
+    return order
+
+
+def hoist(
+    outputs: Mapping[str, Operand], is_constant: Callable[[str], bool], prefix: str
+) -> tuple[dict[str, Operand], dict[str, Node]]:
+    """Split off what depends only on constant inputs, so that it can be computed once outside the time loop.
+
+    Args:
+        outputs: name -> expression of one block.
+        is_constant: tells whether an input keeps its value over the loop.
+        prefix: start of the names given to the hoisted values.
+
+    Returns:
+        (outputs rewritten to read the hoisted values as inputs, hoisted name -> expression).
+    """
+    order = live_nodes(outputs.values())
+    constant: set[int] = set()
+    for node in order:
+        if node.op == "input":
+            if is_constant(node.operands[0]):
+                constant.add(node.index)
+        elif all(not isinstance(x, Node) or x.index in constant for x in node.operands):
+            constant.add(node.index)
+    replaced: dict[int, Operand] = {}
+    hoisted: dict[str, Node] = {}
+
+    def rebuilt(operand: Operand) -> Operand:
+        if not isinstance(operand, Node):
+            return operand
+        if operand.index in replaced:
+            return replaced[operand.index]
+        if operand.op in {"input", "neg"} and operand.index in constant:
+            base = operand.operands[0]
+            replaced[operand.index] = operand if operand.op == "input" else operand.graph.node("neg", rebuilt(base))
+        elif operand.index in constant:
+            name = f"{prefix}{len(hoisted)}"
+            hoisted[name] = operand
+            replaced[operand.index] = operand.graph.input(name)
+        return replaced[operand.index]
+
+    for node in order:
+        if node.index in constant:
+            continue
+        operands = tuple(rebuilt(x) for x in node.operands)
+        replaced[node.index] = node if node.op == "input" else node.graph.node(node.op, *operands)
+    return {name: rebuilt(value) for name, value in outputs.items()}, hoisted

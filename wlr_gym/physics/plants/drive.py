@@ -1,6 +1,6 @@
 """The joint drive, defined once for every simulator: servo, motor, supply, gear friction, gear play.
 
-Scalar source over *lanes* (a mapping name -> scalar of one robot), written with :mod:`wlr_gym.physics.codegen.graph`: each
+Scalar source over *lanes* (a mapping name -> scalar of one robot), written with :mod:`wlr_gym.physics.codegen.ops`: each
 simulator traces it into its own kernel, with its own lanes for joint angles and rates. :func:`pack` fills the parameter lanes
 from the table. What a simulator must keep from substep to substep are the STATE lanes. All at the output shaft, SI units.
 

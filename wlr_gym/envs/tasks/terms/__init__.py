@@ -3,9 +3,9 @@
 ``registered`` and ``computed`` make a function such a unit, here or in a module of one's own (docs/extending.md).
 """
 
-from wlr_gym.envs.tasks.terms.commands import COMMANDS
 from wlr_gym.envs.tasks.terms.measures import MEASURES, POSITIVE, TERMINATIONS, ScalarTerm, registered
 from wlr_gym.envs.tasks.terms.observations import (
+    COMMANDS,
     COMPUTED,
     CONTROLLER,
     POLICY_TERMS,

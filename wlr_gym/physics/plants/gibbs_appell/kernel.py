@@ -20,8 +20,8 @@ from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import (
     Graph,
     Node,
+    compilation,
     emit,
-    graph,
     hoist,
     live_nodes,
     load_module,
@@ -410,7 +410,7 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    source, gauss, kinematics, equations, servo, drive, ground, ops, graph, sys.modules[__name__]
+    source, gauss, kinematics, equations, servo, drive, ground, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join(
     [source_of(*TRACED), *PARAMETER_LANES, *FORMULA_INPUTS, *FORMULA_OUTPUTS, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics import servo
-from wlr_gym.physics.codegen import Graph, emit, graph, live_nodes, load_module, ops, source_of, straight_line_source
+from wlr_gym.physics.codegen import Graph, compilation, emit, live_nodes, load_module, ops, source_of, straight_line_source
 from wlr_gym.physics.model.dynamics import gravity_in_floor
 from wlr_gym.physics.plants import base, drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
@@ -246,6 +246,6 @@ def load_kernel() -> ModuleType:
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    source, engine, kinematics, base, servo, drive, ground, ops, graph, sys.modules[__name__]
+    source, engine, kinematics, base, servo, drive, ground, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join([source_of(*TRACED), *PARAMETER_LANES, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"])
