@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from wlr_gym.data.replay import ChannelError, ReplayResult
     from wlr_gym.gap.analysis import Analysis
     from wlr_gym.gap.report.result import EffectEntry, GapEntry, Result, RunGapEntry
-    from wlr_gym.physics.effects.effect import PatchEffect
+    from wlr_gym.physics.effects import PatchEffect
 
 DRIVE_TITLE = "3. A robot with a hidden fault"
 POLICY = "velocity_slip_aware"

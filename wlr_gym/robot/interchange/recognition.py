@@ -18,7 +18,6 @@ import yaml
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.settings import nested, overlay, parse_config
 from wlr_gym.robot.description import Robot, load_robot
 from wlr_gym.robot.parameter_table import CORNER_NAMES, CORNER_SIGNS, CORNERS, LEGS, WHEELS, spec_of
@@ -730,14 +729,3 @@ def robot_over(base: str, name: str, numbers: Mapping[str, Any], where: Path, *,
     below = load_robot(base, check=False).model_dump(mode="json")
     robot = parse_config(Robot, overlay(below, {**numbers, "name": name}), str(where))
     return load_robot(robot, check=check)
-
-
-def new_file(path: Path, *, force: bool) -> None:
-    """Refuse a file that is there, unless it may be replaced, and a folder that is not.
-
-    Raises:
-        InputError: naming it.
-    """
-    refuse_existing(path, force)
-    if not path.parent.is_dir():
-        raise InputError(f"--out {path}: folder {path.parent} does not exist")
