@@ -159,7 +159,14 @@ def load_agent_config(name: str | Path, changes: tuple[str, ...] = (), task: str
     Raises:
         InputError: no such file, broken YAML, a base or a task that is none, or a change that is not ``key=value``.
     """
-    config = _read_config(name, task)
+    shipped = data_directory("configs") / "agent" / f"{name}.yaml"
+    layers = [] if str(name) in agent_names() and not shipped.is_file() else read_layers("agent", name)
+    config: dict[str, Any] = {}
+    for data, where in layers:
+        if not isinstance(data, Mapping | None):
+            raise InputError(f"{where}: expected a mapping, got {type(data).__name__}")
+        own = dict(data or {})
+        config = merge_changes(config, own if task is None else for_task(own, task, where))
     apply_changes(config, changes)
     return config if task is None else for_task(config, task)
 
@@ -171,23 +178,16 @@ def apply_changes(config: dict[str, Any], changes: Iterable[str]) -> None:
         InputError: a change that is not ``key=value``, or a key given twice.
     """
     for key, text in pairs("setting", changes, "total_steps=1000000").items():
-        _apply(config, key, text)
-
-
-def _read_config(name: str | Path, task: str | None) -> dict[str, Any]:
-    """Return a task's settings of a name or path, laid over those of its bases."""
-    shipped = data_directory("configs") / "agent" / f"{name}.yaml"
-    if str(name) in agent_names() and not shipped.is_file():
-        return {}
-    config: dict[str, Any] = {}
-    for data, where in read_layers("agent", name):
-        if not isinstance(data, Mapping | None):
-            raise InputError(f"{where}: expected a mapping, got {type(data).__name__}")
-        own = dict(data or {})
-        if task is not None:
-            own = for_task(own, task, where)
-        config = merge_changes(config, own)
-    return config
+        *parents, last = key.split(".")
+        group = config
+        for parent in parents:
+            group = group.setdefault(parent, {})
+            if not isinstance(group, dict):
+                raise InputError(f"setting '{key}={text}': '{parent}' is a value, not a group")
+        try:
+            group[last] = parse_yaml(text)
+        except yaml.YAMLError:
+            raise InputError(f"setting '{key}={text}': '{text}' is not a YAML value") from None
 
 
 def for_task(settings: Mapping[str, Any], task: str, where: str = "settings") -> dict[str, Any]:
@@ -212,15 +212,3 @@ def _settings(value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, Mapping | None):
         raise InputError(f"{where} = {value!r}: expected a mapping")
     return {str(key): entry for key, entry in (value or {}).items()}
-
-
-def _apply(config: dict[str, Any], key: str, text: str) -> None:
-    *parents, last = key.split(".")
-    for parent in parents:
-        config = config.setdefault(parent, {})
-        if not isinstance(config, dict):
-            raise InputError(f"setting '{key}={text}': '{parent}' is a value, not a group")
-    try:
-        config[last] = parse_yaml(text)
-    except yaml.YAMLError:
-        raise InputError(f"setting '{key}={text}': '{text}' is not a YAML value") from None

@@ -276,7 +276,17 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
     }
     if "command" in training:
         facts["trained with"] = f"`{training['command']}`"
-    facts["training"] = ", ".join(_training(content["agent"], training, config))
+    said = [content["agent"]]
+    if "steps" in training:
+        said.append(f"{training['steps']:,} environment steps")
+    if "seconds" in training:
+        said.append(f"{training['seconds'] / 60.0:.1f} min with {config.get('torch_threads', 1)} thread(s)")
+    if "seed" in training:
+        said.append(f"seed {training['seed']}")
+    if training.get("git_commit"):
+        name, _, state = training["git_commit"].partition("-")
+        said.append(f"commit {name[:7]}{state and '-'}{state}")  # ``-dirty`` stays
+    facts["training"] = ", ".join(said)
     facts["versions"] = tally(content.get("versions", {}))
     if "exported" in content:
         parity = content["exported"]["parity"]
@@ -287,25 +297,6 @@ def _facts(policy: Path, content: Mapping[str, Any]) -> dict[str, str]:
 
 def _term_counts(columns: list[Mapping[str, Any]]) -> Counter[str]:
     return Counter(column["name"].partition("[")[0] for column in columns)
-
-
-def _training(agent: str, training: Mapping[str, Any], config: Mapping[str, Any]) -> list[str]:
-    found = [agent]
-    if "steps" in training:
-        found.append(f"{training['steps']:,} environment steps")
-    if "seconds" in training:
-        found.append(f"{training['seconds'] / 60.0:.1f} min with {config.get('torch_threads', 1)} thread(s)")
-    if "seed" in training:
-        found.append(f"seed {training['seed']}")
-    if training.get("git_commit"):
-        found.append(f"commit {_short(training['git_commit'])}")
-    return found
-
-
-def _short(commit: str) -> str:
-    """Abbreviate the hash; ``-dirty`` stays."""
-    name, _, state = commit.partition("-")
-    return f"{name[:7]}-{state}" if state else name[:7]
 
 
 def _below(evaluation: str) -> str:

@@ -115,23 +115,19 @@ def load_policy(source: str | Path, environment: Contract | HasContract) -> Poli
     Raises:
         InputError: no policy there, broken, or a contract that does not fit, naming the first difference.
     """
-    place, wanted = find_policy(source), _environment_contract(environment)
+    place = find_policy(source)
+    if not isinstance(environment, Mapping):
+        bare = getattr(environment, "unwrapped", environment)
+        if not isinstance(bare, HasContract):
+            raise InputError(f"environment = {environment!r}: expected one that was made, or what its contract() returns")
+        environment = bare.contract()
     if place.is_file():
         policy, contract = open_policy(place)
-        check_contract(contract["environment"], wanted, str(place))
+        check_contract(contract["environment"], environment, str(place))
         return policy
     contract = read_contract(place)
-    check_contract(contract["environment"], wanted, str(place))
+    check_contract(contract["environment"], environment, str(place))
     return agent_function(contract["agent"], "load_policy")(place, contract)
-
-
-def _environment_contract(environment: object) -> Contract:
-    if isinstance(environment, Mapping):
-        return environment
-    bare = getattr(environment, "unwrapped", environment)
-    if not isinstance(bare, HasContract):
-        raise InputError(f"environment = {environment!r}: expected one that was made, or what its contract() returns")
-    return bare.contract()
 
 
 def make_policy(source: str | Path, environment: Contract) -> Policy:

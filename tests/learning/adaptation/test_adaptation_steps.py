@@ -133,7 +133,7 @@ def test_without_numbers_the_old_policy_is_kept(tmp_path):
 
 def test_training_goes_on_with_the_policy_s_recipe_on_the_stated_robots(tmp_path):
     found = uncertainty.uncertainty_of(result([delay(0.03, 0.002)]), Patch(), "slippery", ROBOT, tmp_path)
-    settings = retraining.training_settings("velocity_slip_aware", found.training, steps=10**6, rate=5e-4, seed=3)
+    settings = retraining.training_settings(asked(steps=10**6, learning_rate=5e-4, seed=3), found.training)
     environment = settings["environment"]
     assert environment["randomization"] == found.training.randomization
     assert environment["task"]["sensors"] == {"camera": 0.0, "flow": 0.0}
@@ -154,24 +154,26 @@ def test_the_new_policy_is_kept_where_it_is_better_and_nowhere_worse_or_stopped(
     tmp_path, monkeypatch, stated, elsewhere, stops, kept
 ):
     bounds = {"as stated": stated, "other floors": elsewhere}
-    played = []
+    played, told = [], []
 
-    def compare(new, old, asked, family, own, threads):
-        played.append(family.name)
-        loss = Loss(family.name, old, 0.2, 0.2, bounds[family.name] - 1.0, bounds[family.name])
-        return Acceptance(new, asked.environment, 8, 1, (), 5.0, "", (loss,))
+    def accept(new, environment, *, references, floors, **given):
+        played.append(name := floors[0]["name"])
+        loss = Loss(name, references[0], 0.2, 0.2, bounds[name] - 1.0, bounds[name])
+        return Acceptance(new, environment, 8, 1, (), 5.0, "", (loss,))
 
-    monkeypatch.setattr(retraining, "compare_on", compare)
+    monkeypatch.setattr(retraining, "accept", accept)
     monkeypatch.setattr(retraining, "trained_policy", lambda progress: "new")
     monkeypatch.setattr(retraining, "export_trained", lambda progress: "new")
     monkeypatch.setattr(retraining, "watched", lambda progress, found, own, policy: episodes(stops if policy == "new" else 20))
     families = [uncertainty.Family(name, {}) for name in bounds]
     found = uncertainty.Uncertainty(Patch(), families[0], tuple(families), ())
     for _ in range(2):  # the second time its files answer
-        record = retraining.accept_policy(Progress(tmp_path, asked()), found, ROBOT)
+        progress = Progress(tmp_path, asked(), lambda *said: told.append(said))
+        record = retraining.accept_policy(progress, found, ROBOT)
         assert record.numbers["policy"] == kept
         assert (stops == 120) == ("may stop the new one more often (in 23% of episodes, not 4%)" in record.said[0])
     assert played == list(bounds)
+    assert told == [("acceptance: as stated", 0.0), ("acceptance: other floors", 0.5)]
 
 
 def episodes(stopped):
@@ -206,24 +208,8 @@ def test_a_policy_that_the_supervision_stops_more_often_is_trained_again(tmp_pat
         assert "nothing was changed" in retraining.train_supervised(progress, found, ROBOT).said[-1]
 
 
-def test_a_step_of_the_acceptance_test_tells_how_far_it_is(tmp_path, monkeypatch):
-    told = []
-
-    def compare(new, old, asked, family, own, threads):
-        return Acceptance(new, asked.environment, 8, 1, (), 5.0, "", (Loss(family.name, old, 0.2, 0.3, -2.0, -1.0),))
-
-    monkeypatch.setattr(retraining, "compare_on", compare)
-    monkeypatch.setattr(retraining, "export_trained", lambda progress: "new")
-    monkeypatch.setattr(retraining, "watched", lambda progress, found, own, policy: episodes(20))
-    families = tuple(uncertainty.Family(name, {}) for name in ("as stated", "other floors"))
-    found = uncertainty.Uncertainty(Patch(), families[0], families, ())
-    retraining.accept_policy(Progress(tmp_path, asked(), lambda text, share: told.append((text, share))), found, ROBOT)
-    assert told == [("acceptance: as stated", 0.0), ("acceptance: other floors", 0.5)]
-
-
 def test_rewards_come_beside_those_of_the_recipe():
-    sizes = {"steps": 10**6, "rate": 5e-4, "seed": 3, "rewards": retraining.STUCK_WHEELS}
-    settings = retraining.training_settings("velocity_slip_aware", uncertainty.Family("training", {}), **sizes)
+    settings = retraining.training_settings(asked(), uncertainty.Family("training", {}), retraining.STUCK_WHEELS)
     rewards = settings["environment"]["task"]["rewards"]
     assert rewards["stuck_wheels"] == {"weight": -6.0}
     assert rewards["squared_velocity_error"]

@@ -1,6 +1,7 @@
 """PPO training: reproducible, survives interruptions, stops at numbers that are not finite."""
 
 import importlib
+import re
 import shutil
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from ppo_runs import ENVIRONMENT, SETTINGS, assert_same_weights, curve, train, w
 from waiting import wait_until
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import PACKAGE
 from wlr_gym.cli import main
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.evaluation import make_core
@@ -64,6 +66,12 @@ def test_training_changes_the_policy(run):
     untrained = load_agent("ppo").make_policy(core.contract(), SETTINGS).act(readings)
     core.close()
     assert not np.array_equal(trained, untrained)
+
+
+def test_private_names_of_stable_baselines_are_used_in_one_module():
+    names = r"\bmodel\._|_last_obs|_last_episode_starts|_n_updates|_setup_learn|_update_current|_get_samples|_build\b|_on_step"
+    texts = {path.name: path.read_text(encoding="utf-8") for path in (PACKAGE / "learning").rglob("*.py")}
+    assert [name for name, text in texts.items() if re.search(names, text)] == ["sb3.py"]
 
 
 def test_plain_stable_baselines_loads_the_model(run):

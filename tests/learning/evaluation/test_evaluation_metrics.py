@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from evaluation_examples import EPISODES, MEASURES, PERIOD, TICKS, measured, rollout
 
-from wlr_gym.base.paths import PACKAGE
 from wlr_gym.learning.evaluation import Measure, metrics_of, score, summarise
-from wlr_gym.learning.evaluation.metrics import SETTLING, TRACKING, spectrum
+from wlr_gym.learning.evaluation.metrics import spectrum
 
 
 def test_perfect_driving():
@@ -160,10 +159,3 @@ def test_the_scale_of_the_tracking_error_is_not_the_limit_of_success():
     assert "0.01 m/s" in docs["success"]
     largest = (Measure("velocity_error", "m/s", "ahead", max=0.1, scale=0.04), MEASURES[1])  # as the environment has it
     assert score(rollout(measured=errors, measures=largest))["tracking_error"].mean == pytest.approx(0.2 / np.sqrt(2))
-
-
-def test_the_page_explains_every_row_of_the_tracking_error():
-    page = (PACKAGE.parent / "docs" / "evaluation.md").read_text(encoding="utf-8")
-    for metric in TRACKING:
-        assert f"`{metric.key}`" in page or f"`{metric.key.removeprefix('tracking_error')}`" in page
-    assert f"| {SETTLING:g} s or more after start and changes of command; before that |" in page

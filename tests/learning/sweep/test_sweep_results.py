@@ -25,7 +25,8 @@ TRIALS = trials_of([{"gamma": 0.9}, {"gamma": 0.97}], [0, 1, 2])
 
 
 def result(settings, folder, score=1.0, seed=0, status="done"):
-    return TrialResult(trial_of(settings, seed), status, [{"steps": 10.0, "tracking_error": score}], 10, 1.0, "", folder)
+    scores = [{"steps": 10.0, "tracking_error": score}]
+    return TrialResult(trial_of(settings, seed), folder, status, scores=scores, steps=10, seconds=1.0)
 
 
 def write_curve(folder, steps):
@@ -62,11 +63,11 @@ def test_a_trial_that_has_ended_is_read_once(book, monkeypatch):
     """Otherwise the end of each of 1000 trials would read the folders of 1000."""
     reads = []
 
-    def read(trial, folder, *arguments):
-        reads.append(trial.name)
-        return result(trial.settings, folder, seed=trial.seed)
+    def read(result):
+        reads.append(result.trial.name)
+        result.status = "done"
 
-    monkeypatch.setattr(running, "read_result", read)
+    monkeypatch.setattr(TrialResult, "read", read)
     book.train(TRIALS, lambda jobs: (Ended(job.name) for job in jobs))
     assert sorted(set(reads)) == sorted(trial.name for trial in TRIALS)
     assert len(reads) <= 2 * len(TRIALS)

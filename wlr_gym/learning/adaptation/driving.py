@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,14 +147,6 @@ WHOLE = "time is over"
 FELL = "it fell"
 
 
-class EpisodeRobot(Protocol):
-    """A robot that policies can drive."""
-
-    def start(self, log: Path | None, seed: int) -> tuple[RobotPlant, Any]:
-        """Return the robot as a plant, torque off, and the simulator behind an emulated one; None = it is a real one."""
-        ...
-
-
 @dataclass(frozen=True)
 class RobotEpisode:
     """How an episode went.
@@ -182,7 +174,7 @@ class RobotEpisode:
 
 
 def drive_episode(
-    environment: str, policy: str, robot: EpisodeRobot, seed: int, seconds: float, log: Path | None = None
+    environment: str, policy: str, robot: AdaptedRobot, seed: int, seconds: float, log: Path | None = None
 ) -> RobotEpisode:
     """Drive one episode; torque is off afterwards. Commands are those of a simulated episode of the same seed.
 

@@ -18,7 +18,7 @@ from wlr_gym.envs.tasks.task import having
 from wlr_gym.hardware.config import load_hardware
 from wlr_gym.hardware.safety.rules import JointMemory, RobotStatus, is_frozen, is_lost, ratings_of, remember_joints
 from wlr_gym.hardware.servos import UNREAD
-from wlr_gym.learning.adaptation.state import AdaptStep, Progress
+from wlr_gym.learning.adaptation.state import AdaptStep, Asked, Progress
 from wlr_gym.learning.adaptation.uncertainty import STATED, TRAINED_SHARE, Family, Uncertainty
 from wlr_gym.learning.evaluation.conditions import FIRST_SEED
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out, seen_observations
@@ -58,28 +58,18 @@ EXPORT_ROBOTS, EXPORT_SECONDS = 8, 4.0
 # ---- training --------------------------------------------------------------------------------------------------------
 
 
-def training_settings(
-    policy: str,
-    family: Family,
-    *,
-    steps: int,
-    rate: float,
-    seed: int,
-    sensors: Any = (),
-    rewards: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
+def training_settings(asked: Asked, family: Family, rewards: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the settings of a training on from a policy: its own recipe, on the robots of a family.
 
     Args:
-        policy: where it starts. family: what it trains with.
-        steps: environment steps. rate: learning rate at the start. seed: of everything random.
-        sensors: which of camera and flow the robot has. rewards: terms beside those of the recipe.
+        asked: which policy, how long, at which rate, with which sensors. family: what it trains with.
+        rewards: terms beside those of the recipe.
     """
-    settings = dict(agent_function("ppo", "settings_to_start_from")(policy))
+    settings = dict(agent_function("ppo", "settings_to_start_from")(asked.policy))
     environment = dict(settings.get("environment") or {})
     task = environment.get("task") or {}
     if isinstance(task, Mapping):  # not a task file
-        present = having(sensors)["task"] if task.get("sensors") else {}
+        present = having(asked.sensors)["task"] if task.get("sensors") else {}
         own = {"rewards": {**(task.get("rewards") or {}), **rewards}} if rewards else {}
         environment["task"] = {**task, **present, **own}
     environment["randomization"] = dict(family.randomization)
@@ -88,14 +78,14 @@ def training_settings(
     else:
         environment.pop("effects", None)
     batch = settings.get("num_envs", 512) * settings.get("steps_per_env", 32)
-    every = max(batch, steps // _SCORES)
+    every = max(batch, asked.steps // _SCORES)
     return settings | {
         "environment": environment,
         "tasks": {},
-        "seed": seed,
-        "total_steps": steps,
-        "learning_rate": rate,
-        "final_learning_rate": FALLS_TO * rate,
+        "seed": asked.seed,
+        "total_steps": asked.steps,
+        "learning_rate": asked.learning_rate,
+        "final_learning_rate": FALLS_TO * asked.learning_rate,
         "initial_log_std": LOG_STD,
         "evaluate_every": every,
         "checkpoint_every": every,
@@ -119,9 +109,7 @@ def train_in(progress: Progress, folder: Path, config: Path, family: Family, rew
     if (folder / CONFIG_FILE).is_file():
         resume_training(folder, on_update=on_update)
         return
-    sizes: dict[str, Any] = {"steps": asked.steps, "rate": asked.learning_rate, "seed": asked.seed}
-    settings = training_settings(asked.policy, family, **sizes, sensors=asked.sensors, rewards=rewards)
-    write_yaml(config, settings)
+    write_yaml(config, training_settings(asked, family, rewards))
     train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
 
 
@@ -232,27 +220,24 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
 
 def acceptance_on(progress: Progress, new: str, family: Family, own: Robot, share: float) -> Acceptance:
     """Return how a new policy does against the old one on the robots of a family; kept in a file. ``share``: of the step."""
+    asked = progress.asked
     path = progress.folder(ACCEPTANCE) / f"{Path(new).parent.name}_{family.name.replace(' ', '_')}.json"
     if not path.is_file():
         progress.tell(f"acceptance: {family.name}", share)
-        write_acceptance(path, compare_on(new, progress.asked.policy, progress.asked, family, own, progress.threads))
+        result = accept(
+            new,
+            asked.environment,
+            references=[asked.policy],
+            floors=[{**family.randomization, "name": family.name}],
+            episodes=asked.episodes,
+            blocks=1,
+            sensors=asked.sensors,
+            robot=own,
+            effects=list(family.effects) or None,
+            threads=progress.threads,
+        )
+        write_acceptance(path, result)
     return read_acceptance(path)
-
-
-def compare_on(new: str, old: str, asked: Any, family: Family, own: Robot, threads: int = 1) -> Acceptance:
-    """Play two policies on the same episodes of a family."""
-    return accept(
-        new,
-        asked.environment,
-        references=[old],
-        floors=[{**family.randomization, "name": family.name}],
-        episodes=asked.episodes,
-        blocks=1,
-        sensors=asked.sensors,
-        robot=own,
-        effects=list(family.effects) or None,
-        threads=threads,
-    )
 
 
 # ---- would the supervision stop the robot? its rules on simulated episodes; the simulator drives on ------------------

@@ -198,10 +198,20 @@ def write_page(progress: Progress, kept: str) -> Path:
     """Write the page and its numbers; return the path of the page."""
     content = numbers_of(progress, kept)
     write_json(progress.out / NUMBERS_FILE, content)
-    parts = [_head(progress, content), section("Time", _times(progress, content))]
-    parts += [section(f"{n}. {TITLES[name]}", _step(progress.steps[name])) for n, name in enumerate(STEPS, 1)]
+    said = [line for name in ("gap", "acceptance") for line in progress.steps[name].said[:1]]
+    lines = "".join(f"<p>{escape(line)}</p>" for line in said)
+    times = [
+        (TITLES[name], one["outcome"], duration(one["driving"]), duration(one["computing"]))
+        for name, one in content["steps"].items()
+    ]
+    times.append(("all", "", duration(content["driving_seconds"]), duration(content["computing_seconds"])))
     note = {"emulated": _EMULATED, "real": _REAL}.get(progress.asked.driven, "")
-    parts.append(f"<footer><p>{escape(note)}</p></footer>" if note else "")
+    parts = [
+        f'<header><p class="label">wlr adapt</p><h1>{escape(headline(content))}</h1>{lines}</header>',
+        section("Time", table(("step", "", "driving", "computing"), times, (2, 3))),
+        *(section(f"{n}. {TITLES[name]}", _step(progress.steps[name])) for n, name in enumerate(STEPS, 1)),
+        f"<footer><p>{escape(note)}</p></footer>" if note else "",
+    ]
     path = progress.out / PAGE_FILE
     write_text(path, document("Adaptation of a policy", _COLOURS[content["is_new"]], parts))
     return path
@@ -223,38 +233,15 @@ def headline(content: dict[str, Any]) -> str:
     return said + ("." if share is None else f", {share:.0f} % of what the robot had cost it.")
 
 
-def _head(progress: Progress, content: dict[str, Any]) -> str:
-    said = [line for name in ("gap", "acceptance") for line in progress.steps[name].said[:1]]
-    lines = "".join(f"<p>{escape(line)}</p>" for line in said)
-    return f'<header><p class="label">wlr adapt</p><h1>{escape(headline(content))}</h1>{lines}</header>'
-
-
-def _times(progress: Progress, content: dict[str, Any]) -> str:
-    rows = [
-        (TITLES[name], one["outcome"], duration(one["driving"]), duration(one["computing"]))
-        for name, one in content["steps"].items()
-    ]
-    rows.append(("all", "", duration(content["driving_seconds"]), duration(content["computing_seconds"])))
-    return table(("step", "", "driving", "computing"), rows, (2, 3))
-
-
 def _step(record: AdaptStep) -> str:
-    said = "".join(f"<p>{escape(line)}</p>" for line in record.said)
-    numbers = record.numbers
+    said, numbers = "".join(f"<p>{escape(line)}</p>" for line in record.said), record.numbers
     if "rows" in numbers:
         said += table(("robots", *COLUMNS), numbers["rows"], range(2, 6))
-    if "old" in numbers and isinstance(numbers["old"], list):
-        said += _episodes(numbers)
+    if isinstance(numbers.get("old"), list):  # of each episode
+        names = [name for name in ("old", "new") if name in numbers]
+        errors = [[*numbers[name], sum(numbers[name]) / len(numbers[name])] for name in names]
+        titles = [*(str(k + 1) for k in range(len(numbers["old"]))), "mean"]
+        shown = [[f"{value:.3f}" if math.isfinite(value) else "-" for value in row] for row in zip(*errors, strict=True)]
+        rows = [(title, *row) for title, row in zip(titles, shown, strict=True)]
+        said += table(("episode", *(f"tracking error, {name} policy" for name in names)), rows, range(1, 1 + len(names)))
     return said + (commands([record.command]) if record.command else "")
-
-
-def _episodes(numbers: dict[str, Any]) -> str:
-    names = [name for name in ("old", "new") if name in numbers]
-    columns = [numbers[name] for name in names]
-    rows = [(str(k + 1), *(_number(value) for value in row)) for k, row in enumerate(zip(*columns, strict=True))]
-    rows.append(("mean", *(_number(sum(one) / len(one)) for one in columns)))
-    return table(("episode", *(f"tracking error, {name} policy" for name in names)), rows, range(1, 1 + len(names)))
-
-
-def _number(value: float) -> str:
-    return f"{value:.3f}" if math.isfinite(value) else "-"

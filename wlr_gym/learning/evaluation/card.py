@@ -384,14 +384,14 @@ def _table(table: Table) -> list[str]:
 
 def content(card: Card) -> dict[str, Any]:
     """Return the card as plain types: what ``card.json`` holds."""
-    power = {name: [None if np.isnan(p) else float(p) for p in played.power] for name, played in card.main.items()}
+    power = {name: [_plain(density) for density in played.power] for name, played in card.main.items()}
     document: dict[str, Any] = {
         "format": FORMAT,
         "conditions": dict(card.conditions),
         "identities": dict(card.identities),
         "metrics": {m.key: {"unit": m.unit, "less_is_better": m.less_is_better, "doc": m.doc} for m in card.metrics},
         **_policies(card, MAIN),
-        "score_in_percent_of": {name: _numbers(estimate) for name, estimate in card.share_of.items()},
+        "score_in_percent_of": _plain(card.share_of),
         "sweeps": {
             sweep.name: [{"at": point.label, **_policies(card, sweep.label(point))} for point in sweep.points]
             for sweep in card.sweeps
@@ -399,39 +399,31 @@ def content(card: Card) -> dict[str, Any]:
         "spectrum": {"frequency": card.main[card.names[0]].frequency.tolist(), "power": power},
     }
     if OTHER_PLANT in card.results:
-        document["other_plant"] = {
-            **_policies(card, OTHER_PLANT),
-            "score_kept": {name: _numbers(estimate) for name, estimate in card.kept.items()},
-        }
+        document["other_plant"] = {**_policies(card, OTHER_PLANT), "score_kept": _plain(card.kept)}
     if card.training_seeds:
-        document["training_seeds"] = {name: _seeds(seeds) for name, seeds in card.seed_scores.items()}
+        document["training_seeds"] = {
+            name: {
+                "scores": _plain(seeds.scores),
+                "interquartile_mean": _plain(seeds.interquartile_mean),
+                "median_seed": seeds.median_seed,
+                "spread_in_percent_of_median": _plain({metric.key: seeds.spread(metric.key) for metric in card.metrics}),
+            }
+            for name, seeds in card.seed_scores.items()
+        }
     return document
 
 
 def _policies(card: Card, label: str) -> dict[str, Any]:
-    return {"policies": _scores(card.scores[label]), "better_than": _scores(card.comparison[label])}
+    return {"policies": _plain(card.scores[label]), "better_than": _plain(card.comparison[label])}
 
 
-def _scores(scores: Mapping[str, Scores]) -> dict[str, Any]:
-    return {name: _estimates(own) for name, own in scores.items()}
-
-
-def _estimates(scores: Scores) -> dict[str, Any]:
-    return {key: _numbers(estimate) for key, estimate in scores.items()}
-
-
-def _seeds(seeds: SeedScores) -> dict[str, Any]:
-    spread = {key: seeds.spread(key) for key in next(iter(seeds.scores.values()))}
-    return {
-        "scores": _scores(seeds.scores),
-        "interquartile_mean": _estimates(seeds.interquartile_mean),
-        "median_seed": seeds.median_seed,
-        "spread_in_percent_of_median": {key: value if np.isfinite(value) else None for key, value in spread.items()},
-    }
-
-
-def _numbers(estimate: Estimate) -> dict[str, float | None]:
-    return {name: float(value) if np.isfinite(value) else None for name, value in vars(estimate).items()}
+def _plain(value: Any) -> Any:
+    """Return estimates, in mappings or alone, and numbers as plain types; None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {key: _plain(own) for key, own in value.items()}
+    if isinstance(value, Estimate):
+        return _plain(vars(value))
+    return float(value) if np.isfinite(value) else None
 
 
 def write_card(folder: Path, card: Card, pictures: Mapping[str, str] | None = None) -> None:

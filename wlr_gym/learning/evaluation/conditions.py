@@ -100,21 +100,16 @@ def play(
         chosen = list(group)
         references: dict[tuple[str, int], _Given] = {}
         with ExitStack() as stack:  # all players first: a policy that does not fit is refused before anything is played
-            players = {subject: _players(environment, subject, chosen[0], stack) for subject in subjects}
+            players: dict[Subject, list[tuple[Core, Policy]]] = {subject: [] for subject in subjects}
+            for subject, made in players.items():
+                for source in subject.sources:
+                    made.append(make_player(environment, source, chosen[0].episodes, chosen[0].keywords))
+                    stack.callback(made[-1][0].close)
             for subject in subjects:
                 for condition in chosen:
                     blocks = _blocks(players[subject], subject, condition, first_seed, tell, watch, references)
                     results[condition.label][subject.name] = summarise(blocks, len(subject.sources))
     return results
-
-
-def _players(environment: str, subject: Subject, condition: Condition, stack: ExitStack) -> list[tuple[Core, Policy]]:
-    players = []
-    for source in subject.sources:
-        core, policy = make_player(environment, source, condition.episodes, condition.keywords)
-        stack.callback(core.close)
-        players.append((core, policy))
-    return players
 
 
 def _blocks(

@@ -7,11 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.colors import to_rgb
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator, MultipleLocator
+from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, text_colour, tidy
@@ -25,9 +29,6 @@ from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import Normalize
-
     from wlr_gym.envs.tasks import Randomization
 
 #: Panels of a sweep, each a metric.
@@ -341,9 +342,6 @@ _COLOURS = "viridis"
 
 def draw_floors(path: Path, randomizations: Sequence[Randomization], first_seed: int = 0, count: int = COUNT) -> None:
     """Draw the floors of ``reset(seed=first_seed)`` and the next seeds, a block per randomisation, and write the picture."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LogNorm
-
     columns, beside = min(count, _COLUMNS), min(len(randomizations), _BLOCKS)
     rows, below = -(-count // columns), -(-len(randomizations) // beside)
     size = 2.2 if beside == 1 else 1.75 if count == 1 else 1.2
@@ -383,10 +381,6 @@ def _draw_block(panels: Sequence[Axes], randomization: Randomization, robot_seed
 
 
 def _draw(axes: Axes, parameters: Parameters, yaw: float, norm: Normalize) -> None:
-    from matplotlib import colormaps
-    from matplotlib.patches import Rectangle
-    from matplotlib.transforms import Affine2D
-
     colours = colormaps[_COLOURS]
     ground = float(parameters["ground.mu_x"].mean())
     axes.set_facecolor(colours(norm(ground)))

@@ -274,7 +274,7 @@ def accept(
             effects=effects,
             threads=threads,
             precision=PRECISION,
-            tell=_part_of(tell, _name(family), len(chosen)),
+            tell=lambda text, share, family=family: tell(f"{_name(family)}: {text}", share / len(chosen)),
         )
         errors = {name: scores["tracking_error"].mean for name, scores in card.scores[MAIN].items()}
         for name, better in card.comparison[MAIN].items():
@@ -291,10 +291,6 @@ def accept(
         inputs,
         tuple(losses),
     )
-
-
-def _part_of(tell: Tell, family: str, families: int) -> Tell:
-    return lambda text, share: tell(f"{family}: {text}", share / families)
 
 
 def _name(family: Any) -> str:

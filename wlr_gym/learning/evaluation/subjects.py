@@ -95,7 +95,8 @@ def _subject(given: Sequence[Source]) -> Subject:
     for index, source in enumerate(sources):
         if source in sources[:index]:
             raise InputError(f"policy '{source}' is given twice: expected each training of a recipe once")
-    name = next((name for name, _ in found if name), texts[0] if len(texts) == 1 else common_name(texts))
+    common = _SEED.sub("", commonprefix(texts)) or "trained"  # noqa: RUF071 (names may have more in common than folders)
+    name = next((name for name, _ in found if name), texts[0] if len(texts) == 1 else common)
     if len(sources) == 1:
         return Subject(name, sources)
     seeds = by_seed(name, sources)
@@ -156,22 +157,18 @@ def make_player(environment: str, source: str | Path, episodes: int, keywords: M
     Raises:
         InputError: unknown environment, policy or keyword, or a policy that does not fit the environment.
     """
+    core = None
     try:
-        return _player(environment, source, episodes, keywords)
-    except InputError:
-        _refuse_another_task(environment, source)
-        raise
-
-
-def _player(environment: str, source: str | Path, episodes: int, keywords: Mapping[str, Any]) -> tuple[Core, Policy]:
-    core = make_core(environment, episodes, environment_for(source, keywords))
-    try:
+        core = make_core(environment, episodes, environment_for(source, keywords))
         policy = make_policy(source, core.contract())
         if isinstance(policy, Planner):
             policy.use_simulator(core)
         return core, policy
-    except BaseException:
-        core.close()
+    except BaseException as error:
+        if core is not None:
+            core.close()
+        if isinstance(error, InputError):
+            _refuse_another_task(environment, source)
         raise
 
 
@@ -223,11 +220,6 @@ def expand(text: str) -> tuple[str, ...]:
 
 def _is_run(place: Path) -> bool:
     return place.suffix == SUFFIX or (place.is_dir() and (is_policy(place) or (place / CONFIG_FILE).is_file()))
-
-
-def common_name(sources: Sequence[str]) -> str:
-    """Return what the paths of a recipe's runs have in common, without the word seed at its end."""
-    return _SEED.sub("", commonprefix(list(sources))) or "trained"  # noqa: RUF071 (names may have more in common than folders)
 
 
 def by_seed(name: str, sources: Sequence[str]) -> dict[str, str]:

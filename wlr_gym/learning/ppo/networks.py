@@ -169,8 +169,8 @@ class OnTop(nn.Module):
         return x[:, width:] + self.residual * self.last(x[:, :width])
 
 
-class Layered(OpenPolicy):
-    """Stable-Baselines3's policy with :class:`Layers`."""
+class LayeredPolicy(OpenPolicy):
+    """Stable-Baselines3's policy with :class:`Layers`, for plain observations (N, D)."""
 
     def __init__(self, *arguments: Any, layers: Layers = Layers(), **keywords: Any) -> None:
         self.layers = layers
@@ -197,11 +197,7 @@ class Layered(OpenPolicy):
             self.action_net: nn.Module = OnTop(last, layers.residual)
 
 
-class LayeredPolicy(Layered):
-    """For plain observations (N, D)."""
-
-
-class LayeredAsymmetricPolicy(Layered, AsymmetricPolicy):
+class LayeredAsymmetricPolicy(LayeredPolicy, AsymmetricPolicy):
     """For observations {``policy``: (N, D), ``privileged``: (N, P)}."""
 
 

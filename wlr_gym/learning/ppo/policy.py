@@ -11,10 +11,9 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt, model_validator
 
@@ -23,6 +22,9 @@ from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.policy import contract_of
 from wlr_gym.robot import LEGS, WHEELS
+
+if TYPE_CHECKING:
+    import torch
 
 
 class PpoConfig(SettingsModel):
@@ -49,7 +51,7 @@ class PpoConfig(SettingsModel):
         mirror: learn from the left-right mirror image of every other sample.
         initial_log_std: logarithm of the exploration noise at the start, in actions: of all joints, or of (legs, wheels).
         teacher: agent whose actions the actor learns before PPO starts (``warm_start.py``); None = from nothing.
-        evaluate_every: environment steps between scores on held-out episodes (``held_out.py``); 0 = never.
+        evaluate_every: environment steps between scores on held-out episodes (``training.py``); 0 = never.
         evaluation_episodes: how many these are.
         checkpoint_every: environment steps between checkpoints.
         keep_checkpoints: how many of the newest stay.
@@ -241,9 +243,9 @@ def actor(network: Any) -> Any:
 
 def acting_net(network: Any) -> Any:
     """Return the last layer of a network as the finished policy has it."""
-    from wlr_gym.learning.ppo.networks import Layered
+    from wlr_gym.learning.ppo.networks import LayeredPolicy
 
-    return network.acting_net() if isinstance(network, Layered) else network.action_net
+    return network.acting_net() if isinstance(network, LayeredPolicy) else network.action_net
 
 
 def parse_settings(config: Mapping[str, Any]) -> PpoConfig:
@@ -251,32 +253,20 @@ def parse_settings(config: Mapping[str, Any]) -> PpoConfig:
     return parse_config(PpoConfig, dict(config), "agent 'ppo'")
 
 
-def policy_class(config: PpoConfig, *, asymmetric: bool) -> Any:
-    """Return the class of the configured network."""
+def network_kind(config: PpoConfig, contract: Mapping[str, Any], *, asymmetric: bool = False) -> tuple[Any, dict[str, Any]]:
+    """Return the class of the configured network for an environment's contract, and the keywords that make it."""
     from stable_baselines3.common.policies import ActorCriticPolicy
-
-    from wlr_gym.learning.ppo.networks import AsymmetricPolicy, LayeredAsymmetricPolicy, LayeredPolicy
-
-    plain, layered = (AsymmetricPolicy, LayeredAsymmetricPolicy) if asymmetric else (ActorCriticPolicy, LayeredPolicy)
-    return layered if _is_layered(config) else plain
-
-
-def policy_keywords(config: PpoConfig, contract: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keywords that make Stable-Baselines3's network the configured one for an environment's contract."""
     from torch import nn
 
+    from wlr_gym.learning.ppo import networks
+
     activation = {"tanh": nn.Tanh, "elu": nn.ELU, "relu": nn.ReLU}[config.activation]
-    keywords = {"net_arch": list(config.hidden_layers), "activation_fn": activation}
-    if not _is_layered(config):
-        return keywords
-    from wlr_gym.learning.ppo.networks import Layers, controller_columns
-
-    columns = () if config.residual is None else controller_columns(contract)
-    return keywords | {"layers": Layers(config.normalise, columns, config.residual or 0.0, config.residual_share)}
-
-
-def _is_layered(config: PpoConfig) -> bool:
-    return config.normalise or config.residual is not None
+    keywords: dict[str, Any] = {"net_arch": list(config.hidden_layers), "activation_fn": activation}
+    if not config.normalise and config.residual is None:
+        return networks.AsymmetricPolicy if asymmetric else ActorCriticPolicy, keywords
+    columns = () if config.residual is None else networks.controller_columns(contract)
+    layers = networks.Layers(config.normalise, columns, config.residual or 0.0, config.residual_share)
+    return networks.LayeredAsymmetricPolicy if asymmetric else networks.LayeredPolicy, keywords | {"layers": layers}
 
 
 def _network(contract: Mapping[str, Any], config: PpoConfig) -> Any:
@@ -291,8 +281,8 @@ def _network(contract: Mapping[str, Any], config: PpoConfig) -> Any:
     action_space = spaces.Box(-1.0, 1.0, (len(contract["action"]),), dtype=np.float32)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        kind = policy_class(config, asymmetric=False)
-        network = kind(observation_space, action_space, lambda _: config.learning_rate, **policy_keywords(config, contract))
+        kind, keywords = network_kind(config, contract)
+        network = kind(observation_space, action_space, lambda _: config.learning_rate, **keywords)
     network.set_training_mode(False)
     return network
 
@@ -310,6 +300,8 @@ def to_onnx(actor: torch.nn.Module, width: int) -> bytes:
         actor: maps observations to actions, both float32.
         width: of the observation.
     """
+    import torch
+
     robots = torch.export.Dim("robots")
     with _quiet():
         program = torch.onnx.export(

@@ -39,15 +39,7 @@ from wlr_gym.learning.evaluation.metrics import summarise
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.learning.ppo import sb3
 from wlr_gym.learning.ppo.networks import MirroredBuffer, MirroredDictBuffer, set_mirror
-from wlr_gym.learning.ppo.policy import (
-    MODEL_FILE,
-    PpoConfig,
-    PpoPolicy,
-    parse_settings,
-    policy_class,
-    policy_keywords,
-    with_network_of,
-)
+from wlr_gym.learning.ppo.policy import MODEL_FILE, PpoConfig, PpoPolicy, network_kind, parse_settings, with_network_of
 from wlr_gym.learning.ppo.warm_start import gather_scales, imitate, start_from
 from wlr_gym.policy import Training, TrainingProgress, fed_environment, read_contract, write_contract
 
@@ -126,8 +118,9 @@ def learning_rate(config: PpoConfig) -> Callable[[float], float]:
 def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
     """Return an untrained Stable-Baselines3 PPO with the configured settings."""
     asymmetric = isinstance(env.observation_space, spaces.Dict)
+    kind, keywords = network_kind(config, env.contract(), asymmetric=asymmetric)
     model = PPO(
-        policy_class(config, asymmetric=asymmetric),
+        kind,
         env,
         learning_rate=learning_rate(config),
         n_steps=config.steps_per_env,
@@ -140,7 +133,7 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
         vf_coef=config.value_coefficient,
         max_grad_norm=config.max_gradient_norm,
         target_kl=config.target_kl,
-        policy_kwargs=policy_keywords(config, env.contract()),
+        policy_kwargs=keywords,
         seed=config.seed,
         device="cpu",
         rollout_buffer_class=(MirroredDictBuffer if asymmetric else MirroredBuffer) if config.mirror else None,

@@ -184,7 +184,7 @@ def search_with_tune(
     search = plan.search
     assert search is not None
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    mode = {"metric": search.metric, "mode": "min" if METRICS[search.metric] else "max"}
+    mode: dict[str, Any] = {"metric": search.metric, "mode": "min" if METRICS[search.metric] else "max"}
     searcher = OptunaSearch(
         space={name: _distribution(values) for name, values in plan.space.items()},
         # a resumed search draws other numbers than those that are known already

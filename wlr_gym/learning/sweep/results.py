@@ -35,27 +35,38 @@ UNFINISHED = "unfinished"
 Scores = Mapping[str, float]
 
 
-@dataclass(frozen=True)
+@dataclass
 class TrialResult:
     """What is known of a trial.
 
     Attributes:
         trial: its settings and seed.
+        folder: run folder.
         status: ``done``, ``failed``, ``stopped early`` (by the search) or ``unfinished``.
+        error: why it failed.
         scores: rows of ``held_out.csv``.
         steps: environment steps done.
         seconds: wall time of its updates.
-        error: why it failed.
-        folder: run folder.
     """
 
     trial: Trial
-    status: str
-    scores: Sequence[Scores]
-    steps: int
-    seconds: float
-    error: str
     folder: Path
+    status: str = UNFINISHED
+    error: str = ""
+    scores: Sequence[Scores] = ()
+    steps: int = 0
+    seconds: float = 0.0
+
+    def read(self) -> None:
+        """Read the run folder; a training that has done all its steps is done."""
+        file = self.folder / "learning_curve.csv"
+        curve = read_curve(file) if file.is_file() else []
+        clock = [row["seconds"] for row in curve]  # starts anew wherever the training was resumed
+        self.seconds = sum(now - before if now > before else now for before, now in zip([0.0, *clock], clock, strict=False))
+        self.steps = int(curve[-1]["steps"]) if curve else 0
+        self.scores = scores_of(self.folder)
+        if is_complete(self.folder) and not self.error:
+            self.status = DONE
 
     @property
     def final(self) -> Scores:
@@ -66,16 +77,6 @@ class TrialResult:
     def best(self) -> Scores:
         """Scores of the policy in ``best/``."""
         return best_of(self.scores)
-
-
-def read_result(trial: Trial, folder: Path, status: str = UNFINISHED, error: str = "") -> TrialResult:
-    """Return what the run folder of a trial says; ``status`` and ``error`` where it is not complete."""
-    curve = read_curve(folder / "learning_curve.csv") if (folder / "learning_curve.csv").is_file() else []
-    clock = [row["seconds"] for row in curve]  # starts anew wherever the training was resumed
-    seconds = sum(now - before if now > before else now for before, now in zip([0.0, *clock], clock, strict=False))
-    whole = is_complete(folder) and not error
-    steps = int(curve[-1]["steps"]) if curve else 0
-    return TrialResult(trial, DONE if whole else status, scores_of(folder), steps, seconds, error, folder)
 
 
 # ---- settings over seeds ---------------------------------------------------------------------------------------------

@@ -29,7 +29,6 @@ from wlr_gym.learning.sweep.results import (
     UNFINISHED,
     Summary,
     TrialResult,
-    read_result,
     stopped_early,
     summarise,
     write_page,
@@ -232,9 +231,7 @@ class _Book:
     def __init__(self, plan: SweepPlan, folder: Path, say: Say) -> None:
         self.plan, self.folder, self.say = plan, folder, say
         self.stopped = stopped_early(folder)
-        self._trials: dict[str, Trial] = {}
-        self._ended: dict[str, tuple[str, str]] = {}
-        self._known: dict[str, TrialResult] = {}
+        self._found: dict[str, TrialResult] = {}
         self._began, self._done, self._expected = time.monotonic(), 0, 0
 
     @property
@@ -267,8 +264,8 @@ class _Book:
         with (self.folder / BEGUN_FILE).open("a", encoding="utf-8") as file:
             file.write(f"{json.dumps(dict(trial.settings))}\n")
 
-    def _enter(self, trial: Trial) -> None:
-        self._trials.setdefault(trial.name, trial)
+    def _enter(self, trial: Trial) -> TrialResult:
+        return self._found.setdefault(trial.name, TrialResult(trial, self.folder / TRIALS / trial.name))
 
     def train(self, trials: Sequence[Trial], run: Run) -> None:
         """Train those of some trials that are not complete."""
@@ -280,42 +277,36 @@ class _Book:
         self._began, self._done, self._expected = time.monotonic(), 0, len(left)
         with closing(run(job_of(self.plan, trial, self.folder) for trial in left)) as ends:  # jobs end before who runs them
             for ended in ends:
-                self.end(self._trials[ended.name], ended.error)
+                self.end(self._found[ended.name].trial, ended.error)
 
     def end(self, trial: Trial, error: str, early: bool = False) -> None:
-        """Note how a trial ended; write the table."""
-        self._enter(trial)
-        self._ended[trial.name] = FAILED if error else STOPPED_EARLY if early else DONE, error
-        self._known.pop(trial.name, None)
+        """Note how a trial ended, read its run folder, and write the table."""
+        found = self._enter(trial)
+        found.status, found.error = FAILED if error else STOPPED_EARLY if early else DONE, error
+        found.read()
         self._done += 1
-        self.say(self._line(trial))
+        self.say(self._line(found))
         try:
             write_table(self.results(), self.folder)
         except InputError as problem:  # a full disk; the trials go on
             self.say(str(problem))
 
-    def _line(self, trial: Trial) -> str:
-        result, metric = self._result(trial), self.plan.metric
+    def _line(self, result: TrialResult) -> str:
+        metric, name = self.plan.metric, result.trial.name
         of = f"/{self._expected}" if self._expected else ""
         if result.status == FAILED:
-            return f"{self._done}{of}  {trial.name}: FAILED: {result.error}"
+            return f"{self._done}{of}  {name}: FAILED: {result.error}"
         scores = f"{metric} {result.final[metric]:.3f}" if metric in result.final else "no scores"
         left = (time.monotonic() - self._began) / self._done * (self._expected - self._done)
         rest = f"; about {duration(left)} left" if left > 0.0 else ""
-        return f"{self._done}{of}  {trial.name}: {result.status}, {scores}, {duration(result.seconds)}{rest}"
+        return f"{self._done}{of}  {name}: {result.status}, {scores}, {duration(result.seconds)}{rest}"
 
     def results(self) -> list[TrialResult]:
-        """Return what is known of all trials."""
-        return [self._result(trial) for trial in self._trials.values()]
-
-    def _result(self, trial: Trial) -> TrialResult:
-        """Read a trial's run folder, once after it has ended: in a sweep of thousands others end all the time."""
-        if trial.name in self._known:
-            return self._known[trial.name]
-        result = read_result(trial, self.folder / TRIALS / trial.name, *self._ended.get(trial.name, (UNFINISHED, "")))
-        if result.status != UNFINISHED:
-            self._known[trial.name] = result
-        return result
+        """Return what is known of all trials; those that have ended are not read again: of thousands some end all the time."""
+        for one in self._found.values():
+            if one.status == UNFINISHED:
+                one.read()
+        return list(self._found.values())
 
     def result_of(self, work: Callable[[], None]) -> SweepResult:
         """Do the work; write table and page of what there is, however it ends; return the result."""
@@ -339,10 +330,11 @@ class _Book:
 
     def write(self) -> None:
         """Write table and page; trials that were stopped early write their last checkpoint before they are read."""
-        for name, (status, _) in self._ended.items():
-            if status == STOPPED_EARLY and self._known.pop(name, None):
-                with suppress(InputError), locked(self.folder / LOCKS / name, 2 * PATIENCE):
+        for one in self._found.values():
+            if one.status == STOPPED_EARLY:
+                with suppress(InputError), locked(self.folder / LOCKS / one.trial.name, 2 * PATIENCE):
                     pass
+                one.read()
         results = self.results()
         write_table(results, self.folder)
         write_page(self.plan, results, self.folder)
