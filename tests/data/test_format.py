@@ -16,6 +16,8 @@ from wlr_gym.data import COLUMNS, Profile, RunMeta, check_table, convert, read_d
 from wlr_gym.data.format import CAMERA, FLOW, REQUIRED
 from wlr_gym.data.logs import export_run
 from wlr_gym.data.logs.write import read_exported
+from wlr_gym.data.sensors import SENSED, channels
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 
 DATA = Path(__file__).parent / "data"
@@ -47,6 +49,26 @@ def refused(path: Path, *words: str) -> None:
 
 def findings_of(table: dict[str, np.ndarray], kind: str) -> dict[str, tuple[int, ...]]:
     return {finding.column: finding.rows for finding in check_table(table, "run.csv") if finding.kind == kind}
+
+
+# --- a row of the sensors ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_new", [False, True])
+def test_a_row_has_no_flow_and_no_pose_without_a_new_reading_but_their_age(is_new):
+    """The plant's readings keep the last ones; in a run each stands where it was new."""
+    sensors = Sensors(np.arange(1.0, SENSOR_LAYOUT.width + 1.0)[None])
+    for name in ("flow_is_new", "camera_is_new"):
+        sensors[name][:] = is_new
+    columns = (*SENSED, *FLOW)
+    row = dict(zip(columns, channels(sensors, 0, columns), strict=True))
+    expected = {"flow_x": sensors.flow[0, 0], "flow_y": sensors.flow[0, 1], "flow_quality": sensors.flow_quality[0]}
+    expected |= dict(zip(("cam_x", "cam_y", "cam_yaw"), sensors.camera_pose[0], strict=True))
+    for name, value in expected.items():
+        assert row[name] == value if is_new else np.isnan(row[name]), name
+    assert row["flow_age"] == sensors.flow_age[0]
+    assert row["volt"] == sensors.supply_voltage[0]
+    assert np.array_equal(channels(sensors, 0), [row[name] for name in SENSED], equal_nan=True)
 
 
 # --- honest data ------------------------------------------------------------------------------------------------------

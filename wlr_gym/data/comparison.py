@@ -1,4 +1,10 @@
-"""The signals in which plants are compared, and what the robot's sensors resolve of each."""
+"""Compare two plants: same setpoints, same parameters, same start; where and when do they diverge, and by how much?
+
+Differences are given in units of what the robot's own sensors resolve (:func:`resolutions`), so that a difference below one
+could not be measured on the robot at all. With ``halve`` everything is repeated at half the physics step: a difference that
+comes from the steps shrinks with them, and each plant's own step error tells whose it is; what stays is a difference between
+the models.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +27,8 @@ from wlr_gym.physics.plants import check_simulator, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, Sensors, Truth
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -80,10 +88,8 @@ def resolutions(robot: Robot) -> dict[str, ComparedSignal]:
     }
 
 
-# --- plants that are compared, and what each of them does on the same motions -----------------------------------------
+# ---- plants, and what each of them does on the same motions ----------------------------------------------------------
 
-
-Array = NDArray[np.float64]
 
 #: s at the first setpoints before time 0, not compared: until the bounce of being set down has died out.
 SETTLE = 0.5
@@ -252,7 +258,7 @@ def _setpoints(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:
     return np.nan_to_num(setpoints), torque_on
 
 
-# --- compare two plants: same setpoints, same parameters, same start; where and when do they diverge, and by how much?
+# ---- their differences -----------------------------------------------------------------------------------------------
 
 
 #: s; the pose is compared after this long (or at the end of a shorter motion).

@@ -186,7 +186,7 @@ def segment_starts(t: Array, segment: float) -> NDArray[np.intp]:
     return np.unique(np.searchsorted(t, t[0] + segment * np.arange(count) - 1e-9))
 
 
-# --- simulation -------------------------------------------------------------------------------------------------------
+# ---- simulation ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -310,7 +310,7 @@ def _stacked(states: list[PlantState]) -> PlantState:
     return PlantState(**{name: np.concatenate([getattr(state, name) for state in states]) for name in known})
 
 
-# --- comparison -------------------------------------------------------------------------------------------------------
+# ---- comparison ------------------------------------------------------------------------------------------------------
 
 
 def _join(pieces: _Traces, name: str, t: Array, starts: NDArray[np.intp], ends: Array) -> Array:
@@ -349,7 +349,7 @@ def pooled(errors: Sequence[ChannelError], value: Callable[[ChannelError], float
     return float(np.sqrt(np.mean([value(error) ** 2 for error in errors])))
 
 
-# --- a run replayed row by row, as fast as it comes: what a page shows beside the measured robot ----------------------
+# ---- row by row: the ghost that a page shows beside the measured robot -----------------------------------------------
 
 
 #: s around an anchor whose samples are looked at.
@@ -403,7 +403,7 @@ def _near(run: Run, row: int) -> Run:
     return replace(run, table=run.table.iloc[int(first) : int(last)])
 
 
-# --- a run repeated on a robot, compared with the one that was measured first: the same table as for a simulator ------
+# ---- a run repeated on a robot: the same comparison ------------------------------------------------------------------
 
 
 def compare_repeat(measured: Run, repeated: Run, robot: Robot | str | Path | None = None, segment: float = 1.0) -> ReplayResult:
@@ -449,7 +449,7 @@ def _from_each_start(measured: Array, repeated: Array, starts: NDArray[np.intp])
     return shifted
 
 
-# --- simulate a run again from its record, bit for bit ----------------------------------------------------------------
+# ---- a simulated run once more, from its record, bit for bit ---------------------------------------------------------
 
 
 def simulated_parameters(run: Run, robot: Robot) -> Parameters:
@@ -522,7 +522,7 @@ def _set(parameters: Parameters, values: Mapping[str, Any]) -> None:
     parameters.validate()
 
 
-# --- overlay plots of a replay: measured, full run, segments ----------------------------------------------------------
+# ---- plots: measured, full run, segments -----------------------------------------------------------------------------
 
 
 _JOINTS = [[f"{kind}_{joint}" for joint in joints] for joints in (LEGS, WHEELS) for kind in ("pos", "vel", "eff")]

@@ -1,4 +1,8 @@
-"""Pose of the body: attitude as quaternion and as angles, and how the body stands on four wheels."""
+"""Robot states of a run, from what it measures: where a replay starts, and where each of its segments starts again.
+
+What the run measures is taken from it, smoothed; the rest (height, attitude, servo references) comes from a background state.
+Where no camera saw the robot, it is where its wheels and its gyroscope took it.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +59,7 @@ def quaternion(yaw: Array, pitch: Array, roll: Array) -> Array:
     return np.stack([w, x, y, z], axis=1)
 
 
-# --- robot states of a run, from what it measures: where a replay starts, and where each of its segments starts again -
+# ---- states ----------------------------------------------------------------------------------------------------------
 
 
 #: s; half width of the window over which a joint or gyro reading is smoothed.
@@ -230,7 +234,7 @@ def _rows_before_motion(run: Run) -> NDArray[np.bool_]:
     return (run["t"] <= run["t"][0] + CAMERA_WINDOW) & ~before
 
 
-# --- where a robot went by its wheels and its gyroscope: for runs, and stretches of runs, that no camera saw ----------
+# ---- odometry --------------------------------------------------------------------------------------------------------
 
 
 def rolled_poses(run: Run, robot: Robot) -> Array:

@@ -1,4 +1,9 @@
-"""Read runs and data sets. What is not a run in the format is refused, naming file, row and column."""
+"""Measured runs on disk: read, written and converted, with the robot they are of and the record of their simulation.
+
+What is not a run in the format is refused, naming file, row and column. Beside the runs of a folder stand ``meta.yaml``, and
+``robot.yaml`` where no shipped robot was driven; beside a simulated run its record, ``run_01.simulation.yaml``. That is not in
+the run: what a robot could not measure is no part of the format: a workflow that has to identify it must not read it there.
+"""
 
 from __future__ import annotations
 
@@ -203,7 +208,7 @@ def _read_parquet(path: Path) -> dict[str, Array]:
     return {name: np.array(table[name].to_numpy(), dtype=np.float64) for name in table.column_names}
 
 
-# --- write and convert runs: the same format that is read, checked before and moved into place when complete ----------
+# ---- writing ---------------------------------------------------------------------------------------------------------
 
 
 def write_run(
@@ -288,7 +293,7 @@ def _write_parquet(path: Path, columns: dict[str, NDArray[np.float64]]) -> None:
     pyarrow.parquet.write_table(pyarrow.table(columns), path, compression="zstd")
 
 
-# ---- the other format ------------------------------------------------------------------------------------------------
+# ---- conversion ------------------------------------------------------------------------------------------------------
 
 
 def convert(source: str | Path, target: str | Path, suffix: str | None = None) -> list[Path]:
@@ -322,7 +327,7 @@ def _moved(meta: RunMeta, source: Path, target: Path) -> RunMeta:
     return meta if robot is None else note_robot(target, robot, meta)
 
 
-# --- the robot of measured runs: by name where it ships, else by its content, in a file beside the runs, with its finge
+# ---- the robot of runs -----------------------------------------------------------------------------------------------
 
 
 def shipped_robots() -> dict[str, Path]:
@@ -413,7 +418,7 @@ def robot_of_meta(meta: RunMeta, folder: Path, file: str = META_FILE) -> Robot:
     return robot
 
 
-# --- the record of how a run was simulated: what is needed to simulate it again, bit for bit --------------------------
+# ---- the record of a simulation --------------------------------------------------------------------------------------
 
 
 SUFFIX = ".simulation.yaml"

@@ -1,4 +1,4 @@
-"""The columns of a run that the sensors fill, and one row of them from a plant's readings."""
+"""What a robot's sensors put into a run: their columns, one row of them from a plant's readings, and their noise."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def channels(sensors: Sensors, robot: int, columns: tuple[str, ...] = SENSED) ->
     return np.concatenate([*always, flow, [sensors.flow_age[robot]]])
 
 
-# --- sensor noise per column: what even a perfect model cannot predict ------------------------------------------------
+# ---- noise: what even a perfect model cannot predict -----------------------------------------------------------------
 
 
 def channel_noise(robot: Robot) -> dict[str, float]:

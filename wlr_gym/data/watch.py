@@ -1,8 +1,16 @@
-"""A film of a measured run beside its simulation.
+"""Runs to be watched: a film of a measured run beside its simulation, and recordings that a page plays.
 
-Both sides are drawn from the same channels in the same way: joints from the encoders, x, y and yaw from the camera (smoothed),
-height and tilt from the legs, as of a robot with all wheels on a flat floor. Slip is not measured, so none is drawn, and no
-friction. Both cameras look at the place of the measured robot, so that a simulated one that drifts is seen to drift.
+In a film both sides are drawn from the same channels in the same way: joints from the encoders, x, y and yaw from the camera
+(smoothed), height and tilt from the legs, as of a robot with all wheels on a flat floor. Slip is not measured, so none is
+drawn, and no friction. Both cameras look at the place of the measured robot: a simulated one that drifts is seen to drift.
+
+A page opens at once; what takes a simulator is worked out by a thread while it is watched:
+
+- the ghost: a plant driven with the run's setpoints, started anew from the measured robot every few seconds;
+- of a run that a simulator logged: the same simulation once more, which knows slip, forces and floor to the bit.
+
+There the measured robot is drawn from encoders, camera and gyroscope, smoothed as for a replay; where no frame is near, it
+moves as its wheels roll and its gyroscope turns.
 """
 
 from __future__ import annotations
@@ -90,7 +98,7 @@ def _times(run: Run) -> Array:
     return np.arange(t[0], t[-1], 1.0 / FPS)
 
 
-# --- runs as recordings that a page plays: the measured robot, its replayed ghost, and every channel over time --------
+# ---- recordings ------------------------------------------------------------------------------------------------------
 
 
 #: s between the points at which the ghost starts anew from the measured robot.

@@ -13,20 +13,22 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
-from wlr_gym.data.logs.write import McapStream
 from wlr_gym.data.runs import note_robot, write_meta
 from wlr_gym.data.sensors import LIVE_CAMERA, channels, sensed_columns
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.safety.rules import Decision, RobotStatus
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 from wlr_gym.robot import JOINTS, WHEEL_SLICE, Robot
+
+if TYPE_CHECKING:
+    from wlr_gym.data.logs.write import McapStream
 
 PARTIAL = "partial_"
 #: Phases of the control loop that begin a table, and its kind.

@@ -196,6 +196,31 @@ def test_lists_with_headers_of_their_own_and_wheels_beside_legs(messages, known,
         assert np.allclose(run[f"vel_{joint}"], right[f"vel_{joint}"]), joint
 
 
+def test_setpoints_of_a_trajectory_go_by_the_names_beside_its_points_or_by_place(messages, right, tmp_path):
+    kind, changed = "trajectory_msgs/msg/JointTrajectory", []
+    for time, topic, of_log, message in messages:
+        if topic == "/chassis/target":
+            lists = {name: getattr(message, of) for name, of in (("positions", "position"), ("velocities", "velocity"))}
+            lists |= {"accelerations": np.zeros(0), "effort": np.zeros(0)}
+            start = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+            points = [make("trajectory_msgs/msg/JointTrajectoryPoint", time_from_start=start, **lists)]
+            of_log, message = kind, make(kind, header=message.header, joint_names=list(message.name), points=points)
+        changed.append((time, topic, of_log, message))
+    path = write_mcap(tmp_path / "a.mcap", changed)
+    found = lab_map(path)
+    assert found.channels["cmd_leg"].field == "points[0].positions[{joint}]"
+    (imported,) = import_log(path, tmp_path / "runs", found)
+    check_right(imported, right)
+    places = {
+        f"cmd_{joint}": f"points[0].{('velocities', 'positions')[joint in LEGS]}[{k}]" for k, joint in enumerate(JOINTS[::-1])
+    }
+    by_place = {name: found.channels["cmd_leg" if "leg" in name else "cmd_wheel"].model_copy(update={"field": field})
+        for name, field in places.items()}  # fmt: skip
+    channels = {key: one for key, one in found.channels.items() if not key.startswith("cmd")} | by_place
+    (imported,) = import_log(path, tmp_path / "places", found.model_copy(update={"channels": channels}))
+    check_right(imported, right)
+
+
 def test_two_imus_the_better_known_is_taken_and_the_other_said(messages, tmp_path):
     second = [
         (time, "/camera/imu", "sensor_msgs/msg/Imu", imu(ns(1e-9 * time - 1.76e9), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)))

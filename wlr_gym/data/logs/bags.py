@@ -1,4 +1,8 @@
-"""Message definitions of a log: taken from the file, as it has them; from what is generally known, where it has none."""
+"""Read bags of ROS without ROS: MCAP files, rosbag2 (folders, ``.db3``, ``.mcap``) and rosbag1 (``.bag``).
+
+MCAP is read from front to back, chunk by chunk: in bounded memory, and with what a recorder left that was killed. Message
+definitions are taken from the file, as it has them; where it has none, from what is generally known.
+"""
 
 from __future__ import annotations
 
@@ -101,7 +105,7 @@ def _idl(text: str, parse: Any) -> dict[str, Any]:
     return found
 
 
-# --- read MCAP files from front to back, chunk by chunk: bounded memory, and what a recorder left that was killed -----
+# ---- MCAP ------------------------------------------------------------------------------------------------------------
 
 
 #: Schema encodings of ROS, by message encoding.
@@ -222,7 +226,7 @@ def _json(data: bytes) -> Any:
     return content if isinstance(content, dict) else {"data": content}
 
 
-# --- read bags of ROS: rosbag2 (folders, ``.db3``, ``.mcap``) and rosbag1 (``.bag``), without ROS ---------------------
+# ---- rosbag ----------------------------------------------------------------------------------------------------------
 
 
 METADATA = "metadata.yaml"

@@ -212,10 +212,9 @@ def _which(facts: _NameFacts, of_topic: _NameFacts, name: str | None, robot: Rob
 
 
 def _bracket(field: str) -> str | None:
-    """Return the name or place in a field's first brackets; a unit is none."""
-    found = re.search(r"(?<! )\[([^\]]*[A-Za-z][^\]]*|\d+)\]", field)
-    name = found.group(1) if found else ""
-    return None if not name or (len(name) > 1 and name.lower() in _UNITS) else name
+    """Return the name or place in a field's last brackets; a unit is none."""
+    found = re.findall(r"(?<! )\[([^\]]*[A-Za-z][^\]]*|\d+)\]", field)
+    return found[-1] if found and (len(found[-1]) == 1 or found[-1].lower() not in _UNITS) else None
 
 
 # ---- IMU and pose ----------------------------------------------------------------------------------------------------

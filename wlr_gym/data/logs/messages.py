@@ -192,7 +192,7 @@ def _values(row: Mapping[str, float], names: Sequence[str]) -> Array:
     return np.array([row.get(name, math.nan) for name in names], np.float64)
 
 
-# ---- back ------------------------------------------------------------------------------------------------------------
+# ---- reading back ----------------------------------------------------------------------------------------------------
 
 #: Column -> where it travels: topic and field.
 PLACES: dict[str, tuple[str, str]] = (
@@ -223,7 +223,7 @@ def read_content(text: str, where: str) -> dict[str, Any]:
     return content
 
 
-# --- what is shown of a run beside its channels: where the robot is, and how its wheels slip. Nothing of it is read bac
+# ---- what is shown beside the channels, and not read back ------------------------------------------------------------
 
 
 POSE, TRANSFORMS, SLIP, DESCRIPTION = "/pose", "/tf", "/slip", "/robot_description"

@@ -1,4 +1,7 @@
-"""Headings and pitches from quaternions of a log, in whatever frame it has them."""
+"""Make runs of a recording by a map: rows at the true times of one topic, and every sample of every channel beside them.
+
+Long recordings are made part by part: as much of one is in memory as a part needs; cuts are where the robot is quiet.
+"""
 
 from __future__ import annotations
 
@@ -96,7 +99,7 @@ def _quaternions(stem: str) -> list[list[str]]:
     return [[f"{stem}{joint}{part}" for part in "wxyz"] for joint in (".", "_", "")]
 
 
-# --- what a channel has at the times of rows that are not its own samples': ways to take a value, and how far that move
+# ---- values at the times of rows that are not a channel's own --------------------------------------------------------
 
 
 #: Usual steps between a channel's samples beyond which nothing is said of what lies between.
@@ -170,7 +173,7 @@ TAKES = {
 }
 
 
-# --- what a log leaves open about joints: where a table says that a motor is off, and angles that start anew after a tu
+# ---- what a log leaves open about joints -----------------------------------------------------------------------------
 
 
 #: rad; an angle that stays within a turn, or little more, and jumps by so much between two samples starts anew after a turn.
@@ -221,7 +224,7 @@ def _fastest(series: Mapping[str, tuple[Times, Array]], channel: str) -> float:
     return float(rates[np.isfinite(rates)].max(initial=0.0))
 
 
-# --- make a run of a log by a map: rows at the true times of one topic, and every sample of every channel beside them -
+# ---- one run ---------------------------------------------------------------------------------------------------------
 
 
 #: ns; channels that begin or end within this of the others shorten the run.
@@ -553,7 +556,7 @@ def _off(table: Mapping[str, Array]) -> Iterator[str]:
         yield f"{off.any(axis=0).sum()} rows have no setpoint, '{column}' among them: torque off"
 
 
-# ---- values at the rows' times ---------------------------------------------------------------------------------------
+# ---- its values ------------------------------------------------------------------------------------------------------
 
 
 def _taken(times: Times, at: Times, values: Array, source: Resolved, period: float) -> tuple[Array, ChannelFact]:
@@ -570,7 +573,7 @@ def _taken(times: Times, at: Times, values: Array, source: Resolved, period: flo
     return result, ChannelFact(source.column, source.topic, source.field, source.unit, rate, how, moved, known)
 
 
-# --- make runs of a recording, part by part: as much of it is in memory as a part needs; cuts are where the robot is qu
+# ---- part by part ----------------------------------------------------------------------------------------------------
 
 
 #: s, and numbers of the log, that a part may have (250 s of 40 channels at 200 Hz); ``split`` may ask for longer ones.

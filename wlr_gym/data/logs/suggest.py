@@ -36,6 +36,7 @@ from wlr_gym.data.logs.map import (
     units_of,
 )
 from wlr_gym.data.logs.rows import lost_frames, pose_angle
+from wlr_gym.data.logs.tables import TABLE
 from wlr_gym.data.logs.topics import Log
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameter_table import XYZ
@@ -53,6 +54,8 @@ _LATE = 0.02
 _NO_TIMES, _ANEW = 0.02, -1_000_000_000
 #: rad; a robot that drives is not tilted by so much.
 _TILTED = 1.0
+#: Columns of a table that are listed where one is asked for.
+_LISTED = 64
 #: Parts of a proposal, each a question or a set of channels that are read alike.
 _SETS = {
     **{f"{kind}_{part}": GROUPS[f"{kind}_{part}"] for kind in ("cmd", "pos", "vel", "eff") for part in ("leg", "wheel")},
@@ -473,14 +476,16 @@ class _Proposer:
         return float(jumps.max(initial=0.0)), float(rates.max(initial=0.0))
 
     def _unnamed(self) -> str:
-        """Return which lists have as many elements as a robot has joints of a kind, but no names."""
+        """Return which lists have as many elements as a robot has joints of a kind, but no names; and a table's columns."""
         said = []
         for name, topic in self.log.topics.items():
             stems = sorted({field.rpartition("[")[0] for field in topic.fields if is_unnamed(topic, field)})
             long = [stem for stem in stems if f"{stem}[{len(LEGS) - 1}]" in topic.fields]
             said += [f"topic '{name}': {', '.join(long)}"] if long else []
         hint = f"say which is which, by place, and suggest again: joints: {{{JOINTS[0]}: '0', ...}}"
-        return f"; lists without names: {'; '.join(said)}; {hint}" if said else ""
+        text = f"; lists without names: {'; '.join(said)}; {hint}" if said else ""
+        table = self.log.topics.get(TABLE)
+        return text if table is None else f"{text}; the table has {', '.join(map(repr, list(table.fields)[:_LISTED]))}"
 
     # ---- fields as the map has them ---------------------------------------------------------------------------------
 

@@ -1,4 +1,7 @@
-"""Read CSV files as other programs write them: what separates, which encoding, where the names of the columns are."""
+"""Read tables as recordings: CSV and Parquet with any columns, one of them the time, and LeRobot data sets of version 3.
+
+CSV is read as other programs write it: whatever separates, whichever encoding, wherever the names of the columns are.
+"""
 
 from __future__ import annotations
 
@@ -171,7 +174,7 @@ def _is_cut(path: Path, dialect: _Dialect) -> bool:
     return not last.endswith(("\n", "\r")) and len(_split(last, dialect.separator)) < len(dialect.names)
 
 
-# --- read tables as recordings: CSV and Parquet with any columns, one of them the time --------------------------------
+# ---- tables ----------------------------------------------------------------------------------------------------------
 
 
 #: Name of the topic that a table's columns make.
@@ -388,7 +391,7 @@ def numeric_topic(frame: pandas.DataFrame, times: NDArray[np.int64], wanted: Col
     return Topic(TABLE, TABLE, np.asarray(times, np.int64), None, fields, known=frozenset(names))
 
 
-# --- read LeRobot data sets of version 3: each episode is a recording, each feature some fields -----------------------
+# ---- LeRobot: each episode is a recording, each feature some fields --------------------------------------------------
 
 
 INFO = Path("meta") / "info.json"

@@ -1,4 +1,8 @@
-"""What a log holds, whatever wrote it: topics, the times of their messages, and their numeric fields."""
+"""What a log holds, whatever wrote it: topics, the times of their messages, and their numeric fields.
+
+A recording of any length is kept as blocks of its topics, beyond some memory in a temporary file, and given back whole or by
+time.
+"""
 
 from __future__ import annotations
 
@@ -190,11 +194,13 @@ def stamp_of(content: Any) -> int | None:
     return found
 
 
-def numbers(content: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
+def numbers(content: Any, prefix: str = "", outer: list[str] | None = None) -> Iterator[tuple[str, float]]:
     """Yield name and value of every number in a message: ``orientation.x``, ``data[2]``, ``position[left_wheel]``.
 
     Elements of arrays beside a list of as many names go by name, as in ``sensor_msgs/JointState``; so do lists of messages
-    that have a name. Headers, texts, covariances and what is longer than :data:`LONGEST` are left out.
+    that have a name. Where the names stand beside a list of messages (``outer``), as in ``trajectory_msgs/JointTrajectory``,
+    the arrays in them go by name and by place. Headers, texts, covariances and what is longer than :data:`LONGEST` are left
+    out.
     """
     items = _items(content)
     names = _names(items)
@@ -205,7 +211,9 @@ def numbers(content: Any, prefix: str = "") -> Iterator[tuple[str, float]]:
         if isinstance(value, bool | int | float | np.number):
             yield name, float(value)
         elif isinstance(value, list | np.ndarray):
-            yield from _elements(name, value, names)
+            yield from _elements(name, value, names or outer)
+            if names is None and outer is not None:
+                yield from _elements(name, value, None)
         elif _is_message(value) and _nanoseconds(value) is None:
             yield from numbers(value, f"{name}.")
 
@@ -215,7 +223,7 @@ def _elements(name: str, values: Any, names: list[str] | None) -> Iterator[tuple
         return
     if _is_message(values[0]):
         for k, value in enumerate(values):
-            yield from numbers(value, f"{name}[{_label(value, k)}].")
+            yield from numbers(value, f"{name}[{_label(value, k)}].", names)
         return
     labels = names if names is not None and len(names) == len(values) else range(len(values))
     for label, value in zip(labels, values, strict=True):
@@ -266,7 +274,7 @@ def cannot_read(path: Path, what: str, error: object) -> InputError:
     return InputError(f"{path}: cannot be read as {what}: {text}")
 
 
-# --- recordings of any length: their topics in blocks, beyond some memory in a temporary file, given back whole or by t
+# ---- recordings of any length ----------------------------------------------------------------------------------------
 
 
 #: Bytes that are kept in memory; what is more goes to a temporary file.

@@ -1,4 +1,4 @@
-"""Write runs as MCAP files and as rosbag2: for Foxglove, PlotJuggler and ROS, and to be read back."""
+"""Write runs as MCAP files and rosbag2, for Foxglove, PlotJuggler and ROS: whole, or while they go on; and read them back."""
 
 from __future__ import annotations
 
@@ -41,6 +41,8 @@ from wlr_gym.data.logs.open import quiet, read_logs
 from wlr_gym.data.logs.topics import LOG, Log, Share
 from wlr_gym.data.runs import Run, Simulation, is_shipped, own_robot
 from wlr_gym.robot import Robot, load_robot
+
+Array = NDArray[np.float64]
 
 #: Formats by name, and the suffix of what is written.
 FORMATS = {"mcap": ".mcap", "rosbag2": ".bag2"}
@@ -153,7 +155,7 @@ def _write_rosbag(path: Path, run: Run) -> None:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-# --- write a run into an MCAP file while it goes on, without holding up what makes it ---------------------------------
+# ---- while a run goes on, without holding up what makes it -----------------------------------------------------------
 
 
 #: Rows that may wait to be written: 20 s at 50 Hz. Beyond, rows are left out: whoever makes them never waits.
@@ -271,10 +273,7 @@ class McapStream:
             self._flushed = time.monotonic()
 
 
-# --- read back runs that :mod:`wlr_gym.data.logs.write` wrote: channels to the bit, times to 1 ns ---------------------
-
-
-Array = NDArray[np.float64]
+# ---- reading back: channels to the bit, times to 1 ns ----------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
