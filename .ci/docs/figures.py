@@ -191,9 +191,7 @@ def _turned(points: NDArray[np.float64], angle: NDArray[np.float64]) -> NDArray[
 
 def vision_slip(path: Path) -> None:
     """Slip in a rendered film of a skid turn, as ``wlr vision`` draws it."""
-    from studies.bench.vision import TRUE_OFFSET
-    from studies.bench.vision_drives import film, skid_turn
-    from studies.bench.vision_scenes import CAMERA
+    from studies.bench.vision import CAMERA, TRUE_OFFSET, film, skid_turn
     from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.scene import Look, Renderer, floor_facets, view
     from wlr_gym.perception.vision.analysis import analyse, save_video_analysis

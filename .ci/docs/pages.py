@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Modules of the API page, in order: title -> module. They are the public interface (docs/versions.md).
+#: Modules of the API page, in order: title -> module. They are the public interface (docs/architecture.md).
 API = {
     "Environments": "wlr_gym.envs",
     "The robot as a machine": "wlr_gym.hardware",
@@ -33,7 +34,6 @@ API = {
     "The contract of a plant": "wlr_gym.physics.plants.base",
     "Effects": "wlr_gym.physics.effects",
     "What an effect is made of": "wlr_gym.physics.effects.effect",
-    "How an effect is looked for": "wlr_gym.physics.effects.effect",
     "Slip": "wlr_gym.robot.slip",
     "Slip observer": "wlr_gym.perception.observer",
     "Runs": "wlr_gym.data",
@@ -55,8 +55,8 @@ API = {
 ROLE = re.compile(r":(?:class|func|meth|mod|data|attr|exc):<code>~?([\w.]+)</code>")
 INTRODUCTION = (
     "`import wlr_gym` registers the environments and loads nothing heavy; the names below load when they are used. What most "
-    "programs need stands first, under the name that you import it by; then the packages. [Public](versions.md) is what stands "
-    "here, no more."
+    "programs need stands first, under the name that you import it by; then the packages. "
+    "[Public](architecture.md#what-is-public) is what stands here, no more."
 )
 
 
@@ -108,10 +108,11 @@ def on_files(files: Files, config: Any) -> Files:
     from mkdocs.structure.files import File
 
     made = {
-        "index.md": start_page(),
+        "index.md": root_page("README.md"),
         "commands.md": command_page(),
         "api.md": api_page(),
-        "changes.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+        "changes.md": root_page("CHANGELOG.md"),
+        "contributing.md": root_page("CONTRIBUTING.md"),
         "site.css": STYLE,
     }
     made |= {f"notebooks/{path.stem}.md": notebook_page(path) for path in (ROOT / "docs" / "notebooks").glob("*.ipynb")}
@@ -120,12 +121,23 @@ def on_files(files: Files, config: Any) -> Files:
     return files
 
 
-def start_page() -> str:
-    """README.md with its links as they are from within docs/."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    text = re.sub(r"\]\(docs/", "](", text)
-    text = text.replace("](CHANGELOG.md)", "](changes.md)").replace("[CITATION.cff](CITATION.cff)", "`CITATION.cff`")
-    return text.replace("](LICENSE)", "](https://opensource.org/license/mit)")
+#: Links of the pages in the clone's root: file -> where it is on the site; ``None``: the clone only has it.
+_ROOT_LINKS = {
+    "CHANGELOG.md": "changes.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "LICENSE": "https://opensource.org/license/mit",
+    "CITATION.cff": None,
+    "examples": None,
+}
+
+
+def root_page(name: str) -> str:
+    """A page of the clone's root with its links as they are from within docs/."""
+    text = re.sub(r"\]\(docs/", "](", (ROOT / name).read_text(encoding="utf-8"))
+    for file, place in _ROOT_LINKS.items():
+        shown = r"`\1`" if place is None else rf"[\1]({place})"
+        text = re.sub(rf"\[([^\]]+)\]\({re.escape(file)}\)", shown, text)
+    return text
 
 
 def notebook_page(path: Path) -> str:
@@ -174,8 +186,12 @@ def api_page() -> str:
 
     parts = ["# Python interface", "", INTRODUCTION, "", "## The names of wlr_gym", ""]
     for name, home in wlr_gym.HOMES.items():
+        # under its package, if that has a section below: a name with two addresses cannot be linked
+        packages = [
+            one for one in API.values() if home.startswith(f"{one}.") and name in vars(import_module(one)).get("__all__", ())
+        ]
         parts += [
-            f"::: {home}.{name}",
+            f"::: {(packages or [home])[0]}.{name}",
             "    options:",
             f"      heading: wlr_gym.{name}",
             f"      toc_label: {name}",

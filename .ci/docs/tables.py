@@ -19,11 +19,10 @@ import measured
 
 from studies import ablations, learning
 from studies.bench import performance
-from studies.bench.adapt_study import read_lines
-from studies.bench.adapt_table import markdown as markdown_of_cases
-from studies.bench.decide_table import markdown as markdown_of_decisions
-from studies.bench.gap import score_answers
-from studies.bench.gap_score_table import markdown
+from studies.bench.adapt import markdown as markdown_of_cases
+from studies.bench.adapt import read_lines
+from studies.bench.decide import markdown as markdown_of_decisions
+from studies.bench.gap import markdown, score_answers
 from studies.paper.verdicts import verdict_table
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.data.format import COLUMNS, Column

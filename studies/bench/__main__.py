@@ -22,8 +22,8 @@ from wlr_gym.cli.options import ForceOption, JsonOption, ray_address
 from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
-    from studies.bench.convergence import Deviation
     from studies.bench.engine import EngineReport
+    from studies.bench.speed import Deviation
     from studies.bench.vision import VisionResult
 
 #: Measurement -> function. Imported when it is run.
@@ -36,15 +36,14 @@ MEASUREMENTS = {
     "import": "studies.bench.speed:measure_import",
     "start": "studies.bench.speed:measure_start",
     "batch": "studies.bench.speed:measure_batch",
-    "convergence": "studies.bench.convergence:measure_convergence",
+    "convergence": "studies.bench.speed:measure_convergence",
     "vision": "studies.bench.vision:measure_vision",
     "bus": "studies.bench.bus:measure_bus",
-    "perception": "studies.bench.perception:measure_perception",
+    "perception": "studies.bench.bus:measure_perception",
     "camera": "studies.bench.camera_chain:measure_camera",
-    "sysid": "studies.bench.sysid:measure_sysid",
 }
 #: Take long or need packages that few have: only made when named.
-_ON_REQUEST = ("vision", "bus", "camera", "perception", "learning", "sysid")
+_ON_REQUEST = ("vision", "bus", "camera", "perception", "learning")
 #: Its own kind: hours, resumable, with a folder of results. See docs/gap_benchmark.md.
 BLIND_TEST = "gap"
 #: Another: what a hidden fault costs a policy, and how much of it is won back. See docs/adapt.md.
@@ -57,7 +56,7 @@ LAB_FILMS = "vision with --out"
 #: Option -> those of the above that take it.
 _TAKEN_BY = {
     **dict.fromkeys(("cases", "contenders"), (ADAPT_STUDY, DECIDE_STUDY)),
-    **dict.fromkeys(("ray", "answers", "classifier", "speed", "threads"), (BLIND_TEST,)),
+    **dict.fromkeys(("ray", "answers", "classifier"), (BLIND_TEST,)),
     "sets": (BLIND_TEST, LAB_FILMS),
     "seed": (LAB_FILMS,),
     "processes": (BLIND_TEST, DECIDE_STUDY),
@@ -71,7 +70,7 @@ class BenchOptions(JsonOption, ForceOption):
     """Measurements to make, as with --only."""
     only: tuple[str, ...] = ()
     """Some of engine, mujoco, env_step, ppo, import, start, batch, convergence; on request: learning, bus, camera, perception,
-    vision, sysid. gap (the blind test of the gap workflow), adapt (what adaptation wins back), decide (gap --until-decided):
+    vision. gap (the blind test of the gap workflow), adapt (what adaptation wins back), decide (gap --until-decided):
     alone, with --out."""
     save: Path | None = None
     """File (.json) for all numbers; the picture of the engine is written beside it."""
@@ -99,10 +98,6 @@ class BenchOptions(JsonOption, ForceOption):
     classifier: int = 0
     """gap: afterwards train the baseline, a classifier on the scores of the first screening, on so many sets of the engine
     (kept in --out; half a minute each), and score its answers to the same data sets."""
-    speed: tuple[Path, ...] = ()
-    """gap: instead of the blind test, time the analysis of these folders of runs and show where the time goes."""
-    threads: int = 2
-    """gap: with --speed, worker threads of an analysis."""
 
 
 def run(options: BenchOptions) -> int:
@@ -130,7 +125,7 @@ def run(options: BenchOptions) -> int:
     if DECIDE_STUDY in asked:
         return _decide_study(options)
     if BLIND_TEST in asked:
-        return _gap_speed(options) if options.speed else _blind_test(options)
+        return _blind_test(options)
     if options.out is not None:
         return _lab_films(options, asked)
     console = Console()
@@ -167,16 +162,22 @@ def _measured(names: Sequence[str], size: Size, console: Console) -> Iterator[tu
 
 def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:
     """Put accuracy and speed of all settings into the report, print them, draw them beside it; return the ratios."""
-    from studies.bench import engine_report
+    from studies.bench import engine
 
     report["engine"] = found.as_dict()
-    console.print(engine_report.reference_text(report["engine"]), markup=False, highlight=False)
-    print_table(console, *engine_report.settings_table(report["engine"]), "all settings")
+    console.print(engine.reference_text(report["engine"]), markup=False, highlight=False)
+    print_table(console, *engine.settings_table(report["engine"]), "all settings")
     if save is not None:
         picture = save.with_name(f"{save.stem}_engine.png")
-        engine_report.save_picture(report["engine"], picture)
+        engine.save_picture(report["engine"], picture)
         print(f"written: {picture}")
-    return engine_report.pairs(found.results)
+    return engine.pairs(found.results)
+
+
+def _folder(options: BenchOptions, study: str, kept: str) -> Path:
+    if options.out is None:
+        raise InputError(f"{study} needs --out DIR: finished {kept} are kept there, so that it can be interrupted")
+    return options.out
 
 
 def _write(path: Path, text: str, console: Console) -> None:
@@ -185,68 +186,58 @@ def _write(path: Path, text: str, console: Console) -> None:
     console.print(text, markup=False, highlight=False)
 
 
+def _end(options: BenchOptions, found: Any, console: Console, *names: str) -> int:
+    """Print what was found as JSON, if asked, and the names of the files in the folder."""
+    if options.json:
+        print_json(found)
+    assert options.out is not None
+    console.print(f"written: {', '.join(str(options.out / name) for name in names)}")
+    return OK
+
+
 def _blind_test(options: BenchOptions) -> int:
     """Test the gap workflow on data sets with hidden truths; print and write its score."""
     from studies.bench import gap
-    from studies.bench.gap_score_table import markdown
 
-    if options.out is None:
-        raise InputError(f"{BLIND_TEST} needs --out DIR: finished data sets are kept there, so that it can be interrupted")
-    console = Console(soft_wrap=True)
-    plan = gap.Plan(options.out, gap.ALL_SETS if options.sets is None else options.sets, options.processes)
+    out, console = _folder(options, BLIND_TEST, "data sets"), Console(soft_wrap=True)
+    plan = gap.Plan(out, gap.ALL_SETS if options.sets is None else options.sets, options.processes)
     report = gap.run_blind_test(plan, say=console.print, answers=options.answers, ray=ray_address(options.ray))
-    _write(options.out / "score.md", markdown(report), console)
+    _write(out / "score.md", gap.markdown(report), console)
     if options.classifier:
         found = gap.score_classifier(plan, options.classifier, console.print)
-        _write(options.out / "score_classifier.md", markdown(found), console)
+        _write(out / "score_classifier.md", gap.markdown(found), console)
     if options.save is not None:
         write_json(options.save, report)
-    if options.json:
-        print_json(report)
-    console.print(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")
-    return OK
+    return _end(options, report, console, "score.json", "score.md", "answers.json")
 
 
 def _adapt_study(options: BenchOptions) -> int:
     """Adapt a policy to robots with hidden faults, and others beside it; print and write the table."""
-    from studies.bench import adapt_study
-    from studies.bench.adapt_cases import chosen_cases
-    from studies.bench.adapt_table import markdown
+    from studies.bench import adapt
 
-    if options.out is None:
-        raise InputError(f"{ADAPT_STUDY} needs --out DIR: finished cases are kept there, so that it can be interrupted")
+    out, console = _folder(options, ADAPT_STUDY, "cases"), Console(soft_wrap=True, highlight=False)
     for name in options.contenders:
-        if name not in adapt_study.CONTENDERS:
-            raise unknown_name("contender", name, adapt_study.CONTENDERS)
-    console = Console(soft_wrap=True, highlight=False)
-    contenders = options.contenders or tuple(adapt_study.CONTENDERS)
-    study = adapt_study.AdaptStudy(options.out, chosen_cases(options.cases), contenders=contenders)
-    lines = adapt_study.run_adapt_study(study.quick() if options.quick else study, console.print)
-    _write(options.out / "adapt.md", markdown(lines), console)
-    if options.json:
-        print_json(lines)
-    console.print(f"written: {options.out / adapt_study.LINES_FILE}, {options.out / 'adapt.md'}")
-    return OK
+        if name not in adapt.CONTENDERS:
+            raise unknown_name("contender", name, adapt.CONTENDERS)
+    contenders = options.contenders or tuple(adapt.CONTENDERS)
+    study = adapt.AdaptStudy(out, adapt.chosen_cases(options.cases), contenders=contenders)
+    lines = adapt.run_adapt_study(study.quick() if options.quick else study, console.print)
+    _write(out / "adapt.md", adapt.markdown(lines), console)
+    return _end(options, lines, console, adapt.LINES_FILE, "adapt.md")
 
 
 def _decide_study(options: BenchOptions) -> int:
     """Let the gap workflow choose what robots with hidden effects drive, and others beside it; print and write the tables."""
-    from studies.bench import decide_study
-    from studies.bench.decide_table import markdown
+    from studies.bench import decide
 
-    if options.out is None:
-        raise InputError(f"{DECIDE_STUDY} needs --out DIR: finished cases are kept there, so that it can be interrupted")
+    out, console = _folder(options, DECIDE_STUDY, "cases"), Console(soft_wrap=True, highlight=False, markup=False)
     if len(options.cases) > 1 or not all(count.isdecimal() for count in options.cases):
         raise InputError(f"--cases {' '.join(options.cases)}: decide takes how many, 1 or more")
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    count = int(options.cases[0]) if options.cases else decide_study.CASES
-    contenders = options.contenders or tuple(decide_study.CONTENDERS)
-    lines = decide_study.run_decide_study(options.out, count, contenders, options.processes, console.print)
-    _write(options.out / "decide.md", markdown(lines), console)
-    if options.json:
-        print_json(lines)
-    console.print(f"written: {options.out / decide_study.LINES_FILE}, {options.out / 'decide.md'}")
-    return OK
+    count = int(options.cases[0]) if options.cases else decide.CASES
+    contenders = options.contenders or tuple(decide.CONTENDERS)
+    lines = decide.run_decide_study(out, count, contenders, options.processes, console.print)
+    _write(out / "decide.md", decide.markdown(lines), console)
+    return _end(options, lines, console, decide.LINES_FILE, "decide.md")
 
 
 def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
@@ -267,10 +258,7 @@ def _lab_films(options: BenchOptions, asked: tuple[str, ...]) -> int:
         write_json(path, report)
     rows = [(what, value, bar, _YES_NO[met]) for what, value, bar, met in bars(found)]
     print_table(console, ("what", "found", "bar", "met"), rows, f"{count} films of a lab")
-    if options.json:
-        print_json(report)
-    console.print(f"written: {options.out / 'score.json'}")
-    return OK
+    return _end(options, report, console, "score.json")
 
 
 def _print_speed(rows: Sequence[Measurement], console: Console) -> None:
@@ -313,21 +301,6 @@ def _print_vision(rows: Sequence[VisionResult], console: Console) -> None:
 
 #: Measurements with rows of their own kind; each has its list in the report.
 _TABLES = {"convergence": _print_convergence, "vision": _print_vision}
-
-
-def _gap_speed(options: BenchOptions) -> int:
-    """Time analyses of the gap workflow, step by step."""
-    from studies.bench.gap_speed import time_analyses
-
-    console = Console(soft_wrap=True)
-    found = time_analyses(options.speed, options.threads, lambda line: console.print(line, markup=False, highlight=False))
-    report = {"machine": machine(), "threads": options.threads, "analyses": [asdict(one) for one in found]}
-    if options.json:
-        print_json(report)
-    if options.save is not None:
-        write_json(options.save, report)
-        console.print(f"written: {options.save}")
-    return OK
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,29 +1,134 @@
-"""Accuracy against speed of the engine and of MuJoCo: the same ten motions, many settings of both, one reference."""
+"""Accuracy against speed of the engine and of MuJoCo: the same ten motions, many settings of both, one reference.
+
+Says the ratios at equal error and at the defaults, as rows, as a table and as a picture.
+"""
 
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.bench.measure import Size, interleave, summary
-from studies.bench.motions import PERIOD, TICKS, BenchMotion, distance, is_upright, motions, start
+from studies.bench.measure import Measurement, Size, interleave, summary
 from studies.bench.mujoco_loop import VIRTUAL_MASS_DIVISOR, Contact, ServoBatch, build_servo_model, servo_controls
-from wlr_gym.physics.plants.base import Plant, PlantOptions
+from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
+from wlr_gym.physics.model.dynamics import rotation_matrix
+from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, standing_state
 from wlr_gym.physics.plants.gibbs_appell.plant import SWEEPS, GibbsAppellPlant
 from wlr_gym.physics.plants.mujoco.plant import MujocoPlant
-from wlr_gym.robot import load_robot
+from wlr_gym.robot import CORNER_SIGNS, Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 Array = NDArray[np.float64]
+
+#: Environment steps of a motion, and s of each.
+TICKS, PERIOD = 100, PlantOptions().control_period
+GRIP, ICE = 0.6, 0.15
+#: s in which a setpoint moves to its next value: no jumps, so that no motor is at its voltage limit.
+RAMP = 0.2
+
+
+@dataclass(frozen=True)
+class BenchMotion:
+    """What one robot does on a level floor.
+
+    Attributes:
+        name: in words.
+        friction: (4,) of the floor under each wheel.
+        setpoints: (TICKS, 8) rad and rad/s.
+        velocity: m/s of the body at the start, forward and to the left.
+        distance: m to the end pose where a closed form says it (locked wheels, v^2/(2 mu g)), else None.
+    """
+
+    name: str
+    friction: Array
+    setpoints: Array
+    velocity: tuple[float, float] = (0.0, 0.0)
+    distance: float | None = None
+
+
+def motions(robot: Robot, ticks: int = TICKS) -> list[BenchMotion]:
+    """Return the ten motions, the same ones every time."""
+    rng, still = np.random.default_rng(31), np.zeros(4)
+    right = np.array([sign[1] < 0 for sign in CORNER_SIGNS])
+    turn, arc = np.where(right, 4.0, -4.0), np.where(right, 5.0, 2.0)
+
+    def drive(name: str, friction: Array | float, *wheels: Array, legs: bool = False) -> BenchMotion:
+        speeds = np.array(wheels)
+        angles = robot.home.leg_angle + rng.uniform(-0.3, 0.3, (len(wheels), 4)) * legs
+        return BenchMotion(name, np.full(4, friction), _ramps(np.hstack([angles, speeds]), robot.home.leg_angle, ticks))
+
+    def slide(name: str, friction: float, velocity: tuple[float, float]) -> BenchMotion:
+        distance = float(np.square(velocity).sum()) / (2.0 * friction * robot.gravity)
+        return BenchMotion(name, np.full(4, friction), drive(name, friction, still).setpoints, velocity, distance)
+
+    def commands(count: int = 5) -> list[Array]:
+        return list(rng.uniform(-4.0, 5.0, (count, 4)))
+
+    return [
+        drive("wheel commands", GRIP, *commands()),
+        drive("wheel and leg commands", GRIP, *commands(), legs=True),
+        drive("skid turn", GRIP, turn),
+        drive("arc", GRIP, arc),
+        drive("braking", GRIP, np.full(4, 5.0), still),
+        drive("wheel commands on a slippery floor", ICE, *commands()),
+        drive("skid turn on a slippery floor", ICE, turn),
+        drive("arc, one wheel on ice", np.array([GRIP, 0.05, GRIP, GRIP]), arc),
+        slide("locked wheels slide forward", 0.07, (0.5, 0.0)),
+        slide("locked wheels slide sideways", 0.3, (0.0, 0.8)),
+    ]
+
+
+def _ramps(targets: Array, home: float, ticks: int) -> Array:
+    """Return setpoints (ticks, 8) that reach each target in RAMP and hold it for an equal share of the time."""
+    share = ticks * PERIOD / len(targets)
+    starts = share * np.arange(len(targets))
+    knots = np.stack([starts, starts + min(RAMP, 0.5 * share)], axis=1).ravel()
+    before = np.vstack([np.r_[np.full(4, home), np.zeros(4)], targets[:-1]])
+    values = np.stack([before, targets], axis=1).reshape(-1, 8)
+    return np.stack([np.interp(PERIOD * np.arange(1, ticks + 1), knots, column) for column in values.T], axis=1)
+
+
+def start(robot: Robot, chosen: list[BenchMotion]) -> tuple[Parameters, PlantState]:
+    """Return parameters and start state of one robot per motion."""
+    parameters = Parameters.nominal(robot, len(chosen))
+    parameters["ground.mu_x"] = parameters["ground.mu_y"] = np.array([motion.friction for motion in chosen])
+    state = standing_state(robot, parameters)
+    state.linear_velocity_in_body[:, :2] = [motion.velocity for motion in chosen]
+    return parameters, state
+
+
+def distance(first: Array, second: Array, hip: Array) -> Array:
+    """Return how far apart two poses (N, 7: position, quaternion) put the robot: mean distance (N,) of its four hips, m."""
+    corners = np.array([[x, y, 1.0] for x, y in CORNER_SIGNS]) * hip
+    places = [pose[:, None, :3] + np.einsum("nij,kj->nki", rotation_matrix(pose[:, 3:7]), corners) for pose in (first, second)]
+    return np.linalg.norm(places[0] - places[1], axis=2).mean(axis=1)
+
+
+def is_upright(pose: Array) -> bool:
+    """Whether every robot's pose (N, 7) is finite, within 20 degrees of level and at least 2 cm above the floor."""
+    level = rotation_matrix(pose[:, 3:7])[:, 2, 2]
+    return bool(np.isfinite(pose).all() and (level > np.cos(np.radians(20.0))).all() and (pose[:, 2] > 0.02).all())
+
+
+# ---- settings and what came of them ----------------------------------------------------------------------------------
+
+
 Cone = Literal["elliptic", "pyramidal"]
 Integrator = Literal["Euler", "implicitfast"]
 
@@ -92,7 +197,7 @@ class EngineResult:
 
     Attributes:
         setting: what was run.
-        error, worst: m, rms and largest over the motions of :func:`studies.bench.motions.distance`.
+        error, worst: m, rms and largest over the motions of :func:`studies.bench.engine.distance`.
         upright: whether all robots were, at the end.
         speed: simulated seconds of a robot per second, one value per round.
     """
@@ -344,3 +449,236 @@ def _rollout_run(setting: EngineSetting, chosen: list[BenchMotion]) -> Run:
         return states[:, -1, 1:8].copy(), speed
 
     return run
+
+
+# ---- report: ratios, table, picture ----------------------------------------------------------------------------------
+
+
+#: m: errors at which the fastest setting of each side is compared. The first two
+#: are met where the contacts are nearly those of Coulomb, the last by MuJoCo's default contact.
+LEVELS = (1e-4, 5e-4, 2e-3, 2.5e-2)
+#: m: up to this error MuJoCo's setting counts as comparable.
+COMPARABLE = 1e-3
+COMPARABLE_BARS = {"float64": 50.0, "float32": 100.0}
+UNIT = "x real time"
+AT_DEFAULTS = "both at 1 ms, MuJoCo's defaults"
+#: What is compared at 1 ms: in words, how MuJoCo is called, threads, bars.
+STANDARD = ((AT_DEFAULTS, "step", 1, {"float64": 30.0, "float32": 60.0}), ("both at 1 ms, 2 threads", "rollout", 2, {}))
+
+
+def level_name(level: float) -> str:
+    """Return what a level is called."""
+    return f"error at most {1e3 * level:g} mm"
+
+
+def pairs(results: Sequence[EngineResult]) -> list[Measurement]:
+    """Return the ratios of speed: at equal error, at MuJoCo's defaults and equal step, and with two threads."""
+    found: list[Measurement] = []
+    for precision in ("float64", "float32"):
+        ours = [one for one in results if one.setting.side == "engine" and one.setting.precision == precision]
+        peers = [one for one in results if one.setting.side == "MuJoCo"]
+        for level in LEVELS:
+            bar = COMPARABLE_BARS[precision] if level < COMPARABLE else None
+            found += _pair(f"{precision}, {level_name(level)}", _fastest(ours, level), _fastest(peers, level), bar)
+        for what, call, threads, bar in STANDARD:
+            standard = _standard(ours, "step", threads), _standard(peers, call, threads)
+            found += _pair(f"{precision}, {what}", *standard, bar.get(precision))
+    return found
+
+
+def _pair(what: str, ours: EngineResult | None, peer: EngineResult | None, bar: float | None) -> list[Measurement]:
+    if ours is None or peer is None:
+        return []
+    text = f"{what}: {ours.setting.label} ({_millimetres(ours.error)})"
+    name = f"MuJoCo {peer.setting.label} ({_millimetres(peer.error)})"
+    return [Measurement("engine", text, UNIT, ours.speed, peer.speed, name, bar)]
+
+
+def _fastest(results: Iterable[EngineResult], level: float) -> EngineResult | None:
+    """Return the fastest on one thread that stays upright with an error of at most ``level``."""
+    fit = [one for one in results if one.upright and one.error <= level and one.setting.threads == 1]
+    return max(fit, key=lambda one: sorted(one.speed)[len(one.speed) // 2], default=None)
+
+
+def _standard(results: Iterable[EngineResult], call: str, threads: int) -> EngineResult | None:
+    """Return the setting of 1 ms with everything else at its default."""
+    for one in results:
+        setting = one.setting
+        kind = (setting.cone, setting.contact, setting.integrator)
+        usual = setting.side == "engine" or kind == KINDS[0]
+        if usual and setting.step == 1e-3 and setting.call == call and setting.threads == threads and setting.is_usual:
+            return one
+    return None
+
+
+def _millimetres(value: float | None) -> str:
+    return "lost" if value is None else f"{1e3 * value:.3g} mm" if value < 0.1 else f"{1e3 * value:.0f} mm"
+
+
+def reference_text(report: dict[str, Any]) -> str:
+    """Return what the errors are against, and how far that is known; ``report`` is ``EngineReport.as_dict()``."""
+    reference = report["reference"]
+    apart, rest = reference["disagreement"], reference["convergence"]
+    closed = "; ".join(f"{name}: {1e3 * value:+.2f} mm" for name, value in reference["closed_form"].items())
+    return (
+        f"The limits of both simulators differ by {1e6 * apart['median']:.2g} µm (median) and {1e6 * apart['max']:.2g} µm "
+        f"(largest) and lie {1e6 * rest['max']:.2g} µm at most beyond the finest step. Distance driven, reference minus the "
+        f"closed form of a rigid robot: {closed}. Not measured, for want of a GPU: MuJoCo Warp, MJX, Isaac Sim, Genesis."
+    )
+
+
+def settings_table(report: dict[str, Any]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return headings and rows: error and speed of every setting; ``report`` as for :func:`reference_text`."""
+    rows = []
+    for one in report["settings"]:
+        errors = [_millimetres(one[key]) if one["upright"] else "falls" for key in ("error", "worst")]
+        speed = "{median:.4g} [{min:.4g}..{max:.4g}]".format(**one["speed"])
+        rows.append((one["side"], one["label"], one["precision"], *errors, speed))
+    return ("side", "setting", "precision", "error, rms", "worst", "x real time"), rows
+
+
+_ERROR = "rms error: mean distance of the four hips from the reference after a motion of 2 s, rms over ten motions (mm)"
+_HOW_TO_READ = "Numbers: step in ms. Crosses: another number of passes (p; usual: 4) or iterations (i; usual: 100)"
+#: Colour of an engine's precision and of a contact of MuJoCo.
+_COLOURS = {"float64": BLUE, "float32": ORANGE, "default": "black", "stiff friction": GREY, "matched": WINE, "tuned": GREEN}
+
+
+def save_picture(report: dict[str, Any], path: Path) -> None:
+    """Write error against speed of every setting on one thread as a PNG; ``report`` is ``EngineReport.as_dict()``."""
+    figure = new_figure(9.5, 6.6)
+    axes = figure.subplots()
+    axes.set(xscale="log", yscale="log", xlabel=_ERROR)
+    axes.set_ylabel("simulated seconds of a robot per second of one core")
+    shown = [one for one in report["settings"] if one["upright"] and one["threads"] == 1 and one["call"] == "step"]
+    labels: list[Label] = []
+    for precision in ("float64", "float32"):
+        rows = [one for one in shown if one["side"] == "engine" and one["precision"] == precision]
+        labels += _draw(axes, rows, f"engine, {precision}", _COLOURS[precision], "o")
+    drawn: set[str] = set()
+    for cone, contact, integrator in KINDS:
+        kind = {"side": "MuJoCo", "cone": cone, "contact": contact, "integrator": integrator}
+        rows = [one for one in shown if all(one[name] == value for name, value in kind.items())]
+        label = f"MuJoCo: {contact}, {cone}, {integrator}"
+        labels += _draw(axes, rows, label, _COLOURS[contact], "s", is_second=contact in drawn)
+        drawn.add(contact)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+    _draw_pair(axes, shown)
+    axes.set_title(_HOW_TO_READ, fontsize=9, loc="left")
+    tidy(axes)
+    legend_below(figure, columns=3)
+    place_labels(figure, axes, labels)
+    save(figure, path)
+
+
+def _point(one: dict[str, Any]) -> tuple[float, float]:
+    return 1e3 * one["error"], one["speed"]["median"]
+
+
+def _draw(
+    axes: Axes, rows: list[dict[str, Any]], label: str, colour: str, marker: str, *, is_second: bool = False
+) -> list[Label]:
+    """Draw a curve over the step, and crosses of settings with another number of passes or iterations; return their labels.
+
+    The second of one colour is dashed, its markers are open, and its steps, which are those of the first, are not written.
+    """
+    usual = [one for one in rows if one["is_usual"]]
+    other = [one for one in rows if not one["is_usual"]]
+    line: dict[str, Any] = {"marker": marker, "label": label}
+    if is_second:
+        line |= {"linestyle": "--", "markerfacecolor": "white"}
+    crosses: dict[str, Any] = {"marker": "x", "linestyle": "none"}
+    for chosen, style in ((usual, line), (other, crosses)):
+        if chosen:
+            axes.plot(*zip(*map(_point, chosen), strict=True), color=colour, markersize=5, linewidth=1.2, **style)
+    steps = [] if is_second else [Label(*_point(one), f"{1e3 * one['step']:g}", colour) for one in usual]
+    return steps + [Label(*_point(one), _unusual(one), colour) for one in other]
+
+
+def _unusual(one: dict[str, Any]) -> str:
+    return f"{1e3 * one['step']:g}, {one['iterations']}{'p' if one['side'] == 'engine' else 'i'}"
+
+
+def _draw_pair(axes: Axes, shown: Sequence[dict[str, Any]]) -> None:
+    """Ring the fastest float64 setting of each side within the smallest level, and say how much faster the engine is."""
+    fit = [one for one in shown if one["precision"] == "float64" and one["error"] <= LEVELS[0]]
+    sides = [[one for one in fit if one["side"] == side] for side in ("engine", "MuJoCo")]
+    if not all(sides):
+        return
+    ours, peer = (max(rows, key=lambda one: one["speed"]["median"]) for rows in sides)
+    ratio = np.median(np.divide(ours["speed"]["values"], peer["speed"]["values"]))
+    for one in (ours, peer):
+        axes.plot(*_point(one), "o", markersize=11, markerfacecolor="none", markeredgecolor="black")
+    ends = {"arrowstyle": "<->", "shrinkA": 9, "shrinkB": 9}
+    axes.annotate("", _point(ours), _point(peer), arrowprops=ends)
+    text = f"rings: {level_name(LEVELS[0])}\n{ratio:.0f} times as fast\n\nengine: {ours['label']}\nMuJoCo: {peer['label']}"
+    middle = 1e3 * peer["error"], float(np.sqrt(ours["speed"]["median"] * peer["speed"]["median"]))
+    axes.annotate(text, middle, (8, 0), textcoords="offset points", va="center", fontsize=9)
+
+
+# ---- labels of the picture, each where it covers least of the lines, the points and the labels before it -------------
+
+
+#: Where a label may be, best first: points from its point to the right and up, and how it is aligned.
+_PLACES = (
+    (7, 0, "left", "center"),
+    (-7, 0, "right", "center"),
+    (5, -5, "left", "top"),
+    (-5, 5, "right", "bottom"),
+    (5, 5, "left", "bottom"),
+    (-5, -5, "right", "top"),
+    (0, 6, "center", "bottom"),
+    (0, -6, "center", "top"),
+)
+#: Pixels between the places at which a line and a label are sampled.
+_STEP = 2.0
+#: Half the width of a marker, pixels.
+_MARKER = 4.0
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text beside a point of the data."""
+
+    x: float
+    y: float
+    text: str
+    colour: str
+
+
+def place_labels(figure: Figure, axes: Axes, labels: Sequence[Label]) -> None:
+    """Write the labels; everything else of the figure must have been drawn, for its layout."""
+    figure.draw_without_rendering()
+    taken = np.concatenate([_samples(axes.transData.transform(np.asarray(line.get_xydata()))) for line in axes.lines])
+    for label in labels:
+        covered = [_covered(axes, label, k, taken) for k in range(len(_PLACES))]
+        box = _write(axes, label, int(np.argmin(covered)))
+        taken = np.concatenate([taken, _grid(box)])
+
+
+def _write(axes: Axes, label: Label, place: int) -> Array:
+    """Write a label at one of its places; return its corners, pixels."""
+    x, y, horizontal, vertical = _PLACES[place]
+    style = {"textcoords": "offset points", "fontsize": 7.5, "color": label.colour, "ha": horizontal, "va": vertical}
+    return axes.annotate(label.text, (label.x, label.y), (x, y), **style).get_window_extent().get_points()
+
+
+def _covered(axes: Axes, label: Label, place: int, taken: Array) -> int:
+    """Return how many of the samples a label would cover."""
+    (left, bottom), (right, top) = _write(axes, label, place)
+    axes.texts[-1].remove()
+    return int(np.sum((taken[:, 0] > left) & (taken[:, 0] < right) & (taken[:, 1] > bottom) & (taken[:, 1] < top)))
+
+
+def _samples(points: Array) -> Array:
+    """Return points on the lines between points (N, 2), and all over their markers."""
+    counts = np.ceil(np.linalg.norm(np.diff(points, axis=0), axis=1) / _STEP).astype(int) + 1
+    pieces = [np.linspace(start, end, count) for start, end, count in zip(points[:-1], points[1:], counts, strict=True)]
+    markers = [_grid(np.stack([point - _MARKER, point + _MARKER])) for point in points]
+    return np.concatenate([*markers, *pieces])
+
+
+def _grid(box: Array) -> Array:
+    """Return points all over a box of two corners."""
+    x, y = (np.arange(low, high, _STEP) for low, high in box.T)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from studies.bench.lab_renderer import Lab, frames, lens, true_places
-from studies.bench.vision_drives import FilmedDrive, lab_drive, pose_at, true_slip
+from studies.bench.vision import FilmedDrive, lab_drive, pose_at, true_slip
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import write_json
 from wlr_gym.perception.markers.targets import Target, load_target

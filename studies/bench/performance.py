@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from studies.bench.engine_report import AT_DEFAULTS, LEVELS, level_name, reference_text, save_picture, settings_table
+from studies.bench.engine import AT_DEFAULTS, LEVELS, level_name, reference_text, save_picture, settings_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "bench.json"
@@ -40,7 +40,7 @@ def merged(kept: list[Row], report: dict[str, Any]) -> list[Row]:
     return sorted([*old, *new.values()], key=lambda row: _ORDER.index(row["name"]) if row["name"] in _ORDER else len(_ORDER))
 
 
-_ORDER = ("engine", "mujoco", "env_step", "ppo", "learning", "sysid", "bus", "import", "start", "batch")
+_ORDER = ("engine", "mujoco", "env_step", "ppo", "learning", "bus", "import", "start", "batch")
 
 
 def speed_table(rows: Iterable[Row]) -> list[str]:
@@ -157,7 +157,7 @@ def write_readme(text: str, rows: list[Row]) -> str:
 
 def main(reports: list[str]) -> None:
     """Take reports over, write README's row and the picture."""
-    kept = json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {"rows": []}
+    kept: dict[str, Any] = json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {"rows": []}
     rows, engine = kept["rows"], kept.get("engine")
     for path in reports:
         report = json.loads(Path(path).read_text(encoding="utf-8"))

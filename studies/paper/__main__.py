@@ -66,8 +66,7 @@ def run(options: PaperOptions) -> int:
     from rich.console import Console
 
     from studies.paper import report
-    from studies.paper.claims import check_all
-    from studies.paper.evidence import gather
+    from studies.paper.claims import check_all, gather
     from studies.paper.experiments import write_tests
     from wlr_gym.base.files import output_folder
     from wlr_gym.base.provenance import record_provenance

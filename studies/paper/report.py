@@ -1,27 +1,290 @@
-"""The files of ``python -m studies.paper``: report, numbers, figures."""
+"""The files of ``python -m studies.paper``: report, numbers, figures.
+
+The figures are the paper's 7-11 and 13-17 with every model side by side, and what it does not show: slip and normal forces.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, MultipleLocator
+from numpy.typing import NDArray
 
-from studies.paper import slip_search
-from studies.paper.claims import CheckedClaim, claims_table
-from studies.paper.evidence import PaperEvidence, variant_row
-from studies.paper.experiments import REDUCED, TESTS, Record, error_of_ignoring_slip
-from studies.paper.measured import inverse_from_record
-from studies.paper.slip_candidates import READINGS, PaperReading
-from studies.paper.slip_outcomes import ERROR_TOLERANCE, LATERAL_TOLERANCE
-from studies.paper.slip_search import OBSERVABLES, SearchFinding
+from studies.paper import printed, slip_search
+from studies.paper.claims import CheckedClaim, PaperEvidence, claims_table, variant_row
+from studies.paper.experiments import (
+    MODELS,
+    REDUCED,
+    TESTS,
+    FromMeasurement,
+    IdealMotion,
+    PaperTest,
+    Record,
+    duration,
+    error_of_ignoring_slip,
+    inverse_from_record,
+)
+from studies.paper.slip_search import (
+    CANDIDATES,
+    ERROR_TOLERANCE,
+    LATERAL_TOLERANCE,
+    OBSERVABLES,
+    READINGS,
+    PaperReading,
+    SearchFinding,
+)
 from studies.paper.verdicts import verdict_table
 from wlr_gym.base.files import write_json, write_text
-from wlr_gym.base.plots import save
+from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
 from wlr_gym.physics.plants import SIMULATORS
 from wlr_gym.robot import Robot
+
+Array = NDArray[np.float64]
+
+_STYLES: dict[str, dict[str, Any]] = {
+    REDUCED: {"label": "reduced model", "color": ORANGE, "linewidth": 2.4, "alpha": 0.7},
+    "gibbs_appell": {"label": "Gibbs-Appell", "color": BLUE, "linewidth": 1.2},
+    "mujoco": {"label": "MuJoCo", "color": "black", "linewidth": 1.0, "linestyle": (0, (4, 3))},
+}
+_IDEAL: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
+#: s; what is before, the robot settling on its legs, is not drawn.
+_FROM = -0.5
+#: s between two ticks.
+_TICK = 5.0
+_UNEVEN = (WINE, GREEN)
+#: How the paper's prediction may count the wheel angle: relative to the leg or not.
+_PREDICTIONS: dict[bool, dict[str, Any]] = {
+    True: {"color": BLUE, "marker": "o", "label": "prediction with the encoder's angle", "markersize": 5},
+    False: {"color": ORANGE, "marker": "s", "label": "prediction of (3) as printed", "fillstyle": "none", "markersize": 9},
+}
+#: Combinations in the figure of the open question.
+_COMBINATIONS = 8
+_RPM = 60.0 / (2.0 * np.pi)
+#: A grid of axes.
+Panels = NDArray[Any]
+Series = Callable[[Record], Array]
+
+
+def _style(model: str) -> dict[str, Any]:
+    return _STYLES.get(model, {"label": model, "color": GREEN, "linewidth": 1.0})
+
+
+def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[Figure, Panels]:
+    figure = new_figure(5.0 * columns, height * rows + 0.8)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    figure.suptitle(title, fontsize=12)
+    for panel in axes.flat:
+        tidy(panel)
+    return figure, axes
+
+
+def _over_time(figure: Figure, axes: Panels) -> Figure:
+    """Finish a figure whose panels share the time."""
+    for panel in axes.flat:
+        panel.set_xlim(_FROM, duration() + 0.5)
+        panel.xaxis.set_major_locator(MultipleLocator(_TICK))
+    for panel in axes[-1]:
+        panel.set_xlabel("time (s)")
+    legend_below(figure)
+    return figure
+
+
+def _draw(axes: Axes, records: Sequence[Record], series: Series, title: str, label: str) -> None:
+    for record in records:
+        shown = record.time > _FROM
+        axes.plot(record.time[shown], series(record)[shown], **_style(record.model))
+    axes.set_title(title, fontsize=9)
+    axes.set_ylabel(label)
+
+
+def _draw_ideal(axes: Axes, ideal: IdealMotion, values: Array) -> None:
+    axes.plot(ideal.time, values, label="no slip, as commanded", zorder=1, **_IDEAL)
+
+
+def _heading(test: PaperTest, kind: int, what: str) -> str:
+    return f"Fig. {test.figures[kind]} ({test.title}): {what}"
+
+
+#: Column of a joint, and which motors of the paper it stands for.
+_LEGS = ((0, "front legs (motors 2, 3)"), (2, "rear legs (motors 1, 4)"))
+_WHEELS = ((4, "front wheels (motors 6, 7)"), (6, "rear wheels, free (motors 5, 8)"))
+
+
+def rotation_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
+    """Figures 7 and 13: rotation of each joint, left side."""
+    figure, axes = _panels(_heading(ideal.test, 0, "rotation of the joints"), 2, 2)
+    legs = (ideal.front, ideal.rear)
+    for k, (joint, title) in enumerate(_LEGS):
+        _draw_ideal(axes[0, k], ideal, np.degrees(legs[k]))
+        _draw(axes[0, k], records, lambda r, j=joint: np.degrees(r.joint_position[:, 0, j]), title, "rotation (degrees)")
+    for k, (joint, title) in enumerate(_WHEELS):
+        _draw_ideal(axes[1, k], ideal, ideal.wheels[:, joint - 4] / (2 * np.pi))
+        _draw(axes[1, k], records, lambda r, j=joint: r.joint_position[:, 0, j] / (2 * np.pi), title, "rotation (turns)")
+    return _over_time(figure, axes)
+
+
+def speed_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
+    """Figures 8 and 14: speed of each joint, left side."""
+    figure, axes = _panels(_heading(ideal.test, 1, "speed of the joints"), 2, 2)
+    columns = {0: 5, 2: 6, 4: 7, 6: 9}
+    for row, joints in enumerate((_LEGS, _WHEELS)):
+        for k, (joint, title) in enumerate(joints):
+            _draw_ideal(axes[row, k], ideal, ideal.u[:, columns[joint]] * _RPM)
+            _draw(axes[row, k], records, lambda r, j=joint: r.joint_velocity[:, 0, j] * _RPM, title, "speed (rpm)")
+    return _over_time(figure, axes)
+
+
+def torque_figure(records: Sequence[Record], ideal: IdealMotion, measured: FromMeasurement | None) -> Figure:
+    """Figures 9 and 15: motor torque of each joint, and what inverse dynamics says, as printed and as corrected.
+
+    Args:
+        records, ideal: of one test.
+        measured: inverse dynamics of the first simulator's record; None = none.
+    """
+    figure, axes = _panels(_heading(ideal.test, 2, "motor torque of the joints"), 2, 2, 2.8)
+    inverse = ideal.inverse_dynamics()
+    source = next((record for record in records if record.model != REDUCED), None)
+    for row, joints in enumerate((_LEGS, _WHEELS)):
+        for k, (joint, title) in enumerate(joints):
+            values = inverse.leg_torque[:, k] / 2 if row == 0 else inverse.wheel_torque[:, joint - 4]
+            _draw_ideal(axes[row, k], ideal, values)
+            _draw(axes[row, k], records, lambda r, j=joint: r.torque[:, 0, j], title + ", each", "torque (N m)")
+            if measured is None or source is None:
+                continue
+            right = measured.right.leg_torque[:, k] / 2 if row == 0 else measured.right.wheel_torque[:, joint - 4]
+            as_printed = measured.leg_torque_printed[:, k] / 2 if row == 0 else measured.wheel_torque_printed[:, joint - 4]
+            for values, colour, label in (
+                (right, WINE, "corrected (19)-(24) from the motion: behind the gears"),
+                (as_printed, GREEN, "printed (19)-(24)"),
+            ):
+                axes[row, k].plot(source.time, values, color=colour, linewidth=0.8, label=label)
+    return _over_time(figure, axes)
+
+
+def body_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
+    """Figures 10 and 16: position, velocity and rotation of the body."""
+    figure, axes = _panels(_heading(ideal.test, 3, "position, velocity and rotation of the body"), 3, 3, 2.1)
+    ground = {0: ideal.x, 2: ideal.posture.height * 100}
+    for k, (axis, unit, factor) in enumerate((("x", "m", 1.0), ("y", "mm", 1e3), ("z", "cm", 100.0))):
+        if k in ground:
+            _draw_ideal(axes[0, k], ideal, ground[k])
+        _draw(axes[0, k], records, lambda r, j=k, f=factor: f * r.position[:, 0, j], "", f"position {axis} ({unit})")
+    for k, column in enumerate((0, 1, 3)):
+        _draw_ideal(axes[1, k], ideal, 1e3 * ideal.u[:, column])
+        _draw(axes[1, k], records, lambda r, j=k: 1e3 * r.velocity[:, 0, j], "", f"velocity {'xyz'[k]} (mm/s)")
+    for k, name in enumerate(("yaw", "pitch", "roll")):
+        if k == 1:
+            _draw_ideal(axes[2, k], ideal, np.degrees(ideal.posture.pitch))
+        _draw(axes[2, k], records, lambda r, j=k: np.degrees(r.attitude[:, 0, j]), "", f"{name} (degrees)")
+    for panel in (axes[0, 1], axes[2, 0], axes[2, 2], axes[1, 1]):
+        low, high = panel.get_ylim()
+        if high - low < 1.0:
+            panel.set_ylim(-0.5, 0.5)  # numerical noise is not to be blown up
+    return _over_time(figure, axes)
+
+
+def path_figure(records: Sequence[Record], variants: Mapping[str, Array], test: PaperTest) -> Figure:
+    """Figures 11 and 17: path on the plane; lateral scale blown up.
+
+    Args:
+        records: nominal robots on every model.
+        variants: label -> (T, 2) paths of robots that are not symmetric.
+        test: which.
+    """
+    figure, axes = _panels(_heading(test, 4, "path on the plane"), 1, 1, 3.4)
+    figure.set_size_inches(8.5, 4.2)
+    panel = axes[0, 0]
+    for record in records:
+        panel.plot(record.position[:, 0, 0], 100 * record.position[:, 0, 1], **_style(record.model))
+    for (label, path), colour in zip(variants.items(), _UNEVEN, strict=True):
+        panel.plot(path[:, 0], 100 * path[:, 1], linewidth=1.4, color=colour, label=f"Gibbs-Appell, {label}")
+    for sign in (1, -1):
+        panel.axhline(100 * sign * test.lateral, color=GREY, linestyle=":", linewidth=1.0, label="paper's lateral displacement")
+    panel.set(xlabel="x (m)", ylabel="y (cm)")
+    legend_below(figure, columns=3)
+    return figure
+
+
+def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
+    """Slip velocity and accumulated slip of the left wheels, and normal forces beside (16) and (17)."""
+    figure, axes = _panels(f"{ideal.test.title}: slip of the wheels, and load on them", 3, 2, 2.1)
+    s = ideal.state()
+    c = ideal.constants
+    static = printed.eq16_normal_force_in_front(c, s), printed.eq17_normal_force_behind(c, s)
+    for k, (wheel, title) in enumerate(((0, "left front"), (2, "left rear"))):
+        _draw(axes[0, k], records, lambda r, j=wheel: 1e3 * r.slip[:, 0, j, 0], f"{title} wheel", "longitudinal slip (mm/s)")
+        _draw(axes[1, k], records, lambda r, j=wheel: 1e3 * r.slip_path[:, 0, j, 0], "", "accumulated slip (mm)")
+        axes[2, k].plot(ideal.time, static[k], label="(16), (17) as printed", zorder=1, **_IDEAL)
+        _draw(axes[2, k], records, lambda r, j=wheel: r.force[:, 0, j, 2], "", "normal force (N)")
+    return _over_time(figure, axes)
+
+
+def question_figure(findings: Sequence[SearchFinding]) -> Figure:
+    """How near departures from the nominal robot come to the paper's four numbers: one at a time, and the best combinations."""
+    nearest = sorted(findings, key=lambda finding: min(map(finding.closest, READINGS)))
+    alone = [finding for finding in nearest if len(finding.names) == 1]
+    together = [finding for finding in nearest if len(finding.names) > 1][:_COMBINATIONS]
+    groups = [
+        ("one departure, and what it is", alone, [_departure(finding.label) for finding in alone]),
+        ("several at once: the closest", together, [finding.label for finding in together]),
+    ]
+    groups = [group for group in groups if group[1]]
+    heights = [0.9 + 0.21 * len(shown) for _, shown, _ in groups]
+    figure = new_figure(8.5, sum(heights) + 1.0)
+    figure.suptitle("How near do departures from the nominal robot come to the paper's four numbers?", fontsize=11)
+    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for panel, (title, shown, labels) in zip(panels, groups, strict=True):
+        _draw_misses(panel, shown, labels)
+        panel.set_title(title, fontsize=9, loc="left")
+        tidy(panel)
+    panels[-1].set_xlabel("largest of four errors, closest robot (1 = tolerance)", fontsize=9)
+    legend_below(figure)
+    return figure
+
+
+def _departure(name: str) -> str:
+    """``zeros: zeros of the leg encoders``."""
+    return next((f"{name}: {one.doc}" for one in CANDIDATES if one.name == name), name)
+
+
+def _draw_misses(panel: Axes, shown: Sequence[SearchFinding], labels: Sequence[str]) -> None:
+    """Draw by how much each departure misses the paper's numbers, in tolerances, a row each."""
+    panel.axvspan(0.0, 1.0, color=GREEN, alpha=0.2, linewidth=0.0, label="match: all four within tolerance")
+    for on_leg, style in _PREDICTIONS.items():
+        readings = [reading for reading in READINGS if reading.encoder_on_leg is on_leg]
+        misses = [min(map(finding.closest, readings)) for finding in shown]
+        panel.plot(misses, range(len(shown)), linestyle="", markeredgewidth=1.5, **style)
+    panel.set_yticks(range(len(shown)), labels)
+    panel.set_ylim(len(shown) - 0.4, -0.6)
+    panel.set_xlim(left=0.0)
+    panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+
+
+def figures_of_test(
+    records: Sequence[Record], ideal: IdealMotion, measured: FromMeasurement | None, paths: Mapping[str, Array]
+) -> dict[str, Figure]:
+    """Return all figures of one test by file name."""
+    numbers = ideal.test.figures
+    ordered = sorted(records, key=lambda record: MODELS.index(record.model))
+    drawn = (
+        rotation_figure(ordered, ideal),
+        speed_figure(ordered, ideal),
+        torque_figure(ordered, ideal, measured),
+        body_figure(ordered, ideal),
+        path_figure(ordered, paths, ideal.test),
+    )
+    named = {f"figure_{number:02d}.png": figure for number, figure in zip(numbers, drawn, strict=True)}
+    return named | {f"{ideal.test.name}_slip.png": slip_figure(ordered, ideal)}
+
+
+# ---- report and numbers ----------------------------------------------------------------------------------------------
+
 
 Records = Mapping[str, Mapping[str, Record]]
 #: label of a finding -> observable -> lowest and highest of its matches.
@@ -83,8 +346,6 @@ def what_would_decide(robot: Robot, findings: Sequence[SearchFinding], threads: 
 
 def write_figures(folder: Path, records: Records, evidence: PaperEvidence, findings: Sequence[SearchFinding]) -> None:
     """Write all figures as PNG."""
-    from studies.paper import figures
-
     source = next((records[model] for model in SIMULATORS if model in records), evidence.plant)
     for name in TESTS:
         measured = inverse_from_record(evidence.robot, source[name])
@@ -93,10 +354,10 @@ def write_figures(folder: Path, records: Records, evidence: PaperEvidence, findi
             label: variants.position[:, variant_row(label), :2] for label in ("more drag left", "left front wheel 2 % small")
         }
         own = [record[name] for record in records.values()]
-        for file, figure in figures.figures_of_test(own, evidence.ideal[name], measured, paths).items():
+        for file, figure in figures_of_test(own, evidence.ideal[name], measured, paths).items():
             save(figure, folder / file)
     if findings:
-        save(figures.question_figure(findings), folder / "open_question.png")
+        save(question_figure(findings), folder / "open_question.png")
 
 
 def write_report(

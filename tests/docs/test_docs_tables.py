@@ -8,6 +8,8 @@ from collections import Counter
 import pytest
 from blocks import PAGES, ROOT, site_script
 
+from studies.bench.blind.cases import case
+from studies.bench.gap import make_data, read_answers
 from wlr_gym.cli import main
 from wlr_gym.envs.registry import ENVIRONMENTS
 
@@ -44,6 +46,17 @@ def test_the_site_has_whole_rows(name):
         inner = [len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines() if line.startswith("|")]
         assert len(set(inner)) <= 1
     assert tables.TABLES[name]()[0] in pages.on_page_markdown(f"<!-- table: {name} -->\n[Its name](tables/{name}.md)")
+
+
+@pytest.mark.slow
+def test_the_seeds_of_the_answers_give_the_data_they_are_about(tmp_path):
+    """Four sets, spread over all; from the first of the version that was scored."""
+    answers = read_answers(tables.ANSWERS)
+    names = sorted(answers)
+    first = int(names[0].removeprefix("set_"))
+    for name in names[:: max(1, len(names) // 4)]:
+        one = case(int(name.removeprefix("set_")) - first, first)
+        assert make_data(tmp_path / name, one) == answers[name]["blind_test"]["data_sha256"], name
 
 
 def test_the_page_names_what_the_acceptance_test_refuses():

@@ -1,4 +1,4 @@
-"""Measure what docs/gap_rig.md says of the real servo: ``python rig_page.py RECORDINGS RESULT.json DATA.json``.
+"""Measure what docs/own_rig.md says of the real servo: ``python rig_page.py RECORDINGS RESULT.json DATA.json``.
 
 RESULT.json is what ``wlr gap RECORDINGS --rig pendulum --out DIR`` wrote; DATA.json is docs/data/xl330_pendulum.json, of which
 .ci/docs/tables.py makes the page's table.

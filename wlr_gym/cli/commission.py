@@ -196,7 +196,7 @@ def _write(target: Path, source: Path, findings: Iterable[StandFinding], earlier
     from wlr_gym.hardware.config import load_hardware
 
     content = with_measurements(load_hardware(source), findings, earlier)  # what the file says, not ports of the command line
-    save_hardware(target, source, content, "measured", "Measured on the robot by wlr commission: docs/commissioning.md.")
+    save_hardware(target, source, content, "measured", "Measured on the robot by wlr commission: docs/robot.md.")
 
 
 # ---- the report ------------------------------------------------------------------------------------------------------

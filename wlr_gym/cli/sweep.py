@@ -24,7 +24,7 @@ from wlr_gym.learning.sweep.running import SweepResult, resume_sweep, start_swee
 @dataclass(frozen=True)
 class SweepOptions(JsonOption):
     what: tyro.conf.Positional[str | None] = None
-    """File of a sweep (YAML; see docs/sweep.md) or environment id (see: wlr envs)."""
+    """File of a sweep (YAML; see docs/learning.md) or environment id (see: wlr envs)."""
     config: str | None = None
     """Settings of the agent: name in configs/agent/ or path of a YAML file; default: the agent's own."""
     agent: str | None = None

@@ -478,7 +478,7 @@ def require_flow(task: Task, has_flow: bool) -> None:
     always = task.config.sensors.flow is None or task.config.sensors.flow >= 1.0
     for column in task.policy:
         if column.device == "flow" and always and not has_flow:
-            raise InputError(f"observation '{column.term}': this robot has no optical-flow sensor; see docs/optical_flow.md")
+            raise InputError(f"observation '{column.term}': this robot has no optical-flow sensor; see docs/camera.md")
 
 
 def _is_known(function: Callable[..., Any]) -> bool:

@@ -170,7 +170,7 @@ MeasuredValues = dict[str, MeasuredValue]
 
 
 class Measured(SettingsModel):
-    """What ``wlr commission`` measured on this robot, by joint or bus; docs/commissioning.md says how. For people and analyses.
+    """What ``wlr commission`` measured on this robot, by joint or bus; docs/robot.md says how. For people and analyses.
 
     Attributes:
         adapter_latency, adapter_jitter: s of a ping beyond its bytes' time on the wire: median; 99th percentile beyond it.

@@ -1,9 +1,9 @@
-"""A robot copy with something hidden in it, runs of it, and a data set of eight: files in the measured-run format."""
+"""A robot copy with something hidden in it, runs of it, and a data set of eight, spoilt where that is the case."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,10 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from studies.bench.blind import commands, sensors
-from studies.bench.blind.copies import Copy, draw, nominal, with_body_of, yielding
-from studies.bench.blind.simulation import BlindProfile, simulate
-from studies.bench.blind.truth import Hidden, hide
-from studies.bench.blind.world import build
+from studies.bench.blind import commands, drive
+from studies.bench.blind.cases import Hidden, hide
+from studies.bench.blind.copies import JOINTS, LEGS, Copy, draw, nominal, with_body_of, yielding
+from studies.bench.blind.drive import BlindProfile, build, simulate
 
 #: Profile registers a set may have; 0 = off. Wheels, rad/s2.
 ACCELERATIONS = (0.0, 7.490150, 11.235225, 14.980301, 22.470451)
@@ -48,11 +47,11 @@ class BlindRobot:
     def drive(self, script: commands.BlindScript, noise: np.random.Generator) -> pd.DataFrame:
         """Return the table of one run."""
         sheet, copy, hidden = dict(self.robot), self.copy, self.hidden
-        times = sensors.ticks(script.duration, float(sheet["sensors"]["control_rate"]), noise)
+        times = drive.ticks(script.duration, float(sheet["sensors"]["control_rate"]), noise)
         setpoints = script.setpoints(times)
         start = setpoints[0, :4] + 0.02 * noise.standard_normal(4)
         records = simulate(build(copy, hidden), copy, hidden, self.profile, times, setpoints, start, times[-1] + 0.01)
-        table = sensors.log(records, times, setpoints, copy, hidden, sheet, noise)
+        table = drive.log(records, times, setpoints, copy, hidden, sheet, noise)
         return table if self.camera else table.drop(columns=[name for name in table if name.startswith("cam_")])
 
     def meta(self, notes: str) -> dict[str, Any]:
@@ -127,3 +126,64 @@ def write(folder: Path, tables: Sequence[pd.DataFrame], meta: Mapping[str, Any])
         table.to_parquet(folder / f"run_{number:02d}.parquet", index=False)
     with open(folder / "meta.yaml", "w", encoding="utf-8") as file:
         yaml.safe_dump(dict(meta), file, sort_keys=False, width=1000)
+
+
+# ---- bad data: what a workflow must refuse or call bad, never explain by an effect -----------------------------------
+
+
+Tables = list[pd.DataFrame]
+
+
+def _wrong_unit(tables: Tables, rng: np.random.Generator) -> Tables:
+    """Leg angles in degrees."""
+    columns = [f"pos_{leg}" for leg in LEGS]
+    return [table.assign(**{name: np.rad2deg(table[name]) for name in columns}) for table in tables]
+
+
+def _mis_ordered(tables: Tables, rng: np.random.Generator) -> Tables:
+    """Rows of every run in another order."""
+    return [table.iloc[rng.permutation(len(table))].reset_index(drop=True) for table in tables]
+
+
+def _nan_ridden(tables: Tables, rng: np.random.Generator) -> Tables:
+    """A third of all encoder readings missing."""
+    columns = [f"pos_{joint}" for joint in JOINTS]
+    return [table.assign(**{name: table[name].where(rng.random(len(table)) > 1 / 3) for name in columns}) for table in tables]
+
+
+def _flipped_sign(tables: Tables, rng: np.random.Generator) -> Tables:
+    """The encoder of one wheel counts backwards, its rate and the rest do not."""
+    return [table.assign(pos_wheel_lr=-table["pos_wheel_lr"]) for table in tables]
+
+
+def _stuck_encoder(tables: Tables, rng: np.random.Generator) -> Tables:
+    """One leg's encoder stays at its first reading; so does its rate."""
+    return [table.assign(pos_leg_rf=table["pos_leg_rf"].iloc[0], vel_leg_rf=0.0) for table in tables]
+
+
+def _too_short(tables: Tables, rng: np.random.Generator) -> Tables:
+    """A fifth of a second of every run."""
+    return [table.iloc[:10] for table in tables]
+
+
+def _too_few(tables: Tables, rng: np.random.Generator) -> Tables:
+    """One run only."""
+    return tables[:1]
+
+
+def _motionless(tables: Tables, rng: np.random.Generator) -> Tables:
+    """Six times the second before anything moves."""
+    still = [table.iloc[: int(np.count_nonzero(table["t"] < 0.95))] for table in tables]
+    return [pd.concat([table.assign(t=table["t"] + lap) for lap in range(6)], ignore_index=True) for table in still]
+
+
+SPOIL: Mapping[str, Callable[[Tables, np.random.Generator], Tables]] = {
+    "wrong_unit": _wrong_unit,
+    "mis_ordered": _mis_ordered,
+    "nan_ridden": _nan_ridden,
+    "flipped_sign": _flipped_sign,
+    "stuck_encoder": _stuck_encoder,
+    "too_short": _too_short,
+    "too_few": _too_few,
+    "motionless": _motionless,
+}

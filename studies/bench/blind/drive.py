@@ -7,17 +7,23 @@ again with new coefficients until they agree. No complementarity, no impulses, h
 """
 
 # pyright: reportAttributeAccessIssue=false
-
+# (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numba
 import numpy as np
+import pandas as pd
 from llvmlite.binding import load_library_permanently
 from numba import types
+from numpy.typing import NDArray
+
+from studies.bench.blind.cases import Hidden
+from studies.bench.blind.copies import CORNERS, JOINTS, LEGS, WHEELS, Copy
 
 #: s.
 STEP = 5e-4
@@ -374,3 +380,360 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
             for i in range(3):
                 felt += turn[i, k] * ((qvel[i] - before[i]) / STEP - gravity[i])
             accel[k] += filter_share * (felt - accel[k])
+
+
+# ---- what the logger would have written ------------------------------------------------------------------------------
+
+
+Array = NDArray[np.float64]
+JITTER = 1e-3  # s, of a tick and of a camera frame's age
+LOST = 1 / 300  # share of ticks
+#: One count of the current register, A.
+CURRENT_COUNT = 2.69e-3
+#: One count of the load register, share of the stall torque.
+LOAD_COUNT = 1e-3
+#: One count of the voltage register, V.
+VOLT_COUNT = 0.1
+
+
+def ticks(duration: float, rate: float, rng: np.random.Generator) -> Array:
+    """Return the host clock at every tick that is not lost, s."""
+    nominal = np.arange(1, int(duration * rate)) / rate
+    kept = nominal[rng.random(len(nominal)) >= LOST]
+    times = kept - 1 / rate + 0.005 + JITTER * np.clip(rng.standard_normal(len(kept)), -4, 4)
+    return np.maximum(times, 1e-4)
+
+
+def log(
+    records: Array, times: Array, setpoints: Array, copy: Copy, hidden: Hidden, robot: dict[str, Any], rng: np.random.Generator
+) -> pd.DataFrame:
+    """Turn the records of a simulated run into the table of a measured one.
+
+    Args:
+        records: as of ``simulation.simulate``.
+        times: (n,) host clock of the rows, s.
+        setpoints: (n, 8) written in these rows.
+    """
+    sensors = robot["sensors"]
+    now = _at(records, times)
+    table: dict[str, Array] = {"t": times}
+    table |= {f"cmd_{joint}": setpoints[:, j] for j, joint in enumerate(JOINTS)}
+    table |= _encoders(now, records[0], copy, hidden, sensors)
+    table |= _efforts(now, copy, robot, rng)
+    table |= _inertial(now, copy, hidden, sensors["imu"], rng)
+    table |= _camera(records, times, copy, hidden, sensors["camera"], rng)
+    volts = now[:, 37] + sensors["volt_noise"] * rng.standard_normal(len(times))
+    table["volt"] = _count(volts, VOLT_COUNT)
+    return pd.DataFrame(table)
+
+
+def _at(records: Array, times: Array) -> Array:
+    """Interpolate the records at times, holding the ends."""
+    place = np.clip(times / SAMPLE, 0, len(records) - 1.000001)
+    low = place.astype(int)
+    share = (place - low)[:, None]
+    return (1 - share) * records[low] + share * records[low + 1]
+
+
+def _count(values: Array, size: float) -> Array:
+    return np.rint(values / size) * size
+
+
+def _encoders(now: Array, first: Array, copy: Copy, hidden: Hidden, sensors: dict[str, Any]) -> dict[str, Array]:
+    count = sensors["encoder"]
+    table = {}
+    for j, joint in enumerate(JOINTS):
+        zero = copy.joint_zero[j] + hidden.zero[j] if j < 4 else -first[7 + j]
+        table[f"pos_{joint}"] = _count(now[:, 7 + j] + zero, count["position"])
+    return table | {f"vel_{joint}": _count(now[:, 15 + j], count["velocity"]) for j, joint in enumerate(JOINTS)}
+
+
+def _efforts(now: Array, copy: Copy, robot: dict[str, Any], rng: np.random.Generator) -> dict[str, Array]:
+    noise, table = robot["sensors"]["effort"], {}
+    for j, joint in enumerate(JOINTS):
+        constant = copy.nominal_torque_constant[j]
+        sigma = noise["leg_noise"] if j < 4 else noise["wheel_noise"]
+        size = CURRENT_COUNT * constant if j < 4 else LOAD_COUNT * robot["servo"]["wheel"]["stall_torque"]
+        effort = now[:, 23 + j] * constant + sigma * rng.standard_normal(len(now))
+        table[f"eff_{joint}"] = _count(effort, size)
+    return table
+
+
+def _inertial(now: Array, copy: Copy, hidden: Hidden, imu: dict[str, float], rng: np.random.Generator) -> dict[str, Array]:
+    turn = _mounting(*hidden.imu)
+    gyro = now[:, 31:34] @ turn + copy.gyro_bias + hidden.gyro_bias
+    accel = now[:, 34:37] @ turn + copy.accel_bias
+    gyro += imu["gyro_noise"] * rng.standard_normal(gyro.shape)
+    accel += imu["accel_noise"] * rng.standard_normal(accel.shape)
+    return {f"gyro_{axis}": gyro[:, k] for k, axis in enumerate("xyz")} | {
+        f"acc_{axis}": accel[:, k] for k, axis in enumerate("xyz")
+    }
+
+
+def _mounting(roll: float, pitch: float, yaw: float) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll): from sensor to body. A row vector times it is its transpose times a column."""
+    (cr, sr), (cp, sp), (cy, sy) = [(np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw)]
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
+def _heading(records: Array) -> Array:
+    w, x, y, z = records[:, 3:7].T
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _nose_down(records: Array) -> Array:
+    w, x, y, z = records[:, 3:7].T
+    return np.arcsin(np.clip(2 * (w * y - x * z), -1, 1))
+
+
+def _camera(
+    records: Array, times: Array, copy: Copy, hidden: Hidden, camera: dict[str, float], rng: np.random.Generator
+) -> dict[str, Array]:
+    """A frame every 1/30 s belongs to the first tick after it; its pose is as old as the set's age, with a little jitter."""
+    frames = np.floor(times * camera["rate"] + rng.random())
+    fresh = np.diff(frames, prepend=-1) > 0
+    age = copy.camera_age + hidden.camera_delay + JITTER * rng.standard_normal(len(times))
+    seen = times - np.maximum(age, 0)
+    unrolled = records[:, :7].copy()
+    pose = np.column_stack([unrolled[:, :3], np.unwrap(_heading(records)), _nose_down(records)])
+    pose = np.stack([np.interp(seen, SAMPLE * np.arange(len(pose)), column) for column in pose.T], axis=1)
+    start = np.array([*records[0, :2], _heading(records[:1])[0]])
+    east, north = (pose[:, :2] - start[:2]).T
+    # zeroed at the start, where the floor frame's x is the robot's heading; the camera sees that frame turned by its mounting
+    angle = start[2] + copy.camera_yaw + hidden.camera_yaw
+    x, y = np.cos(angle) * east + np.sin(angle) * north, -np.sin(angle) * east + np.cos(angle) * north
+    clean = {"cam_x": x * hidden.camera_scale, "cam_y": y * hidden.camera_scale, "cam_yaw": pose[:, 3] - start[2]}
+    clean |= {"cam_z": pose[:, 2], "cam_pitch": pose[:, 4]}
+    table = {}
+    for name, values in clean.items():
+        sigma = camera["yaw_noise"] if name in ("cam_yaw", "cam_pitch") else camera["position_noise"]
+        table[name] = np.where(fresh, values + sigma * rng.standard_normal(len(times)), np.nan)
+    return table
+
+
+# ---- the model; a gear with play gets a rotor on a joint of its own --------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BlindWorld:
+    """A compiled model and where things are in it.
+
+    Attributes:
+        model: MuJoCo model.
+        position, rate: indices (8,) of the joints in qpos and qvel.
+        motor_position, motor_rate: the same of the motors; those of the joint unless its gear has play.
+    """
+
+    model: mujoco.MjModel
+    position: NDArray[np.intp]
+    rate: NDArray[np.intp]
+    motor_position: NDArray[np.intp]
+    motor_rate: NDArray[np.intp]
+
+
+def build(copy: Copy, hidden: Hidden) -> BlindWorld:
+    """Compile the robot copy with what is hidden in it."""
+    model = mujoco.MjModel.from_xml_string(_xml(copy, hidden))
+
+    def addresses(names: list[str]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in names]
+        return model.jnt_qposadr[ids].astype(np.intp), model.jnt_dofadr[ids].astype(np.intp)
+
+    position, rate = addresses(list(JOINTS))
+    motors = [f"{name}_rotor" if hidden.play[k] > 0 else name for k, name in enumerate(JOINTS)]
+    motor_position, motor_rate = addresses(motors)
+    return BlindWorld(model, position, rate, motor_position, motor_rate)
+
+
+def floor_gravity(copy: Copy, hidden: Hidden) -> Array:
+    """Gravity (3,) in the frame of the inclined floor, m/s2."""
+    pitch, roll = copy.slope + hidden.slope
+    down = np.array([-np.sin(pitch), -np.sin(roll), 0.0])
+    down[2] = -np.sqrt(1.0 - down @ down)
+    return copy.gravity * down
+
+
+def _numbers(*values: float) -> str:
+    return " ".join(f"{value:.12g}" for value in values)
+
+
+def _rotor(joint: str, armature: float, play: float) -> tuple[str, str]:
+    """Return the rotor's body and the joint's own armature: play puts the motor's inertia on a joint beside it."""
+    if play == 0:
+        return "", _numbers(armature)
+    body = (
+        f'<body name="{joint}_rotor"><inertial pos="0 0 0" mass="1e-6" diaginertia="1e-9 1e-9 1e-9"/>'
+        f'<joint name="{joint}_rotor" type="hinge" axis="0 1 0" armature="{_numbers(armature)}"/></body>'
+    )
+    return body, "0"
+
+
+def _corner(index: int, copy: Copy, hidden: Hidden) -> str:
+    leg, wheel = LEGS[index], WHEELS[index]
+    x, y = CORNERS[index] * copy.hip
+    leg_rotor, leg_armature = _rotor(leg, copy.armature[index], hidden.play[index])
+    wheel_rotor, wheel_armature = _rotor(wheel, copy.armature[4 + index], hidden.play[4 + index])
+    across, along, own = copy.leg_inertia[index][1], copy.leg_inertia[index][0], copy.leg_inertia[index][2]
+    return f"""
+    <body name="{leg}" pos="{_numbers(x, y, 0)}">
+      <inertial pos="{_numbers(copy.leg_com, 0, 0)}" mass="{_numbers(copy.leg_mass[index])}"
+        diaginertia="{_numbers(own, across, along)}"/>
+      <joint name="{leg}" type="hinge" axis="0 1 0" armature="{leg_armature}"/>
+      <body name="{wheel}" pos="{_numbers(copy.leg_length, 0, 0)}">
+        <inertial pos="0 0 0" mass="{_numbers(copy.wheel_mass)}"
+          diaginertia="{_numbers(copy.transverse_inertia, copy.spin_inertia, copy.transverse_inertia)}"/>
+        <joint name="{wheel}" type="hinge" axis="0 1 0" armature="{wheel_armature}"/>
+      </body>{wheel_rotor}
+    </body>{leg_rotor}"""
+
+
+def _xml(copy: Copy, hidden: Hidden) -> str:
+    corners = "".join(_corner(index, copy, hidden) for index in range(4))
+    mass, *place = hidden.payload
+    payload = ""
+    if mass > 0:
+        inertial = f'<inertial pos="0 0 0" mass="{_numbers(mass)}" diaginertia="1e-9 1e-9 1e-9"/>'
+        payload = f'<body pos="{_numbers(*place)}">{inertial}</body>'
+    return f"""
+<mujoco>
+  <compiler angle="radian" balanceinertia="false"/>
+  <option gravity="{_numbers(*floor_gravity(copy, hidden))}"/>
+  <worldbody>
+    <body name="body" pos="0 0 0.17">
+      <freejoint/>
+      <inertial pos="{_numbers(*(copy.com + hidden.com))}" mass="{_numbers(copy.mass)}"
+        diaginertia="{_numbers(*copy.inertia)}"/>
+      {payload}{corners}
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+# ---- one run of a robot copy -----------------------------------------------------------------------------------------
+
+
+#: Of meeting teeth, N m/rad: legs, wheels.
+TOOTH_STIFFNESS = (3000.0, 600.0)
+#: N m s/rad per rotor inertia.
+TOOTH_DAMPING = 700.0
+
+
+@dataclass(frozen=True)
+class BlindProfile:
+    """Profile registers of a data set, rad/s2, rad/s, rad/s2; 0 = off."""
+
+    wheel_acceleration: float
+    leg_velocity: float
+    leg_acceleration: float
+
+
+def simulate(
+    world: BlindWorld,
+    copy: Copy,
+    hidden: Hidden,
+    profile: BlindProfile,
+    times: Array,
+    setpoints: Array,
+    start: Array,
+    duration: float,
+) -> Array:
+    """Drive the robot through one run.
+
+    Args:
+        world: compiled model.
+        times: (n,) s, when the setpoints are written.
+        setpoints: (n, 8) rad, rad/s, NaN = torque off.
+        start: (4,) leg angles at which the robot is set down, rad, true.
+        duration: s.
+
+    Returns:
+        (samples, WIDTH) records every ``SAMPLE`` seconds from time 0.
+
+    Raises:
+        FloatingPointError: the simulated robot blew up.
+    """
+    model, data = world.model, mujoco.MjData(world.model)
+    data.qpos[world.position[:4]] = start
+    has_rotor = world.motor_position != world.position
+    data.qpos[world.motor_position[has_rotor]] = data.qpos[world.position[has_rotor]]
+    data.qpos[2] = (copy.leg_length * np.sin(start) + copy.radius * hidden.radius_scale).max()
+    records = np.zeros((round(duration / SAMPLE) + 1, WIDTH))
+    addresses = (world.position, world.rate, world.motor_rate, world.motor_position)
+    tables = (_joint_table(copy, hidden), _corner_table(copy, hidden), _general_table(copy, hidden, profile), copy.floor_waves)
+    drive(model._address, data._address, data.qpos, data.qvel, addresses, tables, times, setpoints, records)
+    if not np.isfinite(records).all():
+        raise FloatingPointError("the simulated robot blew up")
+    return records
+
+
+def _joint_table(copy: Copy, hidden: Hidden) -> Array:
+    constant = copy.data_sheet_voltage / copy.no_load_speed
+    resistance = constant * copy.data_sheet_voltage / copy.stall_torque
+    return np.array(
+        [
+            copy.kp,
+            copy.kd,
+            constant,
+            resistance,
+            copy.coulomb + hidden.coulomb,
+            copy.viscous + hidden.viscous,
+            hidden.stick_extra,
+            hidden.stick_speed,
+            hidden.load_ratio,
+            hidden.motor_scale,
+            *hidden.ripple,
+            copy.command_delay + hidden.delay,
+            np.concatenate([copy.joint_zero + hidden.zero, np.zeros(4)]),
+            hidden.play,
+            np.repeat(TOOTH_STIFFNESS, 4),
+            TOOTH_DAMPING * copy.armature,
+        ]
+    )
+
+
+def _corner_table(copy: Copy, hidden: Hidden) -> Array:
+    hips = CORNERS * copy.hip
+    return np.array(
+        [
+            hips[:, 0],
+            hips[:, 1],
+            copy.radius * hidden.radius_scale,
+            np.where(np.isnan(hidden.wheel_mu), copy.mu, hidden.wheel_mu),
+            hidden.creep_speed,
+            hidden.rolling,
+            hidden.out_of_round,
+            *hidden.leg_spring,
+            *hidden.elastic,
+            np.repeat(hidden.cross_ratio, 2),
+        ]
+    )
+
+
+def _general_table(copy: Copy, hidden: Hidden, profile: BlindProfile) -> Array:
+    return np.array(
+        [
+            copy.leg_length,
+            copy.supply,
+            hidden.supply_resistance,
+            profile.wheel_acceleration,
+            profile.leg_velocity,
+            profile.leg_acceleration,
+            *hidden.force,
+            *hidden.tether,
+            hidden.drag,
+            hidden.veer,
+            *hidden.pull,
+            *hidden.patch,
+            hidden.mu_ratio,
+            *hidden.weak_slip,
+            *floor_gravity(copy, hidden),
+            copy.normal_stiffness,
+            copy.floor_creep,
+            copy.gear_creep,
+            copy.flattening,
+            copy.weight / 4 / copy.normal_stiffness,
+        ]
+    )

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta, binom
 
+from studies.bench.blind.cases import NAMED
 from studies.bench.blind.copies import nominal, read_robot
-from studies.bench.blind.truth import NAMED
 from wlr_gym.base.paths import data_directory
 
 #: Verdict, and name, of a law outside the vocabulary.
@@ -69,7 +69,7 @@ def at_least(hits: int, count: int) -> Share:
     return Share(hits, count, float(beta.ppf(0.05, hits, count - hits + 1)) if hits else 0.0)
 
 
-# --- reading a result -------------------------------------------------------------------------------------------------
+# ---- reading a result ------------------------------------------------------------------------------------------------
 
 
 def headline(result: Result) -> str:
@@ -169,7 +169,7 @@ def intervals_hold(truth: Mapping[str, Any], found: Mapping[str, Any]) -> list[b
     return holds
 
 
-# --- scoring ----------------------------------------------------------------------------------------------------------
+# ---- scoring ---------------------------------------------------------------------------------------------------------
 
 
 def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[str, Any]:

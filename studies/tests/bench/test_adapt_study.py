@@ -15,8 +15,8 @@ from wlr_gym.robot import load_robot
 pytest.importorskip("torch")
 pytest.importorskip("dynamixel_sdk")
 
-from studies.bench import adapt_study, adapt_table
-from studies.bench.adapt_cases import cases, chosen_cases
+from studies.bench import adapt
+from studies.bench.adapt import cases, chosen_cases
 
 
 def line(case, contender, errors, **more):
@@ -50,29 +50,29 @@ def test_it_resumes_contender_by_contender_where_the_truth_helps_most_first(tmp_
             raise KeyboardInterrupt
         return line(case.name, contender, [errors.get((case.name, contender), 0.9)])
 
-    monkeypatch.setattr(adapt_study, "_line", worked)
+    monkeypatch.setattr(adapt, "_line", worked)
     first, second = cases()[:2]
     chosen = tuple(one.__class__(**{**vars(one), "name": name}) for one, name in ((first, "a"), (second, "b")))
-    study = adapt_study.AdaptStudy(tmp_path, chosen)
+    study = adapt.AdaptStudy(tmp_path, chosen)
     with pytest.raises(KeyboardInterrupt):
-        adapt_study.run_adapt_study(study, lambda text: None)
-    lines = adapt_study.run_adapt_study(study, lambda text: None)
+        adapt.run_adapt_study(study, lambda text: None)
+    lines = adapt.run_adapt_study(study, lambda text: None)
     assert order[2] == order[3] == ("a", "wide")
     assert [name for name, contender in order[-4:]] == ["b", "b", "a", "a"]
     assert len(lines) == 10
     with pytest.raises(InputError, match="steps: 7500000, requested 7"):
-        adapt_study.run_adapt_study(adapt_study.AdaptStudy(tmp_path, chosen, steps=7), lambda text: None)
+        adapt.run_adapt_study(adapt.AdaptStudy(tmp_path, chosen, steps=7), lambda text: None)
 
 
 def test_regained_is_the_share_of_what_the_truth_wins():
     old = np.array([1.0, 2.0, 3.0])
     lines = [line("a", "none", old), line("a", "truth", 0.5 * old), line("a", "ours", 0.6 * old, kept="new", found=[])]
     lines += [line("b", "none", old), line("b", "truth", 0.95 * old), line("b", "ours", old, kept="old", found=[])]
-    table = adapt_table.by_case(lines)
-    share = adapt_table.regained(table["a"])
+    table = adapt.by_case(lines)
+    share = adapt.regained(table["a"])
     assert (share.mean, share.low, share.high) == pytest.approx((80.0, 80.0, 80.0))
-    assert (adapt_table.helps(table["a"]), adapt_table.helps(table["b"])) == (True, False)
-    said = "\n".join(adapt_table.summary(table))
+    assert (adapt.helps(table["a"]), adapt.helps(table["b"])) == (True, False)
+    said = "\n".join(adapt.summary(table))
     assert "in 1 of 2 cases" in said
     assert "median 80; at least 50 in 1 of 1" in said
     assert "kept the old policy in 1 of 2 cases" in said
@@ -92,14 +92,14 @@ def test_a_broken_line_is_named(tmp_path):
     path = tmp_path / "adapt.jsonl"
     path.write_text(json.dumps(line("a", "none", [1.0])) + "\n{}\n")
     with pytest.raises(InputError, match="line 2: expected case, contender and errors"):
-        adapt_study.read_lines(path)
+        adapt.read_lines(path)
 
 
 @pytest.mark.parametrize("name", ["friction_asymmetry_copy0", "command_delay_copy1"])
 def test_the_truth_is_the_robot_that_is_driven(name, tmp_path):
     (case,), own = chosen_cases((name,)), load_robot()
     hidden = load_patch([dict(one) for one in case.effects])
-    found = uncertainty_of(adapt_study.exact_result(case, own), hidden, "slippery", own, tmp_path)
+    found = uncertainty_of(adapt.exact_result(case, own), hidden, "slippery", own, tmp_path)
     (stated, *_), seeds = found.families, np.arange(3, dtype=np.uint64)
     drawn = load_randomization(dict(stated.randomization), own).parameters(seeds, seeds)
     true = apply_patch(hidden, case.parameters(own)).values

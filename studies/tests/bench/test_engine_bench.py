@@ -3,9 +3,20 @@
 import numpy as np
 import pytest
 
-from studies.bench.engine import KINDS, EngineReport, EngineResult, EngineSetting, make_reference, prepare
-from studies.bench.engine_report import pairs, reference_text, save_picture, settings_table
-from studies.bench.motions import distance, motions
+from studies.bench.engine import (
+    KINDS,
+    EngineReport,
+    EngineResult,
+    EngineSetting,
+    distance,
+    make_reference,
+    motions,
+    pairs,
+    prepare,
+    reference_text,
+    save_picture,
+    settings_table,
+)
 from wlr_gym.robot import load_robot
 
 ROBOT = load_robot()

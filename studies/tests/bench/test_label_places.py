@@ -2,7 +2,7 @@
 
 from itertools import combinations
 
-from studies.bench.label_places import Label, place_labels
+from studies.bench.engine import Label, place_labels
 from wlr_gym.base.plots import new_figure
 
 

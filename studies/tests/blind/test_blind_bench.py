@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from studies.bench import gap, gap_score_table
+from studies.bench import gap
 from studies.bench.__main__ import main
 from studies.bench.blind.cases import FIRST_SCORED_SEED, case
 from studies.bench.blind.score import score
@@ -127,7 +127,7 @@ def test_results_of_other_commits_are_counted(finished, tmp_path):
     other.write_text(other.read_text().replace('"commit": ', '"commit": "abc", "was": '))
     report = _again(plan)
     assert report["commits"] == {"unknown": 1, "abc": 1}
-    assert "Sets analysed by commit: unknown 1, abc 1." in gap_score_table.markdown(report)
+    assert "Sets analysed by commit: unknown 1, abc 1." in gap.markdown(report)
     assert json.loads((tmp_path / "score.json").read_text())["commits"] == report["commits"]
 
 
@@ -246,11 +246,11 @@ def test_a_process_that_dies_has_failed(tmp_path):
 
 def test_report_reads_as_a_table(finished):
     _, report, _ = finished
-    text = gap_score_table.markdown(report)
+    text = gap.markdown(report)
     assert "| false alarms, parameters only | 0/1 = 0% (at most 95%)" in text
     assert "| parameters only | nothing_missing 1 |" in text
     assert "| analyses that crashed | 0/2 = 0% (at most 78%) | 0 | yes |" in text
-    assert len({line.what for line in gap_score_table.lines(report)}) == 27
+    assert len({line.what for line in gap.lines(report)}) == 27
 
 
 def test_same_seed_same_bits_whatever_else_runs(tmp_path):
@@ -295,13 +295,13 @@ def test_a_test_of_any_length_must_have_the_same_truths(tmp_path, first, second)
 
 def test_a_value_without_its_bound_is_not_shown():
     good = {"hits": 0, "count": 3, "share": 0.0, "bound95": 0.63}
-    assert gap_score_table._at_most("alarms", good, 0.05).met == "not shown"
-    assert gap_score_table._at_most("alarms", {**good, "bound95": 0.049}, 0.05).met == "yes"
-    assert gap_score_table._at_most("alarms", {**good, "hits": 1, "share": 0.33}, 0.05).met == "no"
-    assert gap_score_table._at_least("names", {"hits": 9, "count": 10, "share": 0.9, "bound95": 0.6}, 0.85).met == "not shown"
-    assert gap_score_table._none("crashes", good).met == "yes"
-    assert gap_score_table._none("crashes", {**good, "hits": 1}).met == "no"
-    assert gap_score_table._at_most("alarms", good).met == ""
+    assert gap._at_most("alarms", good, 0.05).met == "not shown"
+    assert gap._at_most("alarms", {**good, "bound95": 0.049}, 0.05).met == "yes"
+    assert gap._at_most("alarms", {**good, "hits": 1, "share": 0.33}, 0.05).met == "no"
+    assert gap._at_least("names", {"hits": 9, "count": 10, "share": 0.9, "bound95": 0.6}, 0.85).met == "not shown"
+    assert gap._none("crashes", good).met == "yes"
+    assert gap._none("crashes", {**good, "hits": 1}).met == "no"
+    assert gap._at_most("alarms", good).met == ""
 
 
 @pytest.mark.parametrize(
@@ -310,7 +310,7 @@ def test_a_value_without_its_bound_is_not_shown():
 )
 def test_intervals_may_be_too_wide_as_well(share, low, high, met):
     numbers = {"hits": 1, "count": 1, "share": share, "bound95": low, "bound95_above": high}
-    assert gap_score_table._coverage(numbers).met == met
+    assert gap._coverage(numbers).met == met
 
 
 @pytest.mark.parametrize(
@@ -318,9 +318,9 @@ def test_intervals_may_be_too_wide_as_well(share, low, high, met):
 )
 def test_medians_are_held_to_their_bounds(median, bound, met):
     numbers = {"median": median, "at_least95": bound, "at_most95": None, "count": 7}
-    assert gap_score_table._median("reduction", numbers, least=0.8).met == met
+    assert gap._median("reduction", numbers, least=0.8).met == met
     mirrored = {"median": -median, "at_most95": None if bound is None else -bound, "at_least95": None, "count": 7}
-    assert gap_score_table._median("error", mirrored, most=-0.8).met == met
+    assert gap._median("error", mirrored, most=-0.8).met == met
 
 
 def test_command_asks_for_what_it_needs(tmp_path, capsys):

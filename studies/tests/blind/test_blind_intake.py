@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from studies.bench.blind.copies import read_robot
-from studies.bench.blind.dataset import simulate_runs, write
-from studies.bench.blind.spoil import SPOIL
+from studies.bench.blind.dataset import SPOIL, simulate_runs, write
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.gap import workflow

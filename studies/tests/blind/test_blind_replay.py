@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from studies.bench.blind.cases import named
+from studies.bench.blind.cases import NAMED, named
 from studies.bench.blind.copies import Copy, read_robot
 from studies.bench.blind.dataset import simulate_runs, write
-from studies.bench.blind.truth import NAMED
 from wlr_gym.base.paths import data_directory
 from wlr_gym.data import read_run
 from wlr_gym.data.replay import replay

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from studies.bench.blind import score as scoring
-from studies.bench.blind.cases import SEVERITIES, case, named, strange
+from studies.bench.blind.cases import NAMED, SEVERITIES, STRANGE, case, hide, named, strange
 from studies.bench.blind.copies import nominal, read_robot
-from studies.bench.blind.truth import NAMED, STRANGE, hide
 from wlr_gym.base.paths import data_directory
 
 

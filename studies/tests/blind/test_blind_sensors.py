@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.blind import sensors
+from studies.bench.blind import drive
+from studies.bench.blind.cases import hide
 from studies.bench.blind.copies import JOINTS, nominal, read_robot
 from studies.bench.blind.drive import WIDTH
-from studies.bench.blind.truth import hide
 from wlr_gym.base.paths import data_directory
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
@@ -28,9 +28,9 @@ def moving(seconds: float = 20.0, yaw_rate: float = 0.2) -> np.ndarray:
 
 def log(records, effects=(), seed=0, **copy_numbers) -> pd.DataFrame:
     copy, rng = nominal(ROBOT).moved(**copy_numbers), np.random.default_rng(seed)
-    times = sensors.ticks((len(records) - 1) / 1000 - 0.1, 50.0, rng)
+    times = drive.ticks((len(records) - 1) / 1000 - 0.1, 50.0, rng)
     setpoints = np.zeros((len(times), 8))
-    return sensors.log(records, times, setpoints, copy, hide(effects, copy), ROBOT, rng)
+    return drive.log(records, times, setpoints, copy, hide(effects, copy), ROBOT, rng)
 
 
 def effect(name, **parameters):
@@ -38,7 +38,7 @@ def effect(name, **parameters):
 
 
 def test_clock_jitters_by_a_millisecond_and_loses_one_tick_in_three_hundred():
-    times = sensors.ticks(2000.0, 50.0, np.random.default_rng(1))
+    times = drive.ticks(2000.0, 50.0, np.random.default_rng(1))
     steps = np.diff(times)
     assert (steps > 0).all()
     assert np.std(steps[steps < 0.03]) == pytest.approx(np.sqrt(2) * 1e-3, rel=0.03)

@@ -8,15 +8,14 @@ import pytest
 from scipy.linalg import expm
 
 import studies.bench.blind as blind
-from studies.bench.blind import cases, drive, simulation
+from studies.bench.blind import cases, drive
+from studies.bench.blind.cases import NAMED, STRANGE, hide
 from studies.bench.blind.copies import Copy, draw, nominal, read_robot
-from studies.bench.blind.truth import NAMED, STRANGE, hide
-from studies.bench.blind.world import build
 from wlr_gym.base.paths import data_directory
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
 DOWN = np.full(4, np.pi / 2)
-SHARP = simulation.BlindProfile(0.0, 0.0, 0.0)
+SHARP = drive.BlindProfile(0.0, 0.0, 0.0)
 MASS = 3.0
 GRAVITY = 9.81
 WHEELS = ["wheel_lf", "wheel_rf", "wheel_lr", "wheel_rr"]
@@ -34,8 +33,8 @@ def simulate(setpoints, duration, effects=(), copy: Copy | None = None, start=DO
     if setpoints.ndim == 1:
         setpoints = np.tile(np.concatenate([start, setpoints]), (len(times), 1))
     hidden = hide(effects, copy)
-    return simulation.simulate(
-        build(copy, hidden), copy, hidden, profile, times, setpoints, np.asarray(start, dtype=float), duration
+    return drive.simulate(
+        drive.build(copy, hidden), copy, hidden, profile, times, setpoints, np.asarray(start, dtype=float), duration
     )
 
 

@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from studies.bench import gap, gap_score_table
+from studies.bench import gap
 from studies.bench.blind.cases import case
 from studies.bench.blind.score import intervals_hold, size_error
 
@@ -19,11 +19,11 @@ SHORT = (0, 2, 3)  # straight driving, skid turns, S-curves
 def test_workflow_against_sealed_truths(tmp_path):
     """From 200 sets on, every target; before that, that nothing breaks and no good data are refused."""
     report = gap.run_blind_test(gap.Plan(tmp_path, sets=SETS or 1, runs=() if SETS else SHORT, processes=2))
-    print(gap_score_table.markdown(report))
+    print(gap.markdown(report))
     assert not report["failed"]
     assert report["false_alarms"]["refused_good_data"]["hits"] == 0
     if SETS >= 200:
-        assert not [line for line in gap_score_table.lines(report) if line.met == "no"]
+        assert not [line for line in gap.lines(report) if line.met == "no"]
 
 
 def analysed(folder, one):

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies.bench import decide_study
-from studies.bench.blind.truth import NAMED
-from studies.bench.decide_study import CASES, EIGHT, START, cases, decided_by, run_decide_study
-from studies.bench.decide_table import markdown
+from studies.bench import decide
+from studies.bench.blind.cases import NAMED
+from studies.bench.decide import CASES, EIGHT, START, cases, decided_by, markdown, run_decide_study
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended
 from wlr_gym.data.excitations import excite
@@ -45,8 +44,8 @@ def answers(monkeypatch):
         (folder / "result.json").write_text(given.pop(0).model_dump_json())
 
     monkeypatch.setattr(decision, "analyse", analyse)
-    script = decide_study._script
-    monkeypatch.setattr(decide_study, "_script", lambda motion: replace(script(motion), duration=1.0))
+    script = decide._script
+    monkeypatch.setattr(decide, "_script", lambda motion: replace(script(motion), duration=1.0))
     return given
 
 
@@ -61,7 +60,7 @@ def test_every_effect_comes_once_and_some_robots_have_none():
 
 def test_a_robot_drives_the_motion_that_was_chosen(tmp_path):
     motion = excite("turns").cut(3.0)
-    table = decide_study._robot(cases(1)[0]).drive(decide_study._script(motion), np.random.default_rng(1))
+    table = decide._robot(cases(1)[0]).drive(decide._script(motion), np.random.default_rng(1))
     now = motion.setpoints[(table["t"].to_numpy() / motion.period).astype(int)]
     assert np.array_equal(table.filter(like="cmd_").to_numpy(), now, equal_nan=True)
     assert np.abs(table["vel_wheel_lf"]).max() > 1.0  # it moves
@@ -89,7 +88,7 @@ def test_random_drives_until_it_is_decided(tmp_path, answers):
 
 def test_driving_counts_the_motions_that_were_driven(tmp_path, answers, monkeypatch):
     again = excite("straight", 1)
-    monkeypatch.setattr(decide_study, "motions_to_drive", lambda *_: [again])
+    monkeypatch.setattr(decide, "motions_to_drive", lambda *_: [again])
     one = cases(1)[0]
     answers[:] = [result("payload", 0.5), result("payload")]
     line = decided_by("random", one, tmp_path)
@@ -105,9 +104,9 @@ def test_an_interrupted_contender_begins_anew(tmp_path, answers):
     task = {"out": str(tmp_path), "index": 0, "contender": "random"}
     answers[:] = [result("payload", 0.5)]
     with pytest.raises(IndexError):  # no second answer
-        decide_study._work(task, lambda message: None)
+        decide._work(task, lambda message: None)
     answers[:] = [result("payload")]
-    decide_study._work(task, lambda message: None)
+    decide._work(task, lambda message: None)
     line = json.loads((tmp_path / "lines" / "case_9200_random.json").read_text())
     assert len(line["runs"]) == 3 == len(list((tmp_path / "work" / "case_9200_random" / "runs").glob("run_*.parquet")))
 
@@ -132,12 +131,12 @@ def jobs(monkeypatch, tmp_path):
                 yield Ended(job.name, "killed")
                 continue
             one = cases(job.task["index"] + 1)[-1]
-            line = decide_study._line(one, job.task["contender"]) | {"ended": "decided", "verdict": "effect_found"}
+            line = decide._line(one, job.task["contender"]) | {"ended": "decided", "verdict": "effect_found"}
             line |= {"found": one.hidden, "right": True, "seconds": 50.0}
             (tmp_path / "lines" / f"{job.name}.json").write_text(json.dumps(line))
             yield Ended(job.name)
 
-    monkeypatch.setattr(decide_study, "spread", spread)
+    monkeypatch.setattr(decide, "spread", spread)
     return told
 
 
@@ -168,7 +167,7 @@ def test_a_contender_that_fails_is_counted_and_tried_again(tmp_path, jobs):
 
 def test_a_study_of_other_robots_or_nothing_is_refused(tmp_path, jobs, monkeypatch):
     run_decide_study(tmp_path, 1, ("chosen",), say=quiet)
-    monkeypatch.setattr(decide_study, "SEVERITY", 1.0)
+    monkeypatch.setattr(decide, "SEVERITY", 1.0)
     with pytest.raises(InputError, match=r"study.json: severity: 2.0, requested 1.0"):
         run_decide_study(tmp_path, 1, ("chosen",), say=quiet)
     with pytest.raises(InputError, match="--processes 0: expected 1 or more"):

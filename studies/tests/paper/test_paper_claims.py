@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.paper.claims import CLAIMS, FAILS, HOLDS, OPEN, PARTLY, check_all, claims_table
-from studies.paper.evidence import VARIANTS, gather
+from studies.paper.claims import CLAIMS, FAILS, HOLDS, OPEN, PARTLY, VARIANTS, check_all, claims_table, gather
 from studies.paper.experiments import drive_both, select
 from studies.paper.verdicts import CONDITIONAL, CORRECT, EQUATIONS, INCOMPLETE, MISPRINT, WRONG
 from wlr_gym.robot import load_robot

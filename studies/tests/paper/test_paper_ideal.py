@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 
 from studies.paper import printed
-from studies.paper.experiments import LEG_SPEED, TESTS, WHEEL_ACCELERATION, WHEEL_SPEED, duration, paper_test, stop_time
-from studies.paper.ideal import ideal_motion
+from studies.paper.experiments import (
+    LEG_SPEED,
+    TESTS,
+    WHEEL_ACCELERATION,
+    WHEEL_SPEED,
+    duration,
+    ideal_motion,
+    paper_test,
+    stop_time,
+)
 from studies.paper.quantities import PaperConstants
 
 ONE, TWO = (ideal_motion(test) for test in TESTS.values())

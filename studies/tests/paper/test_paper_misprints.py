@@ -12,7 +12,7 @@ sp = pytest.importorskip("sympy")
 
 from paper_symbols import constants, same, state  # noqa: E402
 
-from studies.paper import printed, repaired  # noqa: E402
+from studies.paper import printed, verdicts  # noqa: E402
 from studies.paper.quantities import WHEELS, PaperConstants, State, ahead, to_the_right, wheelbase  # noqa: E402
 
 C, S = constants(), state()
@@ -65,8 +65,8 @@ def test_the_papers_leg_acceleration_is_the_derivative_of_the_components_of_3_to
 # ---- legs (19), (20) -------------------------------------------------------------------------------------------------
 
 LEGS = [
-    ("rf", "lf", "alpha_dd", printed.eq19_torque_of_the_front_legs, repaired.eq19_torque_of_the_front_legs),
-    ("rr", "lr", "beta_dd", printed.eq20_torque_of_the_rear_legs, repaired.eq20_torque_of_the_rear_legs),
+    ("rf", "lf", "alpha_dd", printed.eq19_torque_of_the_front_legs, verdicts.eq19_torque_of_the_front_legs),
+    ("rr", "lr", "beta_dd", printed.eq20_torque_of_the_rear_legs, verdicts.eq20_torque_of_the_rear_legs),
 ]
 
 
@@ -117,10 +117,10 @@ def test_wheel_torques_follow_from_the_papers_gibbs_function(wheel):
 # ---- forces (25)-(30) ------------------------------------------------------------------------------------------------
 
 FORCES = {
-    "rf": (printed.eq25_force_on_the_right_front_wheel, repaired.eq25_force_on_the_right_front_wheel),
-    "lf": (printed.eq26_force_on_the_left_front_wheel, repaired.eq26_force_on_the_left_front_wheel),
-    "rr": (printed.eq27_force_on_the_right_rear_wheel, repaired.eq27_force_on_the_right_rear_wheel),
-    "lr": (printed.eq28_force_on_the_left_rear_wheel, repaired.eq28_force_on_the_left_rear_wheel),
+    "rf": (printed.eq25_force_on_the_right_front_wheel, verdicts.eq25_force_on_the_right_front_wheel),
+    "lf": (printed.eq26_force_on_the_left_front_wheel, verdicts.eq26_force_on_the_left_front_wheel),
+    "rr": (printed.eq27_force_on_the_right_rear_wheel, verdicts.eq27_force_on_the_right_rear_wheel),
+    "lr": (printed.eq28_force_on_the_left_rear_wheel, verdicts.eq28_force_on_the_left_rear_wheel),
 }
 
 
@@ -132,7 +132,7 @@ def sliding(way):
 
 def dissipation(s):
     """The paper's D with F_n of (16) and (17)."""
-    return repaired.eq15_dissipation(C, s, printed.eq16_normal_force_in_front(C, s), printed.eq17_normal_force_behind(C, s))
+    return verdicts.eq15_dissipation(C, s, printed.eq16_normal_force_in_front(C, s), printed.eq17_normal_force_behind(C, s))
 
 
 @pytest.mark.parametrize("way", [1, -1])
@@ -168,8 +168,8 @@ def test_the_misprinted_denominator_adds_metres_to_a_number_and_even_passes_zero
 
 def test_lateral_forces_lost_their_inertia_and_denominator():
     for side, wheels, as_printed, right in (
-        ("y_f_d", ("rf", "lf"), printed.eq29_lateral_force_in_front, repaired.eq29_lateral_force_in_front),
-        ("y_r_d", ("rr", "lr"), printed.eq30_lateral_force_behind, repaired.eq30_lateral_force_behind),
+        ("y_f_d", ("rf", "lf"), printed.eq29_lateral_force_in_front, verdicts.eq29_lateral_force_in_front),
+        ("y_r_d", ("rr", "lr"), printed.eq30_lateral_force_behind, verdicts.eq30_lateral_force_behind),
     ):
         speed, jerk = sp.Symbol("speed", positive=True), sp.Symbol("axle_dd", real=True)
         shared = {w: jerk if w in wheels else S.y_s_dd[w] for w in WHEELS}
@@ -188,7 +188,7 @@ def test_9_prints_a_velocity_where_10_has_an_acceleration():
     parts = printed.eq7_gibbs_function_of_the_wheels(C, S) + printed.eq8_gibbs_function_of_the_legs(
         C, S, {wheel: printed.leg_acceleration(C, S, wheel) for wheel in WHEELS}
     )
-    assert same(own_gibbs(), parts + repaired.eq9_gibbs_function_of_the_body(C, S))
+    assert same(own_gibbs(), parts + verdicts.eq9_gibbs_function_of_the_body(C, S))
     assert not same(own_gibbs(), parts + printed.eq9_gibbs_function_of_the_body(C, S))
 
 
@@ -196,15 +196,15 @@ def test_12_lost_the_pitch_in_the_legs_term():
     """Potential by hand: body at half the sum of the legs' heights, each leg's mass in the middle of its leg."""
     front, rear = C.l * sp.sin(S.alpha + S.psi), C.l * sp.sin(S.beta + S.psi)
     by_hand = C.M_G * C.g * (front + rear) / 2 + 2 * C.m_l * C.g * (front / 2 + rear / 2)
-    assert same(repaired.eq12_potential(C, S), by_hand)
+    assert same(verdicts.eq12_potential(C, S), by_hand)
     assert not same(printed.eq12_potential(C, S), by_hand)
 
 
 def test_15_needs_its_bracket_closed_before_the_lateral_part():
     s = sliding(1)
     as_printed = printed.eq15_dissipation(C, s, 1, 1)
-    assert same(repaired.eq15_dissipation(C, s, 1, 1).subs(C.mu_dx, 0), as_printed.subs(C.mu_dx, 1) - sum(s.x_s_d.values()))
-    assert not same(as_printed, repaired.eq15_dissipation(C, s, 1, 1))
+    assert same(verdicts.eq15_dissipation(C, s, 1, 1).subs(C.mu_dx, 0), as_printed.subs(C.mu_dx, 1) - sum(s.x_s_d.values()))
+    assert not same(as_printed, verdicts.eq15_dissipation(C, s, 1, 1))
 
 
 def printed_text() -> dict[int, str]:

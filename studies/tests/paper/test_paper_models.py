@@ -14,12 +14,12 @@ from studies.paper.experiments import (
     drive_both,
     drive_plant,
     error_of_ignoring_slip,
+    ideal_motion,
+    inverse_from_record,
     no_slip_travel,
     paper_test,
     select,
 )
-from studies.paper.ideal import ideal_motion
-from studies.paper.measured import inverse_from_record
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions

@@ -10,7 +10,7 @@ sp = pytest.importorskip("sympy")
 
 from paper_symbols import constants, same, state  # noqa: E402
 
-from studies.paper import corrected, printed, reduced, repaired  # noqa: E402
+from studies.paper import corrected, printed, reduced, verdicts  # noqa: E402
 from studies.paper.quantities import WHEELS, Forces, PaperConstants, State, lever, wheelbase  # noqa: E402
 from wlr_gym.physics.model import derivation  # noqa: E402
 
@@ -236,10 +236,10 @@ def test_14_must_not_take_the_velocity_of_the_wheel():
 def test_15_is_a_box_the_ellipse_fits_in():
     c = PaperConstants(mu_dx=0.5, mu_dy=0.5)
     s = State(x_s_d=dict.fromkeys(WHEELS, 0.01), y_f_d=0.01, y_r_d=0.01)
-    box, ellipse = repaired.eq15_dissipation(c, s, 5.0, 5.0), corrected.eq15_dissipation(c, s, 5.0, 5.0)
+    box, ellipse = verdicts.eq15_dissipation(c, s, 5.0, 5.0), corrected.eq15_dissipation(c, s, 5.0, 5.0)
     assert box == pytest.approx(math.sqrt(2) * ellipse)
     straight = replace(s, y_f_d=0.0, y_r_d=0.0)
-    assert repaired.eq15_dissipation(c, straight, 5.0, 5.0) == pytest.approx(corrected.eq15_dissipation(c, straight, 5.0, 5.0))
+    assert verdicts.eq15_dissipation(c, straight, 5.0, 5.0) == pytest.approx(corrected.eq15_dissipation(c, straight, 5.0, 5.0))
 
 
 def test_18_takes_friction_off_on_the_left():

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from studies.paper import report, slip_outcomes, slip_search
-from studies.paper.slip_candidates import CANDIDATES, READINGS, make_parameters
-from studies.paper.slip_outcomes import Outcomes, outcomes
-from studies.paper.slip_search import search
+from studies.paper import report, slip_search
+from studies.paper.slip_search import CANDIDATES, READINGS, Outcomes, make_parameters, outcomes, search
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import load_robot
 
@@ -18,8 +16,8 @@ CHOSEN = [BY_NAME["radius"], BY_NAME["camera"]]
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """The reference precision only, no second kernel to compile; a short search."""
-    monkeypatch.setattr(slip_outcomes, "_FAST", (0.002, "float64"))
-    monkeypatch.setattr(slip_outcomes, "_EXACT", (0.002, "float64"))
+    monkeypatch.setattr(slip_search, "_FAST", (0.002, "float64"))
+    monkeypatch.setattr(slip_search, "_EXACT", (0.002, "float64"))
     monkeypatch.setattr(slip_search, "ROUNDS", 1)
 
 

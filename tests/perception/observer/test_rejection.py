@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from observed_runs import PERIOD, Runs, changed, estimated, observe, simulate, without_flow
 
+from studies.observer.runs import PERIOD, Runs, changed, estimated, observe, simulate, without_flow
 from wlr_gym.perception.observer import SlipObserver, trust
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import load_robot
@@ -128,23 +128,23 @@ def test_the_compiled_network_is_the_one_that_was_trained():
 
 @pytest.mark.slow
 def test_the_filter_that_was_trained_is_the_compiled_one():
-    """``train_trust.py`` writes the filter again in torch."""
+    """studies/observer/training.py writes the filter again in torch."""
     torch = pytest.importorskip("torch")
-    import train_trust
+    from studies.observer import training
 
     runs = simulate("gibbs_appell", "slippery", "commands", 4, 2.0, seed=4)
-    d = {name: torch.from_numpy(values) for name, values in train_trust._prepared(runs).items()}
-    net = train_trust.Trust()
+    d = {name: torch.from_numpy(values) for name, values in training._prepared(runs).items()}
+    net = training.Trust()
     net.start_from(trust.load_trust())
     for name, values in net.arrays().items():
         np.testing.assert_allclose(values, trust.load_trust()[name], rtol=1e-5)
     never = {f"{name}_{end}": torch.full((4,), 1000) for name in ("camera", "flow") for end in ("on", "off")}
     zero = torch.zeros(101, 4, 2)
     sensors = never | {"camera_noise": zero, "flow_noise": zero, "flow_scale": torch.zeros(4)}
-    state, errors, sigmas = train_trust.begin(d, net), [], []
+    state, errors, sigmas = training.begin(d, net), [], []
     with torch.no_grad():
         for i in range(1, 101):
-            state, error, variance = train_trust.advance(d, i, state, net, sensors)
+            state, error, variance = training.advance(d, i, state, net, sensors)
             errors.append(error.numpy())
             sigmas.append(np.sqrt(variance.numpy()))
     found = observe(runs, camera=False)

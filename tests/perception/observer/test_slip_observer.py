@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-from observed_runs import PERIOD, estimated, observe, plain_odometry, simulate, slip_in_truth_order
 
+from studies.observer.runs import PERIOD, estimated, observe, plain_odometry, simulate, slip_in_truth_order
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver, kalman
 from wlr_gym.physics.plants import make_plant

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from vision_studio import pose_of
 
-from studies.bench.vision import _centre_error
-from studies.bench.vision_clutter import clutter
+from studies.bench.vision import _centre_error, clutter
 from wlr_gym.perception.markers.camera import Camera, distort, undistort
 from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.pose import circle_centres, find_target

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from studies.bench.lab_renderer import Lab, frames, lens, true_places
-from studies.bench.vision_drives import skid_turn, true_slip
+from studies.bench.vision import skid_turn, true_slip
 from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.perception.vision.analysis import analyse
 from wlr_gym.perception.vision.tracking import PoseFinder

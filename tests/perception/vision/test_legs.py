@@ -8,7 +8,7 @@ import pytest
 from test_frame_noise import tilted
 from test_measure import OFFSET, samples_of
 
-from studies.bench.vision_drives import paper_test, pose_at, skid_turn, true_slip
+from studies.bench.vision import paper_test, pose_at, skid_turn, true_slip
 from wlr_gym.data import Run
 from wlr_gym.perception.vision import slip
 from wlr_gym.perception.vision.motion import STANDING, leg_readings

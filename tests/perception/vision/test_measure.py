@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies.bench.vision_drives import paper_test, pose_at, skid_turn, true_slip
+from studies.bench.vision import paper_test, pose_at, skid_turn, true_slip
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Run, read_run
 from wlr_gym.perception.vision.alignment import align

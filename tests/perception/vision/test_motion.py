@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, samples_of
 
-from studies.bench.vision_drives import pose_at, skid_turn, true_slip
+from studies.bench.vision import pose_at, skid_turn, true_slip
 from wlr_gym.data import Run
 from wlr_gym.perception.vision import slip
 from wlr_gym.perception.vision.imu_check import imu_findings, wrong_axes

@@ -377,6 +377,6 @@ def test_bench_reports_every_bar(tmp_path):
 def test_process_ends_well_after_apriltag_3():
     """The package's destructor frees memory and then uses it: a crash at the end of the process, or later."""
     pytest.importorskip("pupil_apriltags")
-    code = "from studies.bench.vision_tags import tag_kinds, tag_poses; print(tag_poses(0.0, 4, tag_kinds()[-1])[1])"
+    code = "from studies.bench.vision import tag_kinds, tag_poses; print(tag_poses(0.0, 4, tag_kinds()[-1])[1])"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (0, "all four in 4 of 4 frames\n")

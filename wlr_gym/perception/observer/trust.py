@@ -5,7 +5,7 @@ estimate, its traction over its load, their signs against each other and against
 other wheel and all wheels remember. All of it stays the same when the robot is mirrored or turned round. It says with which
 precision (1/variance, along heading and left) the wheel's rolling counts as a measurement of the velocity, and by how much a
 wheel that pulls rolls ahead. Trained on simulated runs of the nominal robot with the filter's own likelihood, by
-``tests/perception/observer/train_trust.py``.
+``studies/observer/training.py``.
 """
 
 from __future__ import annotations

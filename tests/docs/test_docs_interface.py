@@ -1,4 +1,4 @@
-"""docs/versions.md: versions of the environments are those of the task files; the public interface is documented and typed."""
+"""The public interface is documented and typed, examples and pages use no more than that; versions are those of the tasks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _public(module: Any) -> dict[str, Any]:
 
 
 def test_the_table_is_that_of_the_task_files():
-    text = (ROOT / "docs" / "versions.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
     block = text.split("<!-- environments: ")[1].split("<!-- end of environments -->")[0]
     rows = []
     for env_id, task in ENVIRONMENTS.items():

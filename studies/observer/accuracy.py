@@ -1,16 +1,12 @@
-"""Measure what docs/slip_observer.md says, and draw its figure: ``python observer_page.py [DATA.json [FIGURE.png]]``.
-
-DATA.json is docs/data/observer.json; .ci/docs/tables.py makes the page's table of it.
-"""
+"""How accurate the observer is, and its figure: ``python -m studies.observer accuracy`` (docs/slip_observer.md)."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
-from observed_runs import PERIOD, Runs, channel, observe, play, simulate, slip_in_truth_order, without_flow
 
+from studies.observer.runs import PERIOD, Runs, channel, observe, play, simulate, slip_in_truth_order, without_flow
 from wlr_gym.base.files import write_json
 from wlr_gym.base.plots import COLOURS, legend_below, new_figure, save, tidy
 from wlr_gym.base.provenance import git_commit
@@ -69,7 +65,7 @@ def row(runs: Runs, backend: str, floor: str, drive: str) -> dict[str, object]:
     return {"backend": backend, "floor": floor, "drive": drive, "robots": runs.truth.shape[1], **found}
 
 
-def draw(path: str) -> None:
+def draw(path: Path) -> None:
     """On split floors, the robot with the largest error without a camera: slip of both front wheels, estimates, 2 sigma."""
     runs = simulate("gibbs_appell", "split", "commands", 64, 10.0, seed=SEED)
     time = PERIOD * np.arange(len(runs.sensors))
@@ -96,10 +92,11 @@ def draw(path: str) -> None:
         tidy(ax)
     axes[0].set_ylabel("longitudinal slip (m/s)")
     legend_below(figure, columns=5)
-    save(figure, Path(path))
+    save(figure, path)
 
 
-def main(data: str = "", figure: str = "") -> None:
+def measure_accuracy(data: Path | None = None, figure: Path | None = None) -> None:
+    """Print a row per floor and drive; write all numbers and the figure where asked."""
     rows = [row(simulate(*case, 10.0, seed=SEED), *case[:3]) for case in CASES]
     robot = load_robot("flow")
     rows += [
@@ -107,11 +104,7 @@ def main(data: str = "", figure: str = "") -> None:
         for floor in ("split", "slippery")
     ]
     rows += [row(play(policy, floor, count, 10.0, seed=SEED), "gibbs_appell", floor, policy) for policy, floor, count in PLAYED]
-    if data:
-        write_json(Path(data), {"commit": git_commit(), "seed": SEED, "rows": rows})
-    if figure:
+    if data is not None:
+        write_json(data, {"commit": git_commit(), "seed": SEED, "rows": rows})
+    if figure is not None:
         draw(figure)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

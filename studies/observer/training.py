@@ -1,26 +1,24 @@
 """Train how far the observer trusts its wheels; writes ``trust.npz``.
 
-``python tests/perception/observer/train_trust.py MINUTES [START.npz]``. The filter of ``wlr_gym.perception.observer``
-is written again in torch, for a batch, and differentiated: the loss is its own negative log-likelihood of the true
-velocity, so that errors and sigmas are learned together. Runs are simulated ones of seeds that docs/slip_observer.md
-does not use, all on the Gibbs-Appell plant; camera and optical flow come and go. What does not depend on the estimate
-(how wheels roll, loads, tractions, forces) is taken from the compiled observer.
+The filter of ``wlr_gym.perception.observer`` is written again in torch, for a batch, and differentiated: the loss is
+its own negative log-likelihood of the true velocity, so that errors and sigmas are learned together. Runs are simulated ones of
+seeds that the accuracy is not measured with, all on the Gibbs-Appell plant; camera and optical flow come and go. What does not
+depend on the estimate (how wheels roll, loads, tractions, forces) is taken from the compiled observer.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from observed_runs import PERIOD, Runs, play, simulate
 from torch import Tensor, nn
 
 import wlr_gym.perception.observer as package
+from studies.observer.runs import PERIOD, Runs, play, simulate
 from wlr_gym.perception.observer import SlipObserver
 from wlr_gym.perception.observer.trust import CLUES, CLUES_ALIKE, MEMORY, OUTPUTS
 from wlr_gym.robot import load_robot
@@ -285,15 +283,12 @@ def train(runs: Batch, net: Trust, minutes: float) -> None:
         print(f"{time.monotonic() - start:6.0f} s  loss {np.mean(losses):.3f}", flush=True)
 
 
-def main() -> None:
+def train_network(minutes: float, start: Path | None = None) -> None:
+    """Train from random weights, or from a file of weights; replaces the package's own file."""
     torch.set_num_threads(1)
     net, runs = Trust(), gather_runs()
-    if len(sys.argv) > 2:
-        net.start_from(np.load(sys.argv[2]))
-    train(runs, net, float(sys.argv[1]))
+    if start is not None:
+        net.start_from(np.load(start))
+    train(runs, net, minutes)
     arrays: dict[str, Any] = net.arrays()
     np.savez(Path(package.__file__).parent / "trust.npz", **arrays)
-
-
-if __name__ == "__main__":
-    main()

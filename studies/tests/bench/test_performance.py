@@ -1,67 +1,20 @@
-"""docs/performance.md has the numbers of docs/data/bench.json, and those come from reports of ``python -m studies.bench``."""
+"""Reports of ``python -m studies.bench`` are taken over into data, README and picture."""
 
 from __future__ import annotations
 
 import json
-import re
-from contextlib import closing
 
-import gymnasium
 import pytest
-from blocks import ROOT
 
 from studies.bench import performance
-from studies.bench.__main__ import MEASUREMENTS
 from studies.bench.measure import Measurement, machine
 
-DATA = json.loads((ROOT / "docs" / "data" / "bench.json").read_text(encoding="utf-8"))
-ROWS = DATA["rows"]
-#: What the page says in words.
-IN_SHORT = {f"{precision}, {what}" for precision in ("float64", "float32") for what in performance.README_RATIOS}
-IN_SHORT |= {"env.step of one robot, float64", "PPO, frames, 512 robots, float32", "times learnt (reward 1.7/s), 256 robots"}
+ROWS = json.loads(performance.DATA.read_text(encoding="utf-8"))["rows"]
 
 
 def report(*rows: Measurement, quick: bool = False) -> dict:
     found = {"machine": machine(), "rounds": 3, "quick": quick, "measurements": [row.as_dict() for row in rows]}
     return json.loads(json.dumps(found))
-
-
-def test_page_and_readme_have_the_numbers():
-    text = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8").partition("**In short**")[2].partition("\n\n")[0]
-    for row in ROWS:
-        if row["what"].partition(":")[0] in IN_SHORT:
-            assert f"{(row['ratio'] or row['ours'])['median']:.3g}" in re.findall(r"\d[\d.]*\d|\d", text), row["what"]
-    readme = performance.README.read_text(encoding="utf-8")
-    assert performance.write_readme(readme, ROWS) == readme
-    assert {row["name"] for row in ROWS} <= set(MEASUREMENTS)
-
-
-def test_the_fairness_of_the_speed_claim_has_the_numbers():
-    page = " ".join((ROOT / "docs" / "performance.md").read_text(encoding="utf-8").split())
-    settings = [one for one in DATA["engine"]["settings"] if one["precision"] == "float64"]
-    speed = {(one["side"], one["label"]): one["speed"]["median"] for one in settings}
-    (best,) = [row for row in ROWS if row["what"].startswith("float64, error at most 0.1 mm")]
-    usual, fast = (speed["engine", label] / best["peer"]["median"] for label in ("2 ms", "1 ms"))
-    assert f"With the usual 4 passes it is {usual:.0f} (2 ms), at `gym.make`'s 1 ms {fast:.0f}." in page
-    (both,) = [row["ratio"]["median"] for row in ROWS if row["what"].startswith("float64, both at 1 ms, 2 threads")]
-    assert f"with two the 35.9 are {both:.1f}" in page
-    (alone,) = [row["ours"]["median"] for row in ROWS if row["what"] == "1 robots, float64, 1 thread"]
-    peer = speed["MuJoCo", "1 ms, pyramidal, default contact, Euler"] * 1000
-    assert f"{alone / 1000:.0f} k substeps of 1 ms per second, {alone / peer:.0f} times MuJoCo at 1 ms" in page
-    worst = max(one["worst"] for one in settings if one["label"].startswith("0.25 ms, elliptic, tuned"))
-    assert f"at most {worst * 1000:.2f} mm away at 0.25 ms" in page
-    (loose,) = [row for row in ROWS if row["what"].startswith("float64, error at most 25 mm")]
-    readme = performance.README.read_text(encoding="utf-8")
-    times = "\N{MULTIPLICATION SIGN}"
-    assert f"{loose['ratio']['median']:.0f}{times} as fast where an error of 25 mm suffices, and {both:.0f}{times}" in readme
-
-
-def test_a_snapshot_is_as_large_as_the_page_says():
-    text = (ROOT / "docs" / "planning.md").read_text(encoding="utf-8")
-    with closing(gymnasium.make("WLR-Velocity-v0", randomization="ice")) as env:
-        env.reset(seed=0)
-        size = env.get_wrapper_attr("get_state")().nbytes
-    assert f"`snapshot.nbytes` ({size / 1000:.0f} kB per robot in float64)" in text
 
 
 def test_a_report_replaces_its_own_measurement_only():
