@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,11 @@ def emulated_imu(link: Any, port: ImuPort) -> ImuStream:
     return ImuStream(port, link.clock.now, lambda *_: MemoryDevice(link.clock.machine, "imu"))
 
 
+def imu_that_reads(*counts):
+    """The IMU of an emulated robot whose accelerometer gives nothing but these counts (x, y, z), and that does not turn."""
+    return SimpleNamespace(counts=lambda accelerometer, gyro: (counts, (0, 0, 0)))
+
+
 class Rig:
     """A robot and its loop.
 
@@ -129,5 +135,5 @@ class Rig:
 
 __all__ = [
     "DRIVE", "HARDWARE", "JOINTS", "PATIENT", "PERIOD", "ROBOT", "Phase", "Rig", "StoppedError", "emulated_imu",
-    "hardware_file", "hardware_with", "jabbering_port", "machine_of",
+    "hardware_file", "hardware_with", "imu_that_reads", "jabbering_port", "machine_of",
 ]  # fmt: skip

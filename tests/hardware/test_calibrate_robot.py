@@ -33,6 +33,7 @@ from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 
 ROBOT, NOMINAL = load_robot("emanual"), load_hardware()
+NOMINAL_TEXT = (data_directory("configs") / "hardware/nominal.yaml").read_text()
 #: How the robot at hand is really mounted: not as the file says.
 TRUE = find.with_mountings(
     NOMINAL,
@@ -43,8 +44,10 @@ SENSOR = ImuCalibration(
 )
 
 
-def make_machine(hardware, monkeypatch):
-    machine = Machine(ROBOT, hardware, MachineOptions(timing=NO_TIME))
+@pytest.fixture
+def machine(monkeypatch):
+    """An emulated robot that is mounted as :data:`TRUE` says, and that the commands are connected to."""
+    machine = Machine(ROBOT, TRUE, MachineOptions(timing=NO_TIME))
     monkeypatch.setattr(WiredRobotOption, "link", lambda self, changed=None: emulated_link(machine))
     return machine
 
@@ -71,8 +74,7 @@ class Operator:
         return "y" if "[y/N]" in text else ""
 
 
-def test_the_wizard_finds_how_the_robot_is_mounted(monkeypatch, tmp_path, capsys):
-    machine = make_machine(TRUE, monkeypatch)
+def test_the_wizard_finds_how_the_robot_is_mounted(machine, tmp_path, capsys):
     out = tmp_path / "mine.yaml"
     operator = Operator(machine)
     assert calibrate_joints(JointsOptions(out=out), operator) == 0
@@ -86,20 +88,18 @@ def test_the_wizard_finds_how_the_robot_is_mounted(monkeypatch, tmp_path, capsys
     assert "leg_lf    sign +1 -> -1, zero 1024 -> 30" in capsys.readouterr().out
 
 
-def test_comments_and_limits_of_the_file_stay(monkeypatch, tmp_path):
-    machine = make_machine(TRUE, monkeypatch)
+def test_comments_and_limits_of_the_file_stay(machine, tmp_path):
     out = tmp_path / "mine.yaml"
     calibrate_joints(JointsOptions(out=out, only=("wheel_rf",)), Operator(machine))
-    source = (data_directory("configs") / "hardware/nominal.yaml").read_text()
     text = out.read_text()
-    kept = [line for line in source.splitlines() if not re.match(r"^(joints:|  (leg|wheel)_..: )", line)]
+    kept = [line for line in NOMINAL_TEXT.splitlines() if not re.match(r"^(joints:|  (leg|wheel)_..: )", line)]
     assert [line for line in kept if line not in text.splitlines()] == []
     assert re.search(r"# Signs and zeros by wlr calibrate joints, \d{4}-\d\d-\d\d", text)
     assert load_hardware(out) == find.with_mountings(NOMINAL, {"wheel_rf": Mounting(sign=1, zero=0)})
 
 
-def test_what_was_found_as_json(monkeypatch, tmp_path, capsys):
-    machine, out = make_machine(TRUE, monkeypatch), tmp_path / "mine.yaml"
+def test_what_was_found_as_json(machine, tmp_path, capsys):
+    out = tmp_path / "mine.yaml"
     with only_results(True):
         assert calibrate_joints(JointsOptions(out=out, only=("wheel_rf",), json=True), Operator(machine)) == 0
     found = json.loads(capsys.readouterr().out)
@@ -107,23 +107,21 @@ def test_what_was_found_as_json(monkeypatch, tmp_path, capsys):
     assert found["joints"]["wheel_rf"]["sign"] in (1, -1)
 
 
-def test_ports_of_the_command_line_are_not_written_and_comments_stay(monkeypatch, tmp_path):
-    machine = make_machine(TRUE, monkeypatch)
+def test_ports_of_the_command_line_are_not_written_and_comments_stay(machine, tmp_path, request):
     out = tmp_path / "mine.yaml"
     options = JointsOptions(out=out, only=("wheel_rf",), port=("legs=/tmp/robot/legs", "imu=/tmp/robot/imu"))
     calibrate_joints(options, Operator(machine))
     assert load_hardware(out) == find.with_mountings(NOMINAL, {"wheel_rf": Mounting(sign=1, zero=0)})
-    assert out.read_text().count("#") == nominal_text().count("#") + 1  # its own note
-    machine = sensor(monkeypatch)
+    assert out.read_text().count("#") == NOMINAL_TEXT.count("#") + 1  # its own note
+    sensor = request.getfixturevalue("sensor")
     own = ImuOptions(hardware=str(out), out=out, seconds=2.0, mounting=True, port=("imu=/tmp/robot/imu",))
-    calibrate_imu(own, Turner(machine, [(0, 0, 1), (-0.3, 0, 0.95)]))
+    calibrate_imu(own, Turner(sensor, [(0, 0, 1), (-0.3, 0, 0.95)]))
     found = load_hardware(out)
     assert (found.imu.port, found.buses) == (NOMINAL.imu.port, NOMINAL.buses)
     assert "# Limits of the command limiter" in out.read_text()
 
 
-def test_notes_do_not_pile_up_and_odd_layouts_are_written_anew(monkeypatch, tmp_path):
-    machine = make_machine(TRUE, monkeypatch)
+def test_notes_do_not_pile_up_and_odd_layouts_are_written_anew(machine, tmp_path):
     out = tmp_path / "mine.yaml"
     for _ in range(2):
         calibrate_joints(
@@ -148,15 +146,13 @@ def test_notes_do_not_pile_up_and_odd_layouts_are_written_anew(monkeypatch, tmp_
     assert load_hardware(odd) == load_hardware(out)
 
 
-def test_the_other_joint_is_noticed_and_asked_for_again(monkeypatch, tmp_path, capsys):
-    machine = make_machine(TRUE, monkeypatch)
+def test_the_other_joint_is_noticed_and_asked_for_again(machine, tmp_path, capsys):
     operator = Operator(machine, clumsy=["leg_rf"])
     assert calibrate_joints(JointsOptions(out=tmp_path / "a.yaml", only=("leg_lf",)), operator) == 0
     assert re.search(r"leg_rf moved by \d+ counts while leg_lf was asked for.*Once more", capsys.readouterr().out)
 
 
-def test_no_motor_is_driven_and_none_is_let_go_without_asking(monkeypatch, tmp_path):
-    machine = make_machine(TRUE, monkeypatch)
+def test_no_motor_is_driven_and_none_is_let_go_without_asking(machine, tmp_path):
     machine.servos["leg_lf"].set("torque_enable", 1)
     setpoints = {joint: (servo["goal_position"], servo["goal_velocity"]) for joint, servo in machine.servos.items()}
     operator = Operator(machine, {"Switch them off?": "n"})
@@ -169,15 +165,13 @@ def test_no_motor_is_driven_and_none_is_let_go_without_asking(monkeypatch, tmp_p
 
 
 @pytest.mark.parametrize("answers", [{"leg_rf (right front): hold it still": "q"}, {"Write": "n"}])
-def test_stopping_writes_nothing(monkeypatch, tmp_path, answers):
-    machine = make_machine(TRUE, monkeypatch)
+def test_stopping_writes_nothing(machine, tmp_path, answers):
     options = JointsOptions(out=tmp_path / "a.yaml", only=("leg_lf", "leg_rf"))
     assert calibrate_joints(options, Operator(machine, answers)) == 1
     assert list(tmp_path.iterdir()) == []
 
 
-def test_skipped_joints_stay(monkeypatch, tmp_path):
-    machine = make_machine(TRUE, monkeypatch)
+def test_skipped_joints_stay(machine, tmp_path):
     out = tmp_path / "a.yaml"
     calibrate_joints(
         JointsOptions(out=out, only=("leg_lf", "leg_rr")), Operator(machine, {"leg_lf (left front): hold it still": "s"})
@@ -186,8 +180,7 @@ def test_skipped_joints_stay(monkeypatch, tmp_path):
     assert load_hardware(out).joints["leg_rr"].sign == 1
 
 
-def test_a_servo_that_does_not_answer_ends_it(monkeypatch, tmp_path):
-    machine = make_machine(TRUE, monkeypatch)
+def test_a_servo_that_does_not_answer_ends_it(machine, tmp_path):
     operator = Operator(machine)
     machine.inject("dead wheel_rr after=0.01")
 
@@ -242,7 +235,9 @@ class Turner:
         return ""
 
 
+@pytest.fixture
 def sensor(monkeypatch):
+    """An emulated robot whose IMU is as :data:`SENSOR` says, and that the commands are connected to."""
     hardware = find.with_imu_calibration(NOMINAL, SENSOR)
     machine = Machine(ROBOT, hardware, MachineOptions(timing=NO_TIME))
 
@@ -265,9 +260,8 @@ def turned(ups):
 SIX = [(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
 
 
-def test_six_sides_and_mounting_find_the_sensor(monkeypatch, tmp_path):
-    machine = sensor(monkeypatch)
-    turner = Turner(machine, [*turned(SIX), (0, 0, 1), (-0.3, 0, 0.95)])
+def test_six_sides_and_mounting_find_the_sensor(sensor, tmp_path):
+    turner = Turner(sensor, [*turned(SIX), (0, 0, 1), (-0.3, 0, 0.95)])
     out = tmp_path / "mine.yaml"
     assert calibrate_imu(ImuOptions(out=out, poses=6, mounting=True, seconds=2.0), turner) == 0
     found = load_hardware(out).imu.calibration
@@ -276,14 +270,10 @@ def test_six_sides_and_mounting_find_the_sensor(monkeypatch, tmp_path):
     np.testing.assert_allclose(found.accel_scale, SENSOR.accel_scale, atol=1e-3)
     np.testing.assert_allclose(to_body(found), to_body(SENSOR), atol=2e-3)
     assert found.temperature == pytest.approx(30.0, abs=0.1)
-    assert yaml.safe_load(out.read_text())["safety"] == yaml.safe_load(nominal_text())["safety"]
+    assert yaml.safe_load(out.read_text())["safety"] == yaml.safe_load(NOMINAL_TEXT)["safety"]
 
 
-def nominal_text():
-    return (data_directory("configs") / "hardware/nominal.yaml").read_text()
-
-
-def test_one_level_pose_finds_bias_and_offset(monkeypatch, tmp_path):
+def test_one_level_pose_finds_bias_and_offset(sensor, tmp_path):
     """Scale and mounting are those of the file; here the file's are right, so offset and bias must be too."""
     known = tmp_path / "known.yaml"
     partly = SENSOR.model_copy(update={"gyro_bias": (0.0, 0.0, 0.0), "accel_offset": (0.0, 0.0, 0.0)})
@@ -291,17 +281,15 @@ def test_one_level_pose_finds_bias_and_offset(monkeypatch, tmp_path):
         known, data_directory("configs") / "hardware/nominal.yaml", find.with_imu_calibration(NOMINAL, partly), "imu", "by hand"
     )
     assert load_hardware(known).imu.calibration == partly
-    machine = sensor(monkeypatch)
-    assert calibrate_imu(ImuOptions(hardware=str(known), out=known, seconds=2.0), Turner(machine, [(0, 0, 1)])) == 0
+    assert calibrate_imu(ImuOptions(hardware=str(known), out=known, seconds=2.0), Turner(sensor, [(0, 0, 1)])) == 0
     found = load_hardware(known).imu.calibration
     np.testing.assert_allclose(found.gyro_bias, SENSOR.gyro_bias, atol=3e-4)
     np.testing.assert_allclose(found.accel_offset, SENSOR.accel_offset, atol=0.01)
     assert (found.accel_scale, found.mounting) == (SENSOR.accel_scale, SENSOR.mounting)
 
 
-def test_a_pose_without_readings_is_asked_for_again(monkeypatch, tmp_path, capsys):
-    machine = sensor(monkeypatch)
-    turner = Turner(machine, [(0, 0, 1), (-0.3, 0, 0.95)], silent=2)
+def test_a_pose_without_readings_is_asked_for_again(sensor, tmp_path, capsys):
+    turner = Turner(sensor, [(0, 0, 1), (-0.3, 0, 0.95)], silent=2)
     assert calibrate_imu(ImuOptions(out=tmp_path / "a.yaml", mounting=True, seconds=1.0), turner) == 0
     assert capsys.readouterr().out.count("0 readings of the IMU, expected 50 or more") == 2
     assert turner.count == 4
@@ -337,9 +325,8 @@ def test_an_emulated_robot_is_not_offered_where_it_cannot_serve(what, tmp_path, 
 
 
 @pytest.mark.parametrize(("text", "code", "words"), [("s\nn\n", 1, "nothing was written"), ("", 2, "is a dialogue")])
-def test_answers_can_be_piped_and_their_end_ends_it(tmp_path, monkeypatch, capsys, text, code, words):
+def test_answers_can_be_piped_and_their_end_ends_it(machine, tmp_path, monkeypatch, capsys, text, code, words):
     monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    make_machine(load_hardware(), monkeypatch)
     assert main(["calibrate", "joints", "--out", str(tmp_path / "a.yaml"), "--only", "leg_lf"]) == code
     said = capsys.readouterr()
     assert words in said.out + said.err

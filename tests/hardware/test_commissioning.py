@@ -41,7 +41,35 @@ NOMINAL = load_hardware()
 ROBOT = load_robot(NOMINAL.robot or "nominal")
 #: Tests in which a person is asked for something often.
 ASKING = ("joints", "imu", "stall")
+NOMINAL_TEXT = (data_directory("configs") / "hardware/nominal.yaml").read_text()
 QUANTITIES = {quantity.name: quantity for test in TESTS.values() for quantity in test.quantities}
+
+
+@pytest.fixture
+def emulated():
+    """An emulated robot on a stand."""
+    return EmulatedStand(ROBOT, NOMINAL)
+
+
+@pytest.fixture
+def stand(emulated):
+    """What may drive it."""
+    link = emulated_link(emulated.machine)
+    link.open()
+    yield Stand(ROBOT, NOMINAL, link)
+    link.close()
+
+
+@pytest.fixture
+def beside(emulated, monkeypatch):
+    """An emulated robot that the command takes for the real one."""
+    monkeypatch.setattr(RobotOption, "link_to", lambda self, robot, hardware, patch=None: emulated_link(emulated.machine))
+    return emulated
+
+
+def commission(out, tests, *words):
+    """Commission the emulated robot of the command; return the exit code."""
+    return main(["commission", "--emulated", "--out", str(out), "--tests", *tests.split(), *words])
 
 
 def motors_on(machine):
@@ -97,8 +125,7 @@ def test_what_it_measures_is_what_the_emulator_is_made_of(nominal):
 @pytest.mark.slow
 def test_the_hardware_file_keeps_its_comments_and_gets_every_measured_value(nominal):
     text = (nominal[1] / "hardware.yaml").read_text()
-    source = (data_directory("configs") / "hardware/nominal.yaml").read_text()
-    assert text.startswith(source)
+    assert text.startswith(NOMINAL_TEXT)
     assert re.search(r"# Measured on the robot by wlr commission", text)
     found = load_hardware(nominal[1] / "hardware.yaml")
     assert found.model_copy(update={"measured": Measured()}) == NOMINAL
@@ -179,8 +206,7 @@ def test_a_servo_that_differs_is_found_and_named(tmp_path, name, joint, factor, 
     assert not results[test].is_good
 
 
-def test_legs_that_get_a_part_of_their_voltage_are_found(tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
+def test_legs_that_get_a_part_of_their_voltage_are_found(emulated, tmp_path):
     emulated.machine.inject("slow_servo legs value=0.05")
     results = make(tmp_path, emulated, "load", "stall")
     assert found_in(results) == {("stall_pwm", leg) for leg in LEGS}
@@ -211,8 +237,7 @@ def test_a_leg_that_does_not_move_or_is_not_held_has_no_strength(tmp_path):
     assert found_in(results) == set()
 
 
-def test_a_joint_that_slips_is_asked_for_once_more(tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
+def test_a_joint_that_slips_is_asked_for_once_more(emulated, tmp_path):
     person = Careless(emulated, leg_rf=2, wheel_lf=2)
     result = make(tmp_path, emulated, "stall", person=person)["stall"]
     assert result.is_good
@@ -222,8 +247,7 @@ def test_a_joint_that_slips_is_asked_for_once_more(tmp_path):
     ]
 
 
-def test_torque_comes_on_where_the_hand_holds_the_joint(stood, monkeypatch):
-    emulated, stand = stood
+def test_torque_comes_on_where_the_hand_holds_the_joint(emulated, stand, monkeypatch):
     off = []
 
     class Mover(EmulatedPerson):
@@ -244,7 +268,7 @@ def test_torque_comes_on_where_the_hand_holds_the_joint(stood, monkeypatch):
 
 
 def test_nobody_says_that_legs_have_no_profile(tmp_path):
-    assert main(["commission", "--emulated", "--out", str(tmp_path), "--tests", "velocity_step"]) == 0
+    assert commission(tmp_path, "velocity_step") == 0
     (run_made,) = read_dataset(tmp_path).runs
     assert not run_made.meta.states_profile
 
@@ -253,9 +277,8 @@ def test_nobody_says_that_legs_have_no_profile(tmp_path):
 def test_a_rubbing_wheel_and_a_slow_adapter_are_told_on_the_command_line(tmp_path, capsys):
     patch = {"effects": [{"name": "coulomb_friction", "where": ["wheel_rf"], "parameters": {"torque": 0.05}}]}
     (tmp_path / "rub.yaml").write_text(yaml.safe_dump(patch))
-    words = ["commission", "--emulated", "--out", str(tmp_path / "out"), "--tests", "latency", "load"]
-    code = main([*words, "--effects", str(tmp_path / "rub.yaml"), "--fault", "delay legs value=0.015"])
-    assert code == 1
+    words = ["--effects", str(tmp_path / "rub.yaml"), "--fault", "delay legs value=0.015"]
+    assert commission(tmp_path / "out", "latency load", *words) == 1
     assert differing(tmp_path / "out") == {("adapter_latency", "legs"), ("running_load", "wheel_rf")}
     shown = capsys.readouterr().out
     assert "legs, adapter_latency: median time of a ping" in shown
@@ -265,8 +288,7 @@ def test_a_rubbing_wheel_and_a_slow_adapter_are_told_on_the_command_line(tmp_pat
 
 @pytest.mark.filterwarnings("error")
 def test_a_wheel_that_does_not_turn_has_no_load(tmp_path, capsys):
-    words = ["commission", "--emulated", "--yes", "--tests", "load", "--out", str(tmp_path)]
-    assert main([*words, "--fault", "slow_servo wheel_lf"]) == 1
+    assert commission(tmp_path, "load", "--yes", "--fault", "slow_servo wheel_lf") == 1
     result = results_of(tmp_path)["load"]
     assert result["state"] == "failed"
     assert "wheel_lf turns at 0." in result["reason"]
@@ -285,8 +307,7 @@ def test_a_joint_mounted_the_other_way_and_a_wrong_zero_are_found(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_imu_that_is_mounted_otherwise_is_found(tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
+def test_an_imu_that_is_mounted_otherwise_is_found(emulated, tmp_path):
     link = emulated_link(emulated.machine)
     turned = NOMINAL.imu.model_copy(
         update={"calibration": NOMINAL.imu.calibration.model_copy(update={"mounting": (0, 0, 1.57)})}
@@ -301,18 +322,7 @@ def test_an_imu_that_is_mounted_otherwise_is_found(tmp_path):
 # ---- whatever happens, motors are off --------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def stood():
-    """An emulated robot, and the stand that may drive it."""
-    emulated = EmulatedStand(ROBOT, NOMINAL)
-    link = emulated_link(emulated.machine)
-    link.open()
-    yield emulated, Stand(ROBOT, NOMINAL, link)
-    link.close()
-
-
-def test_a_leg_that_a_hand_moved_far_gets_no_torque(stood):
-    emulated, stand = stood
+def test_a_leg_that_a_hand_moved_far_gets_no_torque(emulated, stand):
     stand.prepare(["leg_lf"])
     for far, on in ((-0.1, ["leg_lf"]), (-0.8, [])):
         stand.prepare(["leg_lf"])
@@ -327,8 +337,7 @@ def test_a_leg_that_a_hand_moved_far_gets_no_torque(stood):
         stand.switch_off(["leg_lf"])
 
 
-def test_a_leg_that_is_turned_too_far_costs_only_its_own_value(stood):
-    emulated, stand = stood
+def test_a_leg_that_is_turned_too_far_costs_only_its_own_value(emulated, stand):
 
     class Far(EmulatedPerson):
         def turn(self, joint, angle):
@@ -339,8 +348,7 @@ def test_a_leg_that_is_turned_too_far_costs_only_its_own_value(stood):
     assert {one.quantity for one in caught.value.readings} == {"wheel_follows_given", "wheel_follows_kept", "leg_follows_given"}
 
 
-def test_a_stop_that_came_during_a_question_comes_before_torque(stood):
-    emulated, stand = stood
+def test_a_stop_that_came_during_a_question_comes_before_torque(emulated, stand):
     stand.operator.ask_to_stop("SIGINT")
     with pytest.raises(QuitError, match="SIGINT"):
         stand.switch_on(WHEELS)
@@ -374,8 +382,7 @@ def fail(error):
 
 
 @pytest.mark.parametrize("error", [TroubleError("odd"), QuitError(), RuntimeError("a mistake"), KeyboardInterrupt()])
-def test_motors_are_off_and_registers_back_however_a_test_ends(stood, error):
-    emulated, stand = stood
+def test_motors_are_off_and_registers_back_however_a_test_ends(emulated, stand, error):
     seen = []
 
     def end(stand):
@@ -401,8 +408,7 @@ def test_motors_are_off_and_registers_back_however_a_test_ends(stood, error):
         ("unplug wheels", "unplugged"),
     ],
 )
-def test_a_fault_ends_the_test_with_motors_off(stood, fault, words):
-    emulated, stand = stood
+def test_a_fault_ends_the_test_with_motors_off(emulated, stand, fault, words):
 
     def fault_then_run(stand):
         emulated.machine.inject(fault)
@@ -415,8 +421,7 @@ def test_a_fault_ends_the_test_with_motors_off(stood, fault, words):
     assert [joint for joint in motors_on(emulated.machine) if "unplug" not in fault or joint in LEGS] == []
 
 
-def test_a_held_wheel_ends_the_test(stood):
-    emulated, stand = stood
+def test_a_held_wheel_ends_the_test(emulated, stand):
 
     def hold(stand, person):
         stand.prepare(WHEELS)
@@ -431,26 +436,21 @@ def test_a_held_wheel_ends_the_test(stood):
     assert motors_on(emulated.machine) == []
 
 
-def test_torque_that_does_not_go_off_ends_everything(tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
+def test_torque_that_does_not_go_off_ends_everything(emulated, tmp_path):
 
     class Saboteur(EmulatedPerson):
         def watch_supply(self):
             emulated.machine.inject("dead wheel_rr")
 
-    results = make_ignoring_power(tmp_path, emulated, Saboteur(emulated))
+    link = emulated_link(emulated.machine)
+    with Commissioning(ROBOT, NOMINAL, link, Saboteur(emulated), tmp_path, RunMeta()) as commissioning:
+        results = list(commissioning.make([TESTS["stall"], TESTS["latency"]]))
     assert [(result.test, result.state) for result in results] == [("stall", "stopped")]
     assert results[0].reason == "CUT THE POWER: torque is not confirmed off at wheel_rr"
 
 
-def make_ignoring_power(folder, emulated, person):
-    link = emulated_link(emulated.machine)
-    with Commissioning(ROBOT, NOMINAL, link, person, folder, RunMeta()) as commissioning:
-        return list(commissioning.make([TESTS["stall"], TESTS["latency"]]))
-
-
 @pytest.mark.parametrize("fault", ["", "dead wheel_rr"])
-def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp_path, monkeypatch, fault):
+def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(emulated, tmp_path, monkeypatch, fault):
     guards = []
 
     class Guard:
@@ -468,7 +468,6 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
             pass
 
     monkeypatch.setattr(runner, "Guard", Guard)
-    emulated = EmulatedStand(ROBOT, NOMINAL)
     link = emulated_link(emulated.machine)
     link.is_serial = True
 
@@ -487,9 +486,8 @@ def test_the_watchdog_process_of_a_real_robot_is_released_when_torque_is_off(tmp
     "name",
     ["watchdog", "velocity_step", "torque_on", "load", *(pytest.param(name, marks=pytest.mark.slow) for name in ASKING)],
 )
-def test_the_next_sign_of_life_comes_in_time_while_a_motor_is_on(stood, monkeypatch, name):
+def test_the_next_sign_of_life_comes_in_time_while_a_motor_is_on(emulated, stand, monkeypatch, name):
     """However long a person takes over a question: no motor is on then. Whenever one is, a sign is promised."""
-    emulated, stand = stood
     signs = []
     stand.sign_of_life = lambda seconds: signs.append((stand.clock.now(), seconds))
     look_at_promises(monkeypatch, emulated, stand, lambda: signs[-1][1] if signs else math.inf)
@@ -518,16 +516,14 @@ def look_at_promises(monkeypatch, emulated, stand, promised):
     monkeypatch.setattr(stand.servos, "read", look)
 
 
-def test_signs_of_life_are_promised_whenever_a_held_motor_is_on(stood, monkeypatch):
-    emulated, stand = stood
+def test_signs_of_life_are_promised_whenever_a_held_motor_is_on(emulated, stand, monkeypatch):
     promised = [math.inf]
     stand.sign_of_life = promised.append
     look_at_promises(monkeypatch, emulated, stand, lambda: promised[-1])
     run_test(TESTS["stall"], stand, EmulatedPerson(emulated))
 
 
-def test_the_stand_has_limits_of_its_own(stood):
-    _, stand = stood
+def test_the_stand_has_limits_of_its_own(stand):
     for speeds in ({"wheel_lf": 3.1}, {"wheel_lf": float("nan")}, {"leg_lf": 1.0}):
         with pytest.raises(InputError, match="expected a wheel and 3 rad/s at most"):
             stand.spin(speeds)
@@ -540,8 +536,7 @@ def test_the_stand_has_limits_of_its_own(stood):
 
 
 def test_a_robot_with_a_fault_is_not_switched_on(tmp_path, capsys):
-    words = ["commission", "--emulated", "--out", str(tmp_path), "--tests", "watchdog", "--fault", "dead leg_rf"]
-    assert main(words) == 1
+    assert commission(tmp_path, "watchdog", "--fault", "dead leg_rf") == 1
     shown = capsys.readouterr().out
     assert "leg_rf     answer: none" in shown
     assert "Nothing was switched on" in shown
@@ -551,8 +546,7 @@ def test_a_robot_with_a_fault_is_not_switched_on(tmp_path, capsys):
 # ---- the person ------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_armed_while_hands_are_at_the_robot(stood):
-    emulated, stand = stood
+def test_nothing_is_armed_while_hands_are_at_the_robot(emulated, stand):
 
     class Watcher(EmulatedPerson):
         def turn(self, joint, angle):
@@ -603,18 +597,12 @@ class SlowHuman(Human):
         return super().__call__(text)
 
 
-def beside(monkeypatch, emulated):
-    monkeypatch.setattr(RobotOption, "link_to", lambda self, robot, hardware, patch=None: emulated_link(emulated.machine))
-
-
 @pytest.mark.slow
-def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(monkeypatch, tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
-    beside(monkeypatch, emulated)
+def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(beside, tmp_path):
     mine = tmp_path / "mine.yaml"
-    mine.write_text((data_directory("configs") / "hardware/nominal.yaml").read_text())
-    drawn = f"{0.2**2 * emulated.stall_current:.3f}"
-    human = Human(emulated, **{"Write the measured": "y", "current while": drawn, "Sign and zero": "s"})
+    mine.write_text(NOMINAL_TEXT)
+    drawn = f"{0.2**2 * beside.stall_current:.3f}"
+    human = Human(beside, **{"Write the measured": "y", "current while": drawn, "Sign and zero": "s"})
     options = CommissionOptions(hardware=str(mine), out=tmp_path / "out", tests=("joints", "torque_on", "stall"))
     assert run(options, human) == 0
     assert [result["state"] for result in results_of(tmp_path / "out").values()] == ["skipped", "done", "done"]
@@ -622,11 +610,11 @@ def test_a_human_is_led_through_and_nobody_is_asked_while_a_motor_is_on(monkeypa
     assert len(starts) == 3
     assert "Each wheel, then each leg's end, is to be held by hand" in starts[2]
     found = load_hardware(mine)
-    assert found.measured.stall_current["wheel_lf"].value == pytest.approx(emulated.stall_current, rel=0.05)
+    assert found.measured.stall_current["wheel_lf"].value == pytest.approx(beside.stall_current, rel=0.05)
     assert not found.measured.joint_zero
 
 
-def test_a_joint_that_cannot_be_held_is_named_and_the_others_are_told(monkeypatch, tmp_path, capsys):
+def test_a_joint_that_cannot_be_held_is_named_and_the_others_are_told(beside, tmp_path, capsys):
     class OneHanded(Human):
         def __call__(self, text):
             answer = super().__call__(text)
@@ -634,9 +622,7 @@ def test_a_joint_that_cannot_be_held_is_named_and_the_others_are_told(monkeypatc
                 self.emulated.release("leg_rf")
             return answer
 
-    emulated = EmulatedStand(ROBOT, NOMINAL)
-    beside(monkeypatch, emulated)
-    human = OneHanded(emulated)
+    human = OneHanded(beside)
     assert run(CommissionOptions(out=tmp_path, tests=("stall",), yes=True), human) == 1
     (again,) = (text for text in human.asked if "Once more" in text)
     assert re.match(r"leg_rf turned by .*: hold it firmly. Once more. leg_rf \(right front\): hold its end", again)
@@ -655,13 +641,11 @@ def test_how_the_body_is_to_be_turned():
     assert all(way in text and "within 3 s" in text for way, text in zip(ways, asked, strict=True))
 
 
-def test_the_way_out_is_always_open(monkeypatch, tmp_path, capsys):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
-    beside(monkeypatch, emulated)
+def test_the_way_out_is_always_open(beside, tmp_path, capsys):
     for word, made in (("Latency", 0), ("leg_lf (left front): swing", 2)):
         out = tmp_path / str(made)
         options = CommissionOptions(out=out, tests=("latency", "silent_servo", "joints"))
-        assert run(options, Human(emulated, **{word: "q", "Write": "n"})) == 1
+        assert run(options, Human(beside, **{word: "q", "Write": "n"})) == 1
         states = [result["state"] for result in results_of(out).values()]
         assert states == ["done"] * made + ["stopped"]
         shown = capsys.readouterr().out
@@ -669,8 +653,7 @@ def test_the_way_out_is_always_open(monkeypatch, tmp_path, capsys):
         assert ("values of the other tests as expected" in shown) == bool(made)
 
 
-def test_a_signal_during_the_comparison_stops_everything_too(monkeypatch, tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
+def test_a_signal_during_the_comparison_stops_everything_too(emulated, monkeypatch, tmp_path):
     made = []
 
     def interrupted(test, stand, person):
@@ -754,8 +737,7 @@ def test_who_is_beside_the_robot_is_asked_before_a_test_is_made_once_more(tmp_pa
     assert (result.state, len(result.repeated)) == ("stopped", 1)
 
 
-def test_a_setpoint_that_is_refused_for_another_reason_is_told_as_it_is(tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
+def test_a_setpoint_that_is_refused_for_another_reason_is_told_as_it_is(emulated, tmp_path):
 
     class Saboteur(EmulatedPerson):
         def ready(self, test):
@@ -767,8 +749,7 @@ def test_a_setpoint_that_is_refused_for_another_reason_is_told_as_it_is(tmp_path
     assert "refused (data limit error)" in result.reason
 
 
-def test_a_lost_answer_now_and_then_leaves_no_gap(tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
+def test_a_lost_answer_now_and_then_leaves_no_gap(emulated, tmp_path):
     emulated.machine.inject("drop probability=0.01")
     results = make(tmp_path, emulated, "velocity_step", "stall")
     assert found_in(results) == set()
@@ -821,9 +802,7 @@ def test_the_list_names_every_test(capsys):
     assert all(name in shown for name in TESTS)
 
 
-def test_what_was_measured_stays_when_somebody_leaves(monkeypatch, tmp_path):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
-    beside(monkeypatch, emulated)
+def test_what_was_measured_stays_when_somebody_leaves(beside, tmp_path):
 
     def leave(text):
         if "A read of" in text:
@@ -834,57 +813,53 @@ def test_what_was_measured_stays_when_somebody_leaves(monkeypatch, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(CommissionOptions(out=tmp_path, tests=tests), leave)
     assert set(load_hardware(tmp_path / "hardware.yaml").measured.adapter_latency) == set(NOMINAL.buses)
-    run(CommissionOptions(out=tmp_path, tests=("silent_servo",), force=True, yes=True), Human(emulated))
+    run(CommissionOptions(out=tmp_path, tests=("silent_servo",), force=True, yes=True), Human(beside))
     assert set(load_hardware(tmp_path / "hardware.yaml").measured.adapter_latency) == set(NOMINAL.buses)
 
 
 def test_a_hardware_file_of_ones_own_is_no_folder_for_results(tmp_path, capsys):
     file = tmp_path / "hardware.yaml"
-    file.write_text((data_directory("configs") / "hardware/nominal.yaml").read_text())
-    text = file.read_text()
-    words = ["commission", "--emulated", "--out", str(tmp_path), "--tests", "latency"]
-    assert main(words) == 2
+    file.write_text(NOMINAL_TEXT)
+    assert commission(tmp_path, "latency") == 2
     assert "hardware.yaml: exists" in capsys.readouterr().err
-    assert main([*words, "--hardware", str(file), "--force"]) == 2
+    assert commission(tmp_path, "latency", "--hardware", str(file), "--force") == 2
     assert "its hardware.yaml is the file of --hardware" in capsys.readouterr().err
-    assert file.read_text() == text
+    assert file.read_text() == NOMINAL_TEXT
 
 
 def test_the_copy_finds_a_servo_file_beside_the_original(tmp_path, capsys):
     (tmp_path / "mine").mkdir()
-    content = yaml.safe_load((data_directory("configs") / "hardware/nominal.yaml").read_text())
+    content = yaml.safe_load(NOMINAL_TEXT)
     table = Path(tables.__file__).parent / "xm540_w150.yaml"
     (tmp_path / "mine" / "my_servo.yaml").write_text(table.read_text())
     content["buses"]["legs"]["model"] = "my_servo.yaml"
     (tmp_path / "mine" / "hardware.yaml").write_text(yaml.safe_dump(content))
-    words = ["--emulated", "--hardware", str(tmp_path / "mine" / "hardware.yaml"), "--out", str(tmp_path / "out")]
-    assert main(["commission", *words, "--tests", "latency"]) == 0
+    assert commission(tmp_path / "out", "latency", "--hardware", str(tmp_path / "mine" / "hardware.yaml")) == 0
     copy = load_hardware(tmp_path / "out" / "hardware.yaml")
     assert Path(copy.buses["legs"].model) == tmp_path / "mine" / "my_servo.yaml"
     assert set(copy.measured.adapter_latency) == set(copy.buses)
 
 
 def test_json_goes_to_the_standard_output(tmp_path, capsys):
-    assert main(["commission", "--emulated", "--out", str(tmp_path), "--tests", "latency", "--json"]) == 0
+    assert commission(tmp_path, "latency", "--json") == 0
     assert [result["test"] for result in json.loads(capsys.readouterr().out)] == ["latency"]
 
 
 def test_what_was_measured_must_be_of_this_robot(tmp_path):
-    text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
     file = tmp_path / "a.yaml"
-    file.write_text(text + "measured:\n  stall_load:\n    wheel_xy: {value: 1.0, unit: '-', date: '2026-01-01'}\n")
+    file.write_text(NOMINAL_TEXT + "measured:\n  stall_load:\n    wheel_xy: {value: 1.0, unit: '-', date: '2026-01-01'}\n")
     with pytest.raises(InputError, match=r"measured.stall_load: unknown joint or bus 'wheel_xy'"):
         load_hardware(file)
-    file.write_text(text + "measured:\n  stal_load: {}\n")
+    file.write_text(NOMINAL_TEXT + "measured:\n  stal_load: {}\n")
     with pytest.raises(InputError, match=r"unknown key 'measured.stal_load' \(did you mean 'stall_load'"):
         load_hardware(file)
 
 
 def test_a_second_commissioning_keeps_what_it_did_not_measure(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
-    assert main(["commission", "--emulated", "--out", str(first), "--tests", "latency"]) == 0
+    assert commission(first, "latency") == 0
     file = first / "hardware.yaml"
-    assert main(["commission", "--emulated", "--hardware", str(file), "--out", str(second), "--tests", "silent_servo"]) == 0
+    assert commission(second, "silent_servo", "--hardware", str(file)) == 0
     found = load_hardware(second / "hardware.yaml").measured
     assert found.adapter_latency == load_hardware(file).measured.adapter_latency
     assert set(found.answers_behind_fast) == set(NOMINAL.buses)
@@ -893,28 +868,25 @@ def test_a_second_commissioning_keeps_what_it_did_not_measure(tmp_path):
 
 
 def test_tests_made_again_leave_the_results_of_the_others(tmp_path, capsys):
-    words = ["commission", "--emulated", "--force", "--out", str(tmp_path), "--tests"]
-    assert main([*words, "latency", "silent_servo"]) == 0
+    assert commission(tmp_path, "latency silent_servo") == 0
     first = results_of(tmp_path)
-    assert main([*words, "silent_servo"]) == 0
+    assert commission(tmp_path, "silent_servo", "--force") == 0
     second = results_of(tmp_path)
     assert second["latency"] == first["latency"]
     assert set(second) == set(first)
     measured = load_hardware(tmp_path / "hardware.yaml").measured
     assert set(measured.adapter_latency) == set(measured.answers_behind_fast) == set(NOMINAL.buses)
-    assert main([*words, "latency", "--fault", "delay legs value=0.015"]) == 2
+    assert commission(tmp_path, "latency", "--force", "--fault", "delay legs value=0.015") == 2
     assert "silent_servo is of robot 'wlr-emanual', hardware 'nominal', emulated, not of" in capsys.readouterr().err
     assert results_of(tmp_path) == second
 
 
 @pytest.mark.parametrize("answers", [{"Latency": "q"}, {"Latency": "s", "A read of": "q"}, {"swing its foot": "q"}])
-def test_a_test_that_is_not_made_leaves_its_earlier_result(monkeypatch, tmp_path, answers):
-    emulated = EmulatedStand(ROBOT, NOMINAL)
-    beside(monkeypatch, emulated)
+def test_a_test_that_is_not_made_leaves_its_earlier_result(beside, tmp_path, answers):
     tests = ("latency", "silent_servo", "joints")
-    assert run(CommissionOptions(out=tmp_path, tests=tests, yes=True), Human(emulated)) == 0
+    assert run(CommissionOptions(out=tmp_path, tests=tests, yes=True), Human(beside)) == 0
     first, samples = results_of(tmp_path), (tmp_path / "joints.json").read_text()
-    run(CommissionOptions(out=tmp_path, tests=tests, force=True), Human(emulated, **answers))
+    run(CommissionOptions(out=tmp_path, tests=tests, force=True), Human(beside, **answers))
     second = json.loads((tmp_path / "commission.json").read_text())
     assert [result["state"] for result in second] == ["done"] * 3
     assert {result["test"] for result in second} == set(tests)
@@ -928,40 +900,39 @@ def test_a_test_that_is_not_made_leaves_its_earlier_result(monkeypatch, tmp_path
 def test_results_of_nobody_knows_whom_are_replaced(tmp_path, capsys, content):
     (tmp_path / "commission.json").write_text(content)
     (tmp_path / "hardware.yaml").write_text("of another robot\n")
-    words = ["commission", "--emulated", "--out", str(tmp_path), "--tests", "latency"]
-    assert main(words) == 2
+    assert commission(tmp_path, "latency") == 2
     assert "exists" in capsys.readouterr().err
-    assert main([*words, "--force"]) == 0
+    assert commission(tmp_path, "latency", "--force") == 0
     assert "commission.json: damaged, or does not say of which robot" in capsys.readouterr().out
     assert set(results_of(tmp_path)) == {"latency"}
 
 
 def test_two_hardware_files_of_one_name_are_two_robots(tmp_path, capsys):
-    words = ["commission", "--emulated", "--force", "--out", str(tmp_path / "out"), "--hardware"]
+    def code(file, tests):
+        return commission(tmp_path / "out", tests, "--force", "--hardware", str(tmp_path / file / "my_robot.yaml"))
+
     for name in "ab":
         (tmp_path / name).mkdir()
-        (tmp_path / name / "my_robot.yaml").write_text((data_directory("configs") / "hardware/nominal.yaml").read_text())
-    assert main([*words, str(tmp_path / "a/my_robot.yaml"), "--tests", "latency"]) == 0
-    assert main([*words, str(tmp_path / "b/my_robot.yaml"), "--tests", "silent_servo"]) == 2
+        (tmp_path / name / "my_robot.yaml").write_text(NOMINAL_TEXT)
+    assert code("a", "latency") == 0
+    assert code("b", "silent_servo") == 2
     assert "choose another --out" in capsys.readouterr().err
-    assert main([*words, str(tmp_path / "b/../a/my_robot.yaml"), "--tests", "silent_servo"]) == 0
-    assert main([*words, str(tmp_path / "b/my_robot.yaml"), "--tests", "latency", "silent_servo"]) == 0  # nothing is left of a
+    assert code("b/../a", "silent_servo") == 0
+    assert code("b", "latency silent_servo") == 0  # nothing is left of a
 
 
-def test_the_later_of_two_values_stays_and_only_the_copy_gets_those_of_an_earlier_session(monkeypatch, tmp_path):
+def test_the_later_of_two_values_stays_and_only_the_copy_gets_those_of_an_earlier_session(beside, tmp_path):
     def at(date, value):
         return {"value": value, "unit": "A", "date": date}
 
-    beside(monkeypatch, EmulatedStand(ROBOT, NOMINAL))
-    text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
     mine, out = tmp_path / "mine.yaml", tmp_path / "out"
-    mine.write_text(text)
+    mine.write_text(NOMINAL_TEXT)
     options = {"hardware": str(mine), "out": out, "yes": True, "force": True}
     assert run(CommissionOptions(tests=("silent_servo",), **options)) == 0
     own = {"wheel_lf": at("2026-11-20", 1.5), "wheel_rf": at("2026-11-01", 1.6)}
     earlier = {"wheel_lf": at("2026-11-01", 1.1), "wheel_rf": at("2026-11-20", 1.2), "wheel_lr": at("2026-11-20", 1.3)}
-    mine.write_text(text + yaml.safe_dump({"measured": {"stall_current": own}}))
-    (out / "hardware.yaml").write_text(text + yaml.safe_dump({"measured": {"stall_current": earlier}}))
+    mine.write_text(NOMINAL_TEXT + yaml.safe_dump({"measured": {"stall_current": own}}))
+    (out / "hardware.yaml").write_text(NOMINAL_TEXT + yaml.safe_dump({"measured": {"stall_current": earlier}}))
     assert run(CommissionOptions(tests=("latency",), **options)) == 0
 
     def currents(file):
@@ -975,15 +946,13 @@ def test_the_later_of_two_values_stays_and_only_the_copy_gets_those_of_an_earlie
 def test_a_copy_of_the_hardware_file_still_finds_its_robot(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/robot.yaml").write_text("base: emanual\nname: mine\n")
-    text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
     file = tmp_path / "mine/hardware.yaml"
-    file.write_text(re.sub(r"(?m)^robot: \w+", "robot: robot.yaml", text))
-    words = ["commission", "--emulated", "--hardware", str(file), "--out", str(tmp_path / "out"), "--tests", "latency"]
-    assert main(words) == 0
+    file.write_text(re.sub(r"(?m)^robot: \w+", "robot: robot.yaml", NOMINAL_TEXT))
+    assert commission(tmp_path / "out", "latency", "--hardware", str(file)) == 0
     assert load_robot(load_hardware(tmp_path / "out/hardware.yaml").robot or "").name == "mine"
 
 
 @pytest.mark.parametrize("action", ["brake", "release"])
-def test_a_joint_that_is_not_there_cannot_be_held(stood, action):
+def test_a_joint_that_is_not_there_cannot_be_held(emulated, action):
     with pytest.raises(InputError, match="unknown joint 'wheel_fl'"):
-        getattr(stood[0], action)("wheel_fl")
+        getattr(emulated, action)("wheel_fl")

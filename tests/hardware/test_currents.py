@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from test_rules import HOME, status
 
 import wlr_gym  # noqa: F401  registers the environments
 from wlr_gym.base.paths import find_config
@@ -102,14 +103,8 @@ def seconds_until(rule, share, robot, limits):
     ratings, memory = rules.ratings_of(robot, 0.02), rules.Memory()
     counts = np.r_[np.full(4, share * 4.4 / CURRENT_COUNT), np.zeros(4)]
     effort = JointMap(robot, HARDWARE).effort(counts, np.zeros(8))
-    home = np.r_[np.full(4, np.pi / 2), np.zeros(4)]
-    status = rules.RobotStatus(
-        time=1.0, position=home, velocity=np.zeros(8), effort=effort, silence=np.zeros(8), alert=np.zeros(8, bool),
-        restarted=np.zeros(8, bool), voltage=np.full(8, 12.0), temperature=np.full(8, 30.0), gyro=np.zeros(3),
-        accelerometer=np.array([0.0, 0.0, 9.81]), imu_silence=0.0, up=np.array([0.0, 0.0, 1.0]),
-    )  # fmt: skip
     for tick in range(200):
-        decision = rules.decide(limits, ratings, status, memory, home, home)
+        decision = rules.decide(limits, ratings, status(effort=effort), memory, HOME, HOME)
         if any(verdict.rule == rule for verdict in decision.verdicts):
             return tick * 0.02
         memory = decision.memory

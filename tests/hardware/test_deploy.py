@@ -31,7 +31,7 @@ from wlr_gym.hardware.config import load_hardware, with_ports
 from wlr_gym.hardware.deployment import REHEARSALS, loop_of
 from wlr_gym.hardware.deployment import deploy as drive
 from wlr_gym.hardware.emulator.link import emulated_robot
-from wlr_gym.hardware.log import RunLog, read_events
+from wlr_gym.hardware.log import CsvTable, read_events
 from wlr_gym.hardware.loop import StoppedError
 from wlr_gym.hardware.timing import MonotonicClock
 from wlr_gym.learning.evaluation import make_core, roll_out
@@ -41,8 +41,19 @@ ID = "WLR-Velocity-v0"
 COMMAND = {"linear_velocity_x": 0.08, "yaw_rate": 0.15}
 
 
-def robot_core(folder, seconds=4.0):
-    return make_core(ID, 1, {"backend": "dynamixel", "hardware": {"emulated": True, "log": folder}, "episode_length": seconds})
+@pytest.fixture
+def robot_core(tmp_path):
+    """Makes an emulated robot's core, and closes it when the test is over."""
+    made = []
+
+    def make(seconds=4.0, log=tmp_path, **hardware):
+        options = {"emulated": True, "log": log, **hardware}
+        made.append(make_core(ID, 1, {"backend": "dynamixel", "hardware": options, "episode_length": seconds}))
+        return made[-1]
+
+    yield make
+    for core in made:
+        core.close()
 
 
 class Wobble:
@@ -68,11 +79,6 @@ def run_of(core):
     return read_run(result.run)
 
 
-def tired_core(folder):
-    hardware = {"emulated": True, "log": folder, "effects": "tired_battery"}
-    return make_core(ID, 1, {"backend": "dynamixel", "hardware": hardware, "episode_length": 2.0})
-
-
 # ---- deploying ---------------------------------------------------------------------------------------------------------
 
 
@@ -80,8 +86,8 @@ def tired_core(folder):
 @pytest.mark.parametrize(
     "make", [lambda core: Wobble(core.observation.shape[1]), lambda core: make_policy("pid", core.contract())]
 )
-def test_the_log_shown_to_the_policy_again_gives_the_same_actions(tmp_path, make):
-    core = robot_core(tmp_path)
+def test_the_log_shown_to_the_policy_again_gives_the_same_actions(robot_core, make):
+    core = robot_core()
     result = drive(core, make(core), seed=2)
     assert result.run is not None
     assert result.well
@@ -92,12 +98,11 @@ def test_the_log_shown_to_the_policy_again_gives_the_same_actions(tmp_path, make
     assert given.shape == (200, 8)
     assert np.abs(np.diff(given, axis=0)).max() > 0.001
     np.testing.assert_array_equal(answered, given)
-    core.close()
 
 
 @pytest.mark.slow
-def test_commands_that_change_on_the_way_are_seen_again(tmp_path):
-    core = robot_core(tmp_path, 9.0)
+def test_commands_that_change_on_the_way_are_seen_again(robot_core):
+    core = robot_core(9.0)
     policy = make_policy("pid", core.contract())
     result = drive(core, policy, seed=5)
     assert result.run is not None
@@ -105,12 +110,11 @@ def test_commands_that_change_on_the_way_are_seen_again(tmp_path):
     assert len(np.unique(commands)) >= 2
     given, answered = act_again(core, policy, result.run)
     np.testing.assert_array_equal(answered, given)
-    core.close()
 
 
-def test_a_policy_tracks_on_the_robot_as_in_simulation(tmp_path):
+def test_a_policy_tracks_on_the_robot_as_in_simulation(robot_core):
     """Errors on the emulated robot lie where those of randomised simulated robots lie, with the same command."""
-    core = robot_core(tmp_path, 8.0)
+    core = robot_core(8.0)
     machine, seen = machine_of(core), []
     loop_of(core).operator.spare = lambda: seen.append(machine.plant.truth().values[0].copy())
     result = drive(core, make_policy("pid", core.contract()), command=COMMAND)
@@ -119,7 +123,6 @@ def test_a_policy_tracks_on_the_robot_as_in_simulation(tmp_path):
     truth = np.array(seen)[-100 - 30 :][:100]  # the last 2 s before the wheels stop
     speed = truth[:, columns["linear_velocity_in_body"].start].mean()
     turn = truth[:, columns["angular_velocity_in_body"].stop - 1].mean()
-    core.close()
     simulated = make_core(
         ID, 32, {"episode_length": 8.0, "task": {"commands": {"terms": held(COMMAND), "zero_probability": 0.0}}}
     )
@@ -134,8 +137,8 @@ def held(command):
     return {name: [value, value + 1e-9] for name, value in command.items()}
 
 
-def test_a_stop_by_the_gate_is_reported_and_logged(tmp_path):
-    core = robot_core(tmp_path)
+def test_a_stop_by_the_gate_is_reported_and_logged(robot_core):
+    core = robot_core()
     loop = loop_of(core)
     machine_of(core).inject("drop wheels after=1.5")
     result = drive(core, make_policy("pid", core.contract()))
@@ -146,24 +149,25 @@ def test_a_stop_by_the_gate_is_reported_and_logged(tmp_path):
     assert len(read_run(result.run).table) == result.ticks
     rules = [event["rule"] for event in read_events(result.run) if event["event"] == "intervention"]
     assert "silence" in rules
-    core.close()
 
 
-def test_a_full_disk_under_the_policys_log_is_a_stop_in_good_order(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
+def test_a_full_disk_under_the_policys_log_is_a_stop_in_good_order(robot_core, monkeypatch):
+    def full(table, values):
+        if "policy" in table.path.name:
+            raise OSError(28, "No space left on device")
+        add(table, values)
 
-    monkeypatch.setattr(RunLog, "policy", full)
-    core = robot_core(tmp_path)
+    add = CsvTable.add
+    monkeypatch.setattr(CsvTable, "add", full)
+    core = robot_core()
     result = drive(core, make_policy("pid", core.contract()))
     assert not result.well
     assert result.reason.startswith("computer: the log cannot be written: [Errno 28]")
     assert result.ticks <= 2
-    core.close()
 
 
-def test_a_failing_policy_leaves_no_torque(tmp_path):
-    core = robot_core(tmp_path)
+def test_a_failing_policy_leaves_no_torque(robot_core):
+    core = robot_core()
 
     class Broken(Wobble):
         def act(self, observations):
@@ -174,11 +178,10 @@ def test_a_failing_policy_leaves_no_torque(tmp_path):
     with pytest.raises(ZeroDivisionError):
         drive(core, Broken(core.observation.shape[1]))
     assert not any(servo["torque_enable"] for servo in machine_of(core).servos.values())
-    core.close()
 
 
-def test_actions_that_are_no_numbers_are_refused_and_torque_goes_off(tmp_path):
-    core = robot_core(tmp_path)
+def test_actions_that_are_no_numbers_are_refused_and_torque_goes_off(robot_core):
+    core = robot_core()
 
     class Nan(Wobble):
         def act(self, observations):
@@ -187,7 +190,6 @@ def test_actions_that_are_no_numbers_are_refused_and_torque_goes_off(tmp_path):
     with pytest.raises(InputError, match="expected a finite number"):
         drive(core, Nan(core.observation.shape[1]))
     assert not any(servo["torque_enable"] for servo in machine_of(core).servos.values())
-    core.close()
 
 
 def test_simulators_are_no_robots():
@@ -198,19 +200,22 @@ def test_simulators_are_no_robots():
 
 
 @pytest.mark.slow
-def test_a_policys_run_is_replayed_from_its_first_tick(tmp_path):
+def test_a_policys_run_is_replayed_from_its_first_tick(robot_core):
     """The robot drives off at once: the effort of that is no tension that it stood under before."""
-    core = robot_core(tmp_path)
+    core = robot_core()
     errors = replay(run_of(core)).errors
     assert max(error.segment_rms / error.noise for error in errors.values()) < 8.0  # else 140
     assert errors["gyro_z"].segment_rms < 2.0 * errors["gyro_z"].noise
 
 
 @pytest.mark.slow
-def test_an_emulated_robot_may_hide_something(tmp_path):
+def test_an_emulated_robot_may_hide_something(robot_core, tmp_path):
     """Effects act on what is emulated; environment and policy are not told."""
     runs = {}
-    for name, core in (("sound", robot_core(tmp_path / "sound", 2.0)), ("tired", tired_core(tmp_path / "tired"))):
+    for name, core in (
+        ("sound", robot_core(2.0, tmp_path / "sound")),
+        ("tired", robot_core(2.0, tmp_path / "tired", effects="tired_battery")),
+    ):
         runs[name] = run_of(core)
         assert not core.patch.effects
     assert runs["tired"]["volt"].mean() < runs["sound"]["volt"].mean() - 0.2
@@ -271,9 +276,8 @@ def test_the_results_say_which_steps_they_count_and_their_units(tmp_path, capsys
     assert "ticks" not in json.dumps(found)
 
 
-def test_the_live_status_shows_what_supervision_sees(tmp_path):
-    hardware = {"emulated": True, "log": tmp_path, "deadman": 5.0}
-    core = make_core(ID, 1, {"backend": "dynamixel", "hardware": hardware, "episode_length": 2.0})
+def test_the_live_status_shows_what_supervision_sees(robot_core):
+    core = robot_core(2.0, deadman=5.0)
     loop = loop_of(core)
     view, seen = RobotView(loop, core), []
 
@@ -287,7 +291,6 @@ def test_the_live_status_shows_what_supervision_sees(tmp_path):
     loop.operator.spare = look
     machine_of(core).inject("drop wheel_rf after=1.2 duration=0.1")
     drive(core, make_policy("pid", core.contract()), command=COMMAND)
-    core.close()
     status = loop.status
     assert status is not None
     for words in ("running  1.0 s", "linear_velocity_x +0.08", "wheel_rr", "limit 70%", "limit 68", "limit 10.2", "limit 0.7"):
@@ -299,19 +302,17 @@ def test_the_live_status_shows_what_supervision_sees(tmp_path):
     assert "acts on: nothing" in seen[-1]
 
 
-def test_command_line_says_why_it_stopped(tmp_path, capsys):
-    assert run_command("deploy", words(tmp_path, "--fault", "overload wheel_rr after=0.8")) == FAILED
-    assert "alert: wheel_rr has a hardware error" in capsys.readouterr().out
-
-
-def test_command_line_drives_no_leg_that_is_out_of_its_range(tmp_path, capsys):
-    assert run_command("deploy", words(tmp_path, "--fault", "encoder_jump leg_lf value=2")) == FAILED
-    assert "leg_lf     position: 3.57 rad" in capsys.readouterr().out
-
-
-def test_command_line_ends_in_an_overheated_servo_with_its_stop_reason(tmp_path, capsys):
-    assert run_command("deploy", words(tmp_path, "--fault", "overheat leg_lf value=500")) == FAILED
-    assert "temperature: leg_lf has" in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("overload wheel_rr after=0.8", "alert: wheel_rr has a hardware error"),
+        ("encoder_jump leg_lf value=2", "leg_lf     position: 3.57 rad"),  # out of its range: it is not driven
+        ("overheat leg_lf value=500", "temperature: leg_lf has"),
+    ],
+)
+def test_command_line_says_why_it_stopped(tmp_path, capsys, fault, reason):
+    assert run_command("deploy", words(tmp_path, "--fault", fault)) == FAILED
+    assert reason in capsys.readouterr().out
 
 
 def test_command_line_dry_run(tmp_path):

@@ -2,7 +2,6 @@
 
 import os
 import signal
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from pydantic import ValidationError
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
-from robot_rig import ROBOT, Phase, Rig, StoppedError, machine_of
+from robot_rig import ROBOT, Phase, Rig, StoppedError, imu_that_reads, machine_of
 
 from studies.paper.experiments import PROFILE
 from wlr_gym.cli import FAILED, INTERRUPTED, OK, record, replay, run_command
@@ -68,10 +67,6 @@ def unplug(loop):
     """Take the wheels' adapter away, and let that be noticed."""
     loop.clock.machine.inject("unplug wheels")
     loop.clock.wait_until(loop.clock.now() + 0.002)
-
-
-def lie_down(machine):
-    machine._imu = SimpleNamespace(counts=lambda accelerometer, gyro: ((0, 8192, 0), (0, 0, 0)))
 
 
 def emulated_plant(folder):
@@ -277,7 +272,11 @@ def test_keys_are_looked_at_before_torque_comes_on(rig, key, words):
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"), [(lambda rig: lie_down(rig.machine), "tilt: "), (lambda rig: rig.inject("unplug wheels"), "port: ")]
+    ("fault", "words"),
+    [
+        (lambda rig: setattr(rig.machine, "_imu", imu_that_reads(0, 8192, 0)), "tilt: "),
+        (lambda rig: rig.inject("unplug wheels"), "port: "),
+    ],
 )
 def test_a_fault_during_a_requested_stop_is_the_reason(rig, fault, words):
     rig = Rig(off_time=0.1, stop_time=2.0)  # time to fall
@@ -295,7 +294,7 @@ def test_a_fault_during_a_requested_stop_is_the_reason(rig, fault, words):
 def test_a_fault_in_the_tick_of_a_request_is_no_good_end(rig):
     """A request excuses itself, not a body that is down."""
     rig.loop.start()
-    lie_down(rig.machine)
+    rig.machine._imu = imu_that_reads(0, 8192, 0)
     asked = []
 
     def spare():

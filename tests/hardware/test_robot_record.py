@@ -38,6 +38,14 @@ def recorded(out, **options):
     return record.run(record.RecordOptions(out=out, **{"emulated": True, "seconds": 2.0, **options}))
 
 
+@pytest.fixture
+def machine(monkeypatch):
+    """The emulated robot that the command is connected to."""
+    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
+    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
+    return machine
+
+
 def test_a_robot_that_waits_for_an_operator_is_not_recorded(tmp_path):
     text = (data_directory("configs") / "hardware/nominal.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(text.replace("deadman: null", "deadman: 0.5"))
@@ -87,9 +95,7 @@ def test_the_seed_of_the_motions_decides_the_noise_too(tmp_path):
     assert noise_of(tmp_path / "second", "run_02", seed=3)[0] != first[0]
 
 
-def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
-    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
-    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
+def test_the_profile_reaches_the_servos(machine, tmp_path, monkeypatch):
     seen = []
     step = machine.step
 
@@ -104,10 +110,8 @@ def test_the_profile_reaches_the_servos(tmp_path, monkeypatch):
     assert not any(servo["torque_enable"] for servo in machine.servos.values())
 
 
-def test_a_robot_that_stops_leaves_its_log_and_code_1(tmp_path, monkeypatch, capsys):
-    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
+def test_a_robot_that_stops_leaves_its_log_and_code_1(machine, tmp_path, capsys):
     machine.inject("dead leg_rf after=2.5")
-    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
     assert recorded(tmp_path, excitation=("straight", "turns"), seconds=6.0) == 1
     (run,) = read_dataset(tmp_path).runs
     assert 20 < len(run.table) < 300
@@ -119,9 +123,7 @@ def test_a_robot_that_stops_leaves_its_log_and_code_1(tmp_path, monkeypatch, cap
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_an_interrupted_record_says_what_it_did_not_drive(tmp_path, monkeypatch, capsys, name):
-    machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
-    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
+def test_an_interrupted_record_says_what_it_did_not_drive(machine, tmp_path, monkeypatch, capsys, name):
     step, signals = machine.step, [getattr(signal, name)]
 
     def interrupted_step():

@@ -35,13 +35,6 @@ PARTIAL = "partial_"
 _TABLES = {"ramp": "ramp", "running": "run"}
 
 
-def row_columns(robot: Robot, has_camera: bool) -> list[str]:
-    """Return the columns of a run on the robot, in their order."""
-    given = ("t", *COMMANDS, *sensed_columns(robot), *LIVE_CAMERA)
-    left_out = () if has_camera else (*CAMERA, *LIVE_CAMERA)
-    return [name for name in COLUMNS if name in given and name not in left_out]
-
-
 def _append(file: io.FileIO, line: str) -> None:
     """Add a line, whole or not at all: a disk that fills up takes a part of it, and tells by the number alone."""
     data, done = (line + "\n").encode(), 0
@@ -66,8 +59,7 @@ class CsvTable:
     def __init__(self, path: Path, header: list[str]) -> None:
         self.path = path
         self.rows = 0
-        self._partial = path.with_name(PARTIAL + path.name)
-        self._file = self._partial.open("xb", buffering=0)
+        self._file = _partial(path).open("xb", buffering=0)
         _append(self._file, ",".join(header))
 
     def add(self, values: np.ndarray) -> None:
@@ -82,90 +74,175 @@ class CsvTable:
             return
         self._file.close()
         if self.rows == 0:
-            self._partial.unlink()
+            _partial(self.path).unlink()
         else:
-            self._partial.replace(self.path)
+            _partial(self.path).replace(self.path)
 
 
-class RunLog:
-    """The files of one start: ``ramp_01.csv`` (the way to the start pose), ``run_01.csv``, ``run_01.events.jsonl``.
+class RunRecorder:
+    """Logs the runs of a control loop. A log that cannot be written (a full disk) is noted, and prevents nothing.
 
-    Both tables are measured runs (docs/run_format.md); a ramp's name keeps it out of the data set. With a policy there is also
+    Files of a start: ``ramp_01.csv`` (the way to the start pose), ``run_01.csv``, ``run_01.events.jsonl``. Both tables are
+    measured runs (docs/run_format.md); a ramp's name keeps it out of the data set. With a policy there is also
     ``run_01.policy.csv``: per row of the run, what it was commanded and what it answered.
 
     Args:
-        folder: made if it is not there; runs are numbered on from those in it.
-        meta: written as ``meta.yaml``, with the robot.
+        folder: of the logs, made if it is not there; runs are numbered on from those in it. None = none is written.
+        meta: of the runs; written as ``meta.yaml``, with the robot.
         robot: whose runs they are.
-        has_camera: its poses are written, too.
+        link: to it: the clock of the runs, whether there is a camera, whose poses are logged then, the seed of an emulated one.
 
-    Raises:
-        InputError: the folder cannot be written to, or its ``meta.yaml`` says something else.
+    Attributes:
+        columns: of a row.
+        number: of the present or last start; 0 = none.
+        trouble: why the log cannot be written; empty = it can.
+        origin: what was known where the run began: wheel angles and the camera's age count from there; None = not begun.
+        stream: where rows of the run go besides; it has these columns.
     """
 
-    def __init__(self, folder: Path, meta: RunMeta, robot: Robot, has_camera: bool = False) -> None:
-        make_output_folder(folder)
-        write_meta(folder, note_robot(folder, robot, meta))
-        self.folder = folder
-        self.columns = row_columns(robot, has_camera)
+    def __init__(self, folder: Path | None, meta: RunMeta, robot: Robot, link: Link) -> None:
+        self.folder, self.meta, self._robot = folder, meta, robot
         self._sensed = sensed_columns(robot)
-        self._order = [("t", *COMMANDS, *self._sensed, *LIVE_CAMERA).index(name) for name in self.columns]
-        self.number: int = 1 + max((_number(path) for path in folder.iterdir()), default=0)
+        given = ("t", *COMMANDS, *self._sensed, *LIVE_CAMERA)
+        left_out = (*CAMERA, *LIVE_CAMERA) if link.camera is None else ()
+        self.columns: list[str] = [name for name in COLUMNS if name in given and name not in left_out]
+        self._order = [given.index(name) for name in self.columns]
+        self.number = 0
+        self.trouble = ""
+        self.stream: McapStream | None = None
+        self.origin: RobotStatus | None = None
+        self._clock, self._seed = link.clock, link.seed
+        self._checks: list[str] = []
         self._tables: dict[str, CsvTable] = {}
-        self._current = ""
-        self._last = -np.inf
-        self.events_path: Path = folder / f"{PARTIAL}{self.name('run')}.events.jsonl"
-        self._events = self.events_path.open("xb", buffering=0)
+        self._current = ""  # table that rows go to
+        self._last = -np.inf  # time of the last row
+        self._events: io.FileIO | None = None
+        self._rules: frozenset[str] = frozenset()
+        self._flow_trouble = ""
+        self._camera: str | None = None  # why it gave no pose in the last control step
 
-    def name(self, kind: str) -> str:
-        """Return the stem of a file, such as ``run_01``."""
-        return f"{kind}_{self.number:02d}"
+    def path(self, kind: str = "run", ending: str = ".csv") -> Path:
+        """Return where a file of the last start will be once it is finished, such as ``run_01.csv``."""
+        assert self.folder is not None
+        return self.folder / f"{kind}_{self.number:02d}{ending}"
 
     @property
-    def run(self) -> Path:
-        """Where the run will be once it is finished."""
-        return self.folder / f"{self.name('run')}.csv"
+    def run(self) -> Path | None:
+        """The last run, once it is finished; None where nothing was logged."""
+        return self.path() if self.number and self.path().is_file() else None
 
     @property
     def files(self) -> list[Path]:
-        """What is there of the tables and events, once they are finished."""
-        tables = [table.path for table in self._tables.values()]
-        return [path for path in (*tables, self.run.with_suffix(".events.jsonl")) if path.is_file()]
+        """The files of the last start, once they are finished; of one that ended before its run, the way to its start pose."""
+        paths = [*(table.path for table in self._tables.values()), self.path(ending=".events.jsonl")] if self.number else []
+        return [path for path in paths if path.is_file()]
 
-    def begin(self, kind: str) -> None:
-        """Write rows to ``ramp`` or ``run`` from here on."""
-        self._current = kind
-        if kind not in self._tables:
-            self._tables[kind] = CsvTable(self.folder / f"{self.name(kind)}.csv", self.columns)
+    def new_run(self, checks: list[str] | None = None) -> None:
+        """Begin a log with what the preflight found; None = it was not made again.
 
-    def row(self, time: float, sensors: Sensors, setpoints: np.ndarray) -> np.ndarray | None:
-        """Write what was read at ``time`` (s) and what was then asked for (NaN = motor off); return a run's row, else None."""
-        if not self._current or time <= self._last:  # the readings of an interrupted control step come twice
-            return None
-        self._last = time
-        values = np.concatenate([[time], setpoints, channels(sensors, 0, self._sensed), sensors.camera_age])[self._order]
-        self._tables[self._current].add(values)
-        return values if self._current == "run" else None
+        Raises:
+            InputError: the folder cannot be written to, or its ``meta.yaml`` says something else.
+        """
+        self._checks = self._checks if checks is None else checks
+        if self.folder is None:
+            return
+        self._finish()
+        make_output_folder(self.folder)
+        write_meta(self.folder, note_robot(self.folder, self._robot, self.meta))
+        self.trouble = ""
+        self.number = 1 + max((_number(path) for path in self.folder.iterdir()), default=0)
+        self._tables, self._current, self._last = {}, "", -np.inf
+        self._events = _partial(self.path(ending=".events.jsonl")).open("xb", buffering=0)
+        self._event(self._clock.now(), "checks", found=self._checks)
+        if self._seed is not None:
+            self._event(self._clock.now(), "emulated", noise_seed=self._seed)
+
+    def phase(self, name: str, reason: str) -> None:
+        """Note that a phase begins; ``ramp`` and ``running`` begin a table."""
+        with self._writing() as is_possible:
+            if is_possible:
+                self._event(self._clock.now(), "phase", phase=name, reason=reason)
+                if name in _TABLES:
+                    self._current = _TABLES[name]
+                    self._table(self._current, self.path(self._current), self.columns)
+
+    def step(self, status: RobotStatus, decision: Decision, setpoints: np.ndarray, count: int) -> None:
+        """Write the row of a control step, and an event for each rule that begins to act.
+
+        Args:
+            status: what was known of the robot.
+            decision: of the command limiter.
+            setpoints: (8,) as the servos' registers hold them, rad and rad/s; NaN = motor off.
+            count: readings of the joints so far.
+        """
+        with self._writing() as is_possible:
+            if not is_possible:
+                return
+            if self._current and status.time > self._last:  # the readings of an interrupted control step come twice
+                self._last = status.time
+                sensors = sensors_of(status, self.origin)
+                values = np.concatenate([[status.time], setpoints, channels(sensors, 0, self._sensed), sensors.camera_age])
+                row = values[self._order]
+                self._tables[self._current].add(row)
+                if self.stream is not None and self._current == "run":
+                    self.stream.add(float(row[0]), row[1:].tolist())
+            rules = {verdict.rule: {"level": verdict.level.name, "text": verdict.text} for verdict in decision.verdicts}
+            rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}
+            for rule in rules.keys() - self._rules:
+                self._event(status.time, "intervention", rule=rule, row=count, **rules[rule])
+            self._rules = frozenset(rules)
+            self._note_sensors(status, count)
+
+    def _note_sensors(self, status: RobotStatus, count: int) -> None:
+        """Write an event where camera or flow begin to be missing, for a reason, or odd, and where they are well again."""
+        if (camera := status.camera) is not None and camera.reason != self._camera:
+            self._camera = camera.reason
+            self._event(status.time, "camera", row=count, no_pose=self._camera or None, doubt=camera.doubt or None)
+        if (flow := status.flow) is not None and (flow.trouble or flow.is_new):
+            kind = (flow.trouble or flow.note).partition(":")[0]
+            if kind != self._flow_trouble:
+                self._event(status.time, "flow", row=count, trouble=flow.trouble, note=flow.note)
+                self._flow_trouble = kind
 
     def policy(self, names: list[str], values: np.ndarray) -> None:
         """Write what the policy was commanded and answered for the row that comes next."""
-        if "policy" not in self._tables:
-            self._tables["policy"] = CsvTable(self.folder / f"{self.name('run')}.policy.csv", names)
-        self._tables["policy"].add(values)
+        with self._writing() as is_possible:
+            if is_possible:
+                self._table("policy", self.path(ending=".policy.csv"), names).add(values)
 
-    def event(self, time: float, kind: str, **content: Any) -> None:
+    def end(self, reason: str, statistics: dict[str, Any]) -> None:
+        """Write how the run ended, and give the files their names."""
+        with self._writing():
+            self._event(self._clock.now(), "end", reason=reason, statistics=statistics)
+        with self._writing():
+            self._finish()
+
+    def _table(self, kind: str, path: Path, header: list[str]) -> CsvTable:
+        """Return a table of this start, begun where it is not there yet."""
+        if kind not in self._tables:
+            self._tables[kind] = CsvTable(path, header)
+        return self._tables[kind]
+
+    def _event(self, time: float, kind: str, **content: Any) -> None:
         """Write what happened at ``time`` (s)."""
-        if not self._events.closed:
-            line = {"t": round(time, 6), "event": kind, **content}
-            _append(self._events, json.dumps(line))
+        if self._events is not None and not self._events.closed:
+            _append(self._events, json.dumps({"t": round(time, 6), "event": kind, **content}))
 
-    def finish(self) -> None:
-        """Close the files and give them their names."""
+    def _finish(self) -> None:
         for table in self._tables.values():
             table.finish()
-        if not self._events.closed:
+        if self._events is not None and not self._events.closed:
             self._events.close()
-            self.events_path.replace(self.folder / f"{self.name('run')}.events.jsonl")
+            events = self.path(ending=".events.jsonl")
+            _partial(events).replace(events)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[bool]:
+        """Tell whether there is a log that takes more; note why it takes none from here on."""
+        try:
+            yield self.number > 0 and not self.trouble
+        except OSError as error:
+            self.trouble = self.trouble or f"the log cannot be written: {error}"
 
 
 def read_events(run: Path) -> list[dict[str, Any]]:
@@ -179,129 +256,6 @@ def read_events(run: Path) -> list[dict[str, Any]]:
         return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     except (OSError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {error}") from None
-
-
-class RunRecorder:
-    """Logs the runs of a control loop. A log that cannot be written (a full disk) is noted, and prevents nothing.
-
-    Args:
-        folder: of the logs; None = none is written.
-        meta: of the runs.
-        robot: whose runs they are.
-        link: to it: the clock of the runs, whether there is a camera, whose poses are logged then, the seed of an emulated one.
-
-    Attributes:
-        columns: of a row.
-        log: of the present or last run.
-        trouble: why the log cannot be written; empty = it can.
-        origin: what was known where the run began: wheel angles and the camera's age count from there; None = not begun.
-        stream: where rows of the run go besides; it has these columns.
-    """
-
-    def __init__(self, folder: Path | None, meta: RunMeta, robot: Robot, link: Link) -> None:
-        self.folder, self.meta, self._robot, self._has_camera = folder, meta, robot, link.camera is not None
-        self.columns = row_columns(robot, self._has_camera)
-        self.log: RunLog | None = None
-        self.trouble = ""
-        self.stream: McapStream | None = None
-        self.origin: RobotStatus | None = None
-        self._clock, self._seed = link.clock, link.seed
-        self._checks: list[str] = []
-        self._rules: frozenset[str] = frozenset()
-        self._flow_trouble = ""
-        self._camera: str | None = None  # why it gave no pose in the last control step
-
-    @property
-    def run(self) -> Path | None:
-        """The last run, once it is finished; None where nothing was logged."""
-        return self.log.run if self.log is not None and self.log.run.is_file() else None
-
-    @property
-    def files(self) -> list[Path]:
-        """The files of the last start, once they are finished; of one that ended before its run, the way to its start pose."""
-        return [] if self.log is None else self.log.files
-
-    def new_run(self, checks: list[str] | None = None) -> None:
-        """Begin a log with what the preflight found; None = it was not made again."""
-        self._checks = self._checks if checks is None else checks
-        if self.folder is None:
-            return
-        if self.log is not None:
-            self.log.finish()
-        self.trouble = ""
-        self.log = RunLog(self.folder, self.meta, self._robot, self._has_camera)
-        self.log.event(self._clock.now(), "checks", found=self._checks)
-        if self._seed is not None:
-            self.log.event(self._clock.now(), "emulated", noise_seed=self._seed)
-
-    def phase(self, name: str, reason: str) -> None:
-        """Note that a phase begins; ``ramp`` and ``running`` begin a table."""
-        if self.log is None or self.trouble:
-            return
-        with self._noting_trouble():
-            self.log.event(self._clock.now(), "phase", phase=name, reason=reason)
-            if name in _TABLES:
-                self.log.begin(_TABLES[name])
-
-    def step(self, status: RobotStatus, decision: Decision, setpoints: np.ndarray, count: int) -> None:
-        """Write the row of a control step, and an event for each rule that begins to act.
-
-        Args:
-            status: what was known of the robot.
-            decision: of the command limiter.
-            setpoints: (8,) as the servos' registers hold them, rad and rad/s; NaN = motor off.
-            count: readings of the joints so far.
-        """
-        if self.log is None or self.trouble:
-            return
-        with self._noting_trouble():
-            row = self.log.row(status.time, sensors_of(status, self.origin), setpoints)
-            if self.stream is not None and row is not None:
-                self.stream.add(float(row[0]), row[1:].tolist())
-            rules = {verdict.rule: {"level": verdict.level.name, "text": verdict.text} for verdict in decision.verdicts}
-            rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}
-            for rule in rules.keys() - self._rules:
-                self.log.event(status.time, "intervention", rule=rule, row=count, **rules[rule])
-            self._rules = frozenset(rules)
-            self._note_camera(self.log, status, count)
-            self._note_flow(self.log, status, count)
-
-    def _note_camera(self, log: RunLog, status: RobotStatus, count: int) -> None:
-        """Write an event where the camera begins to give no pose, for a reason, and where it gives one again."""
-        if status.camera is not None and status.camera.reason != self._camera:
-            self._camera = status.camera.reason
-            log.event(status.time, "camera", row=count, no_pose=self._camera or None, doubt=status.camera.doubt or None)
-
-    def _note_flow(self, log: RunLog, status: RobotStatus, count: int) -> None:
-        """Write an event where optical flow begins to be missing, for a reason, or is odd, and where it is well again."""
-        reading = status.flow
-        if reading is None or not (reading.trouble or reading.is_new):
-            return
-        kind = (reading.trouble or reading.note).partition(":")[0]
-        if kind != self._flow_trouble:
-            log.event(status.time, "flow", row=count, trouble=reading.trouble, note=reading.note)
-            self._flow_trouble = kind
-
-    def policy(self, names: list[str], values: np.ndarray) -> None:
-        """Write what the policy was commanded and answered for the row that comes next."""
-        if self.log is not None and not self.trouble:
-            with self._noting_trouble():
-                self.log.policy(names, values)
-
-    def end(self, reason: str, statistics: dict[str, Any]) -> None:
-        """Write how the run ended, and finish the files."""
-        if self.log is not None:
-            with self._noting_trouble():
-                self.log.event(self._clock.now(), "end", reason=reason, statistics=statistics)
-            with self._noting_trouble():
-                self.log.finish()
-
-    @contextlib.contextmanager
-    def _noting_trouble(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self.trouble = self.trouble or f"the log cannot be written: {error}"
 
 
 def sensors_of(status: RobotStatus, origin: RobotStatus | None) -> Sensors:
@@ -330,3 +284,7 @@ def sensors_of(status: RobotStatus, origin: RobotStatus | None) -> Sensors:
 def _number(path: Path) -> int:
     found = re.match(rf"(?:{PARTIAL})?(?:run|ramp)_(\d+)\.", path.name)
     return int(found.group(1)) if found else 0
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(PARTIAL + path.name)

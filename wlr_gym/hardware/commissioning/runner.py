@@ -280,34 +280,24 @@ def run_test(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
     """Make a test and switch every motor off, whatever happens; signals end it in good order.
 
     Raises:
-        TroubleError, NoAnswerError, RefusedError, ConnectionError, InputError: it could not be made, or (PartlyError) in part.
+        TroubleError, NoAnswerError, RefusedError, ConnectionError, InputError: it could not be made, or (PartlyError) in part;
+            TrippedError where a watchdog stopped a motor meanwhile, whatever else that led to.
         QuitError: somebody asked for a stop.
         PowerError: torque is not confirmed off.
     """
     stand.begin()
     with stop_on_signals(stand.operator):
         try:
-            readings = measured(test, stand, person)
-        finally:
-            left = stand.off()
-            if left:
-                raise PowerError(f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}")
-    return readings
-
-
-def measured(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
-    """Return what a test measures.
-
-    Raises:
-        TrippedError: a watchdog stopped a motor meanwhile, whatever else that led to: a refused setpoint, a wheel that stands.
-    """
-    try:
-        readings = test.measure(stand, person)
-    except (TroubleError, NoAnswerError, RefusedError):
-        with contextlib.suppress(ConnectionError):
+            try:
+                readings = test.measure(stand, person)
+            except (TroubleError, NoAnswerError, RefusedError):
+                with contextlib.suppress(ConnectionError):
+                    stand.check_watchdogs()  # a refused setpoint, a wheel that stands: it may be why
+                raise
             stand.check_watchdogs()
-        raise
-    stand.check_watchdogs()
+        finally:
+            if left := stand.off():
+                raise PowerError(f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}")
     return readings
 
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.checks import check_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import find_sign
 from wlr_gym.hardware.commissioning.stand import LARGEST_LEAN, LOW_PWM, PERIOD, Person, SlippedError, Stand, TroubleError
 from wlr_gym.hardware.dynamixel.bus import Block
 from wlr_gym.hardware.dynamixel.protocol import RefusedError
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS
+
+Measure = Callable[[Stand, Person], "list[Reading]"]
 
 
 @dataclass(frozen=True)
@@ -38,8 +42,7 @@ class StandQuantity:
     relative: float = 0.0
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """A measured value.
 
     Attributes:
@@ -80,7 +83,37 @@ class StandTest:
     asks: str
     moves: str
     quantities: tuple[StandQuantity, ...]
-    measure: Callable[[Stand, Person], list[Reading]]
+    measure: Measure
+
+
+#: Name -> test, in the order they are made: what cannot move first, hands first.
+TESTS: dict[str, StandTest] = {}
+
+
+def stand_test(name: str, title: str, asks: str, moves: str, *quantities: StandQuantity) -> Callable[[Measure], Measure]:
+    """Make a function the measurement of a test in :data:`TESTS`; the arguments are those of :class:`StandTest`."""
+
+    def add(measure: Measure) -> Measure:
+        TESTS[name] = StandTest(name, title, asks, moves, quantities, measure)
+        return measure
+
+    return add
+
+
+def choose(names: Sequence[str]) -> list[StandTest]:
+    """Return the named tests in the order they are made; no name = all.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    for name in names:
+        check_name("test", name, TESTS)
+    return [test for test in TESTS.values() if not names or test.name in names]
+
+
+def _each(quantity: str, places: Sequence[str], values: Iterable[float]) -> list[Reading]:
+    """Return a reading per place."""
+    return [Reading(quantity, place, float(value)) for place, value in zip(places, values, strict=True)]
 
 
 # ---- the line: adapters, and a servo that does not answer ----
@@ -96,6 +129,15 @@ _TIMER = "Set the adapter's latency timer to 1 ms (docs/robot.md), use a port wi
 _CHAIN = "The emulator has this otherwise: report it. Reads that miss a servo cost another time than on the emulator."
 
 
+@stand_test(
+    "latency",
+    "Latency and jitter of the adapters",
+    "",
+    "Nothing moves.",
+    StandQuantity("adapter_latency", "s", "median time of a ping beyond its bytes' time on the wire", 0.0015, _TIMER),
+    StandQuantity("adapter_jitter", "s", "99 of 100 pings take at most so much longer than the median", 0.002, _TIMER),
+    StandQuantity("lost_answers", "-", "part of the pings without an answer", 0.005, "Check cable, ground and termination."),
+)
 def _measure_latency(stand: Stand, person: Person) -> list[Reading]:
     found = []
     for name, bus in stand.hardware.buses.items():
@@ -117,22 +159,23 @@ def _measure_latency(stand: Stand, person: Person) -> list[Reading]:
     return found
 
 
-LATENCY = StandTest(
-    "latency",
-    "Latency and jitter of the adapters",
+@stand_test(
+    "silent_servo",
+    "A read of several servos, one of which does not exist",
     "",
     "Nothing moves.",
-    (
-        StandQuantity("adapter_latency", "s", "median time of a ping beyond its bytes' time on the wire", 0.0015, _TIMER),
-        StandQuantity("adapter_jitter", "s", "99 of 100 pings take at most so much longer than the median", 0.002, _TIMER),
+    *(
         StandQuantity(
-            "lost_answers", "-", "part of the pings without an answer", 0.005, "Check cable, ground and termination."
-        ),
+            f"answers_{place}_{kind}",
+            "-",
+            f"part of the servos named {place} the silent one that answer, {kind} read",
+            0.1,
+            _CHAIN,
+        )
+        for kind in ("ordinary", "fast")
+        for place in ("before", "behind")
     ),
-    _measure_latency,
 )
-
-
 def _measure_silent_servo(stand: Stand, person: Person) -> list[Reading]:
     found = []
     for name, group in stand.servos.groups.items():
@@ -154,26 +197,6 @@ def _measure_silent_servo(stand: Stand, person: Person) -> list[Reading]:
     return found
 
 
-SILENT_SERVO = StandTest(
-    "silent_servo",
-    "A read of several servos, one of which does not exist",
-    "",
-    "Nothing moves.",
-    tuple(
-        StandQuantity(
-            f"answers_{place}_{kind}",
-            "-",
-            f"part of the servos named {place} the silent one that answer, {kind} read",
-            0.1,
-            _CHAIN,
-        )
-        for kind in ("ordinary", "fast")
-        for place in ("before", "behind")
-    ),
-    _measure_silent_servo,
-)
-
-
 # ---- moved by hand, motors off: signs, zeros, the IMU's axes ----
 
 
@@ -189,6 +212,14 @@ _CALIBRATE = "Run wlr calibrate joints; if the sign is wrong, the leg would run 
 _MOUNTING = "Run wlr calibrate imu --mounting (and --poses 6 for the scale); imu.gyro_range must be the sensor's."
 
 
+@stand_test(
+    "joints",
+    "Sign and zero of every joint",
+    "Each joint is to be turned by hand, one after the other; legs then held straight down.",
+    "No motor comes on.",
+    StandQuantity("joint_sign", "-", "1: the joint turns the way the hardware file says", 0.1, _CALIBRATE),
+    StandQuantity("joint_zero", "rad", "reading of a leg that is held straight down, less pi/2", 0.04, _CALIBRATE),
+)
 def _measure_joints(stand: Stand, person: Person) -> list[Reading]:
     found = []
     for joint in JOINTS:
@@ -220,19 +251,24 @@ def _counts(stand: Stand) -> list[float]:
     return [float(counts[joint]) for joint in JOINTS]
 
 
-SIGNS = StandTest(
-    "joints",
-    "Sign and zero of every joint",
-    "Each joint is to be turned by hand, one after the other; legs then held straight down.",
+@stand_test(
+    "imu",
+    "Axes of the IMU",
+    "The robot with its stand is to be tilted to the right, nose down, and turned to the left.",
     "No motor comes on.",
-    (
-        StandQuantity("joint_sign", "-", "1: the joint turns the way the hardware file says", 0.1, _CALIBRATE),
-        StandQuantity("joint_zero", "rad", "reading of a leg that is held straight down, less pi/2", 0.04, _CALIBRATE),
+    StandQuantity("gravity", "m/s2", "length of the specific force at rest", 0.5, _MOUNTING),
+    StandQuantity("level_tilt", "rad", "angle of the level body to the vertical by the accelerometer", 0.06, _MOUNTING),
+    *(
+        StandQuantity(
+            f"gyro_{name}", "-", f"part of the turn that the gyroscope saw about {axis}, with its sign", 0.1, _MOUNTING
+        )
+        for name, axis in (("roll", "x"), ("pitch", "y"), ("yaw", "z"))
     ),
-    _measure_joints,
+    *(
+        StandQuantity(f"tilt_{name}", "-", "tilt by the accelerometer over the turn by the gyroscope", 0.2, _MOUNTING)
+        for name in ("roll", "pitch")
+    ),
 )
-
-
 def _measure_imu(stand: Stand, person: Person) -> list[Reading]:
     level = _at_rest(stand)
     found = [
@@ -274,29 +310,6 @@ def _tilt(name: str, force: np.ndarray, level: np.ndarray) -> float:
     return angles[0] - angles[1]
 
 
-IMU_AXES = StandTest(
-    "imu",
-    "Axes of the IMU",
-    "The robot with its stand is to be tilted to the right, nose down, and turned to the left.",
-    "No motor comes on.",
-    (
-        StandQuantity("gravity", "m/s2", "length of the specific force at rest", 0.5, _MOUNTING),
-        StandQuantity("level_tilt", "rad", "angle of the level body to the vertical by the accelerometer", 0.06, _MOUNTING),
-        *(
-            StandQuantity(
-                f"gyro_{name}", "-", f"part of the turn that the gyroscope saw about {axis}, with its sign", 0.1, _MOUNTING
-            )
-            for name, axis in (("roll", "x"), ("pitch", "y"), ("yaw", "z"))
-        ),
-        *(
-            StandQuantity(f"tilt_{name}", "-", "tilt by the accelerometer over the turn by the gyroscope", 0.2, _MOUNTING)
-            for name in ("roll", "pitch")
-        ),
-    ),
-    _measure_imu,
-)
-
-
 # ---- what servos do with setpoints: when the line falls silent, when torque comes on ----
 
 
@@ -310,52 +323,16 @@ _LEG_WEAK = "If the test load or stall differs too, the leg is weak or something
 _GOAL = "The start-up order (setpoint first, then torque) is right for neither case alone: report it before driving."
 
 
-def _measure_watchdog(stand: Stand, person: Person) -> list[Reading]:
-    stand.prepare(JOINTS)
-    stand.switch_on(JOINTS)
-    stand.spin(dict.fromkeys(WHEELS, _SPEED))
-    before = stand.run(_STEADY)[-1]
-    speed = np.mean([readings.velocity for readings in stand.run(0.2)], axis=0)[WHEEL_SLICE]
-    if (np.abs(speed) < 0.5 * _SPEED).any():
-        raise TroubleError(f"wheels turn at {np.round(speed, 2).tolist()} rad/s, asked for {_SPEED:g}")
-    last = stand.fall_silent(_SILENCE)
-    after = stand.step()
-    rolled = (after.position - last.position)[WHEEL_SLICE]
-    found = [Reading("watchdog_stop_time", wheel, float(rolled[k] / speed[k])) for k, wheel in enumerate(WHEELS)]
-    moved = np.abs(after.position - before.position)[LEG_SLICE]
-    found += [Reading("watchdog_leg_move", leg, float(moved[k])) for k, leg in enumerate(LEGS)]
-    for joint in JOINTS:
-        found.append(Reading("watchdog_latched", joint, float(stand.servos.get(joint, "bus_watchdog") < 0)))
-        found.append(Reading("watchdog_holds_torque", joint, float(stand.servos.get(joint, "torque_enable"))))
-    return found + [Reading("watchdog_refuses", wheel, float(_refuses(stand, wheel))) for wheel in WHEELS]
-
-
-def _refuses(stand: Stand, wheel: str) -> bool:
-    try:
-        stand.spin({wheel: 0.0})
-    except RefusedError:
-        return True
-    return False
-
-
-WATCHDOG = StandTest(
-    "watchdog",
-    "Bus Watchdog",
-    "",
-    f"All motors come on; wheels turn at {_SPEED:g} rad/s, then nothing is sent for a second.",
-    (
-        StandQuantity(
-            "watchdog_stop_time", "s", "way of a wheel after the last packet over its speed", 0.08, f"Too long: {_STOP}", 0.1
-        ),
-        StandQuantity("watchdog_leg_move", "rad", "way of a leg meanwhile", 0.02, "Is its Homing Offset 0 (wlr doctor)?"),
-        StandQuantity("watchdog_latched", "-", "1: the watchdog register says that it stopped the servo", 0.1, _STOP),
-        StandQuantity("watchdog_holds_torque", "-", "1: torque stays on", 0.1, "The emulator has this otherwise: report it."),
-        StandQuantity("watchdog_refuses", "-", "1: setpoints are refused until it is cleared", 0.1, _STOP),
-    ),
-    _measure_watchdog,
+@stand_test(
+    "torque_on",
+    "What torque-on does to the setpoint",
+    "Legs straight down. One leg is to be turned by hand in between, motors off.",
+    f"Wheels turn at {_SLOW:g} rad/s, and each leg moves by {_LEAN:g} rad.",
+    StandQuantity("wheel_follows_given", "-", "speed over the setpoint written before torque came on", 0.15, _GOAL),
+    StandQuantity("wheel_follows_kept", "-", "speed over the setpoint left from before torque went off", 0.15, _GOAL),
+    StandQuantity("leg_follows_given", "-", "way over the way asked for before torque came on", 0.2, _LEG_WEAK + _GOAL),
+    StandQuantity("leg_follows_kept", "-", "way over the way back to the setpoint from before torque went off", 0.2, _GOAL),
 )
-
-
 def _measure_torque_on(stand: Stand, person: Person) -> list[Reading]:
     found = _wheels_torque_on(stand) + _legs_torque_on(stand)
     person.turn(LEGS[0], -_LEAN)
@@ -379,8 +356,7 @@ def _wheels_torque_on(stand: Stand) -> list[Reading]:
     stand.switch_on(WHEELS)
     kept = _speed(stand)
     stand.switch_off(WHEELS)
-    found = [Reading("wheel_follows_given", wheel, float(given[k] / _SLOW)) for k, wheel in enumerate(WHEELS)]
-    return found + [Reading("wheel_follows_kept", wheel, float(kept[k] / _SLOW)) for k, wheel in enumerate(WHEELS)]
+    return _each("wheel_follows_given", WHEELS, given / _SLOW) + _each("wheel_follows_kept", WHEELS, kept / _SLOW)
 
 
 def _speed(stand: Stand) -> np.ndarray:
@@ -402,19 +378,44 @@ def _legs_torque_on(stand: Stand) -> list[Reading]:
     return found
 
 
-TORQUE_ON = StandTest(
-    "torque_on",
-    "What torque-on does to the setpoint",
-    "Legs straight down. One leg is to be turned by hand in between, motors off.",
-    f"Wheels turn at {_SLOW:g} rad/s, and each leg moves by {_LEAN:g} rad.",
-    (
-        StandQuantity("wheel_follows_given", "-", "speed over the setpoint written before torque came on", 0.15, _GOAL),
-        StandQuantity("wheel_follows_kept", "-", "speed over the setpoint left from before torque went off", 0.15, _GOAL),
-        StandQuantity("leg_follows_given", "-", "way over the way asked for before torque came on", 0.2, _LEG_WEAK + _GOAL),
-        StandQuantity("leg_follows_kept", "-", "way over the way back to the setpoint from before torque went off", 0.2, _GOAL),
+@stand_test(
+    "watchdog",
+    "Bus Watchdog",
+    "",
+    f"All motors come on; wheels turn at {_SPEED:g} rad/s, then nothing is sent for a second.",
+    StandQuantity(
+        "watchdog_stop_time", "s", "way of a wheel after the last packet over its speed", 0.08, f"Too long: {_STOP}", 0.1
     ),
-    _measure_torque_on,
+    StandQuantity("watchdog_leg_move", "rad", "way of a leg meanwhile", 0.02, "Is its Homing Offset 0 (wlr doctor)?"),
+    StandQuantity("watchdog_latched", "-", "1: the watchdog register says that it stopped the servo", 0.1, _STOP),
+    StandQuantity("watchdog_holds_torque", "-", "1: torque stays on", 0.1, "The emulator has this otherwise: report it."),
+    StandQuantity("watchdog_refuses", "-", "1: setpoints are refused until it is cleared", 0.1, _STOP),
 )
+def _measure_watchdog(stand: Stand, person: Person) -> list[Reading]:
+    stand.prepare(JOINTS)
+    stand.switch_on(JOINTS)
+    stand.spin(dict.fromkeys(WHEELS, _SPEED))
+    before = stand.run(_STEADY)[-1]
+    speed = np.mean([readings.velocity for readings in stand.run(0.2)], axis=0)[WHEEL_SLICE]
+    if (np.abs(speed) < 0.5 * _SPEED).any():
+        raise TroubleError(f"wheels turn at {np.round(speed, 2).tolist()} rad/s, asked for {_SPEED:g}")
+    last = stand.fall_silent(_SILENCE)
+    after = stand.step()
+    rolled = (after.position - last.position)[WHEEL_SLICE]
+    found = _each("watchdog_stop_time", WHEELS, rolled / speed)
+    found += _each("watchdog_leg_move", LEGS, np.abs(after.position - before.position)[LEG_SLICE])
+    for joint in JOINTS:
+        found.append(Reading("watchdog_latched", joint, float(stand.servos.get(joint, "bus_watchdog") < 0)))
+        found.append(Reading("watchdog_holds_torque", joint, float(stand.servos.get(joint, "torque_enable"))))
+    return found + _each("watchdog_refuses", WHEELS, [_refuses(stand, wheel) for wheel in WHEELS])
+
+
+def _refuses(stand: Stand, wheel: str) -> bool:
+    try:
+        stand.spin({wheel: 0.0})
+    except RefusedError:
+        return True
+    return False
 
 
 # ---- the wheels' velocity loop and load; stall of all joints ----
@@ -439,6 +440,15 @@ _LAW = "Present Load follows something else than on the emulator: efforts of the
 _STALL = "Its motor is weaker or stronger than the file's: check supply and plugs; else exchange the servo, or measure again."
 
 
+@stand_test(
+    "velocity_step",
+    "Step response of the wheels' velocity loop",
+    "",
+    f"Wheels turn at {_STEP:g} rad/s for {_STEP_TIME:g} s.",
+    StandQuantity("velocity_loop_time", "s", "time constant of the way to a new speed", 0.0, _LOOP, 0.1),
+    StandQuantity("integral_cycle", "s", "control cycle that this means, by the robot file's gains", 0.0, _LOOP, 0.1),
+    StandQuantity("velocity_error", "-", "part of the speed that is missing in the end", 0.03, _LOOP),
+)
 def _measure_velocity_step(stand: Stand, person: Person) -> list[Reading]:
     stand.prepare(WHEELS)
     stand.switch_on(WHEELS)
@@ -484,20 +494,19 @@ def _integral_cycle(stand: Stand, time: float) -> float:
     return 1e-3 * time * servo.wheel.kp / (line + servo.wheel.kd)
 
 
-VELOCITY_STEP = StandTest(
-    "velocity_step",
-    "Step response of the wheels' velocity loop",
-    "",
-    f"Wheels turn at {_STEP:g} rad/s for {_STEP_TIME:g} s.",
-    (
-        StandQuantity("velocity_loop_time", "s", "time constant of the way to a new speed", 0.0, _LOOP, 0.1),
-        StandQuantity("integral_cycle", "s", "control cycle that this means, by the robot file's gains", 0.0, _LOOP, 0.1),
-        StandQuantity("velocity_error", "-", "part of the speed that is missing in the end", 0.03, _LOOP),
+@stand_test(
+    "load",
+    "Load of free wheels and legs, and what Present Load follows",
+    "Legs straight down, then hands off.",
+    f"Wheels turn at {', '.join(f'{speed:g}' for speed in _SPEEDS)} rad/s, each for {_EVEN:g} s; then each leg moves by "
+    f"{LARGEST_LEAN:g} rad.",
+    StandQuantity(
+        "load_per_pwm", "-", "load over PWM from speed to speed, wheel free: 0 = it is torque, 1 = it is PWM", 0.3, _LAW
     ),
-    _measure_velocity_step,
+    StandQuantity(
+        "running_load", "-", "load of the free wheel, or of the leg on its way, part of stall torque", 0.01, _FRICTION
+    ),
 )
-
-
 def _measure_load(stand: Stand, person: Person) -> list[Reading]:
     stand.prepare(WHEELS)
     stand.switch_on(WHEELS)
@@ -546,24 +555,15 @@ def _require_speed(asked: float, reached: NDArray[np.float64]) -> None:
         raise TroubleError(f"{', '.join(slow)} rad/s after {_EVEN:g} s, expected {asked:g} within {_OFF_SPEED:.0%}: {_WEAK}")
 
 
-LOAD = StandTest(
-    "load",
-    "Load of free wheels and legs, and what Present Load follows",
-    "Legs straight down, then hands off.",
-    f"Wheels turn at {', '.join(f'{speed:g}' for speed in _SPEEDS)} rad/s, each for {_EVEN:g} s; then each leg moves by "
-    f"{LARGEST_LEAN:g} rad.",
-    (
-        StandQuantity(
-            "load_per_pwm", "-", "load over PWM from speed to speed, wheel free: 0 = it is torque, 1 = it is PWM", 0.3, _LAW
-        ),
-        StandQuantity(
-            "running_load", "-", "load of the free wheel, or of the leg on its way, part of stall torque", 0.01, _FRICTION
-        ),
-    ),
-    _measure_load,
+@stand_test(
+    "stall",
+    "Stall of held wheels and legs",
+    "Each wheel, then each leg's end, is to be held by hand, one after the other. Legs straight down.",
+    f"The held wheel or leg pulls for {_HELD_TIME:g} s with {LOW_PWM:.0%} of the supply.",
+    StandQuantity("stall_pwm", "-", "PWM at the held joint over the Goal PWM", 0.05, "The servo does not keep to Goal PWM."),
+    StandQuantity("stall_load", "-", "load of the held joint over PWM and supply", 0.05, _STALL, 0.1),
+    StandQuantity("stall_current", "A", "current at full voltage, from the supply's display", 0.1, _STALL, 0.25),
 )
-
-
 def _measure_stall(stand: Stand, person: Person) -> list[Reading]:
     found: list[Reading] = []
     slipped = []
@@ -616,39 +616,3 @@ def _pull(stand: Stand, person: Person, joint: str, trouble: str = "") -> tuple[
     load = float(np.mean([stand.load(readings.effort)[k] for readings in rows]))
     found = [Reading("stall_pwm", joint, pwm / asked), Reading("stall_load", joint, load / (pwm * supply))]
     return found, pwm * pwm * supply
-
-
-STALL = StandTest(
-    "stall",
-    "Stall of held wheels and legs",
-    "Each wheel, then each leg's end, is to be held by hand, one after the other. Legs straight down.",
-    f"The held wheel or leg pulls for {_HELD_TIME:g} s with {LOW_PWM:.0%} of the supply.",
-    (
-        StandQuantity(
-            "stall_pwm", "-", "PWM at the held joint over the Goal PWM", 0.05, "The servo does not keep to Goal PWM."
-        ),
-        StandQuantity("stall_load", "-", "load of the held joint over PWM and supply", 0.05, _STALL, 0.1),
-        StandQuantity("stall_current", "A", "current at full voltage, from the supply's display", 0.1, _STALL, 0.25),
-    ),
-    _measure_stall,
-)
-
-
-# ---- all of them: what cannot move first, hands first ----
-
-
-_ORDER = (LATENCY, SILENT_SERVO, SIGNS, IMU_AXES, TORQUE_ON, WATCHDOG, VELOCITY_STEP, LOAD, STALL)
-#: Name -> test.
-TESTS: dict[str, StandTest] = {test.name: test for test in _ORDER}
-
-
-def choose(names: Sequence[str]) -> list[StandTest]:
-    """Return the named tests in the order they are made; no name = all.
-
-    Raises:
-        InputError: an unknown name.
-    """
-    for name in names:
-        if name not in TESTS:
-            raise unknown_name("test", name, TESTS)
-    return [test for test in TESTS.values() if not names or test.name in names]
