@@ -63,7 +63,7 @@ def stand(emulated):
 @pytest.fixture
 def beside(emulated, monkeypatch):
     """An emulated robot that the command takes for the real one."""
-    monkeypatch.setattr(RobotOption, "link_to", lambda self, robot, hardware, patch=None: emulated_link(emulated.machine))
+    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(emulated.machine))
     return emulated
 
 

@@ -70,7 +70,7 @@ def test_another_robot_shows(run, tmp_path):
 def test_a_robot_that_stops_ends_it(run, tmp_path, monkeypatch, capsys):
     machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
     machine.inject("dead wheel_lf after=2.5")
-    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
+    monkeypatch.setattr("wlr_gym.hardware.plant.link_of", lambda *args: emulated_link(machine))
     options = replay.ReplayOptions(run.path, tmp_path, backend="dynamixel", plots=False, emulated=True)
     assert replay.run(options) == 1
     assert "stopped: " in capsys.readouterr().out

@@ -25,11 +25,13 @@ from wlr_gym.robot import JOINTS, load_robot
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
 
+from wlr_gym.hardware import plant
 from wlr_gym.hardware.deployment import DriveResult
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
 from wlr_gym.hardware.log import read_events
+from wlr_gym.hardware.plant import link_of
 
 ROBOT = load_robot("emanual")
 
@@ -42,7 +44,7 @@ def recorded(out, **options):
 def machine(monkeypatch):
     """The emulated robot that the command is connected to."""
     machine = Machine(ROBOT, RobotOption().load_hardware(), MachineOptions(timing=NO_TIME))
-    monkeypatch.setattr(RobotOption, "link_to", lambda *args: emulated_link(machine))
+    monkeypatch.setattr("wlr_gym.hardware.plant.link_of", lambda *args: emulated_link(machine))
     return machine
 
 
@@ -294,11 +296,8 @@ class Operator:
 @pytest.fixture
 def emulated_as_real(monkeypatch):
     """What is connected is an emulated robot that the commands take for a real one."""
-    link_to = RobotOption.link_to
     monkeypatch.setattr("wlr_gym.hardware.safety.preflight.require_ports", lambda hardware: None)
-    monkeypatch.setattr(
-        RobotOption, "link_to", lambda options, *given: link_to(replace(options, emulated=True, port=()), *given)
-    )
+    monkeypatch.setattr(plant, "link_of", lambda *given: link_of(*given[:2], replace(given[2], emulated=True)))
 
 
 def test_every_motion_of_a_real_robot_is_asked_for(tmp_path, monkeypatch, capsys, emulated_as_real):

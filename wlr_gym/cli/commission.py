@@ -172,7 +172,8 @@ def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Ca
     from wlr_gym.hardware.emulator.machine import EmulatedStand
 
     if not options.emulated:
-        return options.link_to(robot, hardware, options.patch()), TerminalPerson(ask, not options.yes)
+        options.refuse_effects(options.patch())
+        return options.link_to(robot, hardware), TerminalPerson(ask, not options.yes)
     stand = EmulatedStand(robot, hardware, options.patch())
     for fault in options.fault:
         stand.machine.inject(fault)

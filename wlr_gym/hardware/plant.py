@@ -71,7 +71,7 @@ class RobotPlant:
             safety = description.safety.model_copy(update={"deadman": chosen.deadman})
             description = description.model_copy(update={"safety": safety})
         if link is None:
-            link = _link(robot, description, chosen, self.options)
+            link = link_of(robot, description, chosen, self.options.sensor_noise)
         self.parameters["flow.present"] = link.flow is not None
         self.parameters["camera.present"] = link.camera is not None
         self.loop: ControlLoop = ControlLoop(robot, description, link, self.options.control_period, chosen, meta)
@@ -153,11 +153,16 @@ class RobotPlant:
         self.loop.close()
 
 
-def _link(robot: Robot, hardware: Hardware, chosen: RobotOptions, options: PlantOptions) -> Link:
-    camera = None if chosen.camera is None else load_camera_file(chosen.camera)
-    if not chosen.emulated:
-        return serial_link(robot, hardware, camera, chosen.poses)
+def link_of(robot: Robot, hardware: Hardware, options: RobotOptions, sensor_noise: bool = True) -> Link:
+    """Return connections to the robot that the options describe, closed; ``sensor_noise``: of an emulated one.
+
+    Raises:
+        InputError: effects or a camera that cannot be read.
+    """
+    camera = None if options.camera is None else load_camera_file(options.camera)
+    if not options.emulated:
+        return serial_link(robot, hardware, camera, options.poses)
     from wlr_gym.hardware.emulator.link import emulated_robot  # with the simulators, which a real robot does not need
 
-    noise = options.sensor_noise
-    return emulated_robot(robot, hardware, chosen.effects, sensor_noise=noise, camera=camera, seed=chosen.seed)
+    effects, seed = options.effects, options.seed
+    return emulated_robot(robot, hardware, effects, sensor_noise=sensor_noise, camera=camera, seed=seed)
