@@ -33,8 +33,7 @@ from wlr_gym.base.text import tally
 from wlr_gym.data.excitations import Motion, excite
 from wlr_gym.data.record import next_run
 from wlr_gym.data.runs import read_meta
-from wlr_gym.gap.decision import Budget, Decided, Recorded, decide
-from wlr_gym.gap.robot.next_run import motions_to_drive
+from wlr_gym.gap.decision import Budget, Decided, Recorded, decide, motions_to_drive
 from wlr_gym.robot import load_robot
 
 #: Contender -> what it drives.

@@ -17,7 +17,6 @@ from wlr_gym.data.record import record_simulation
 from wlr_gym.data.runs import read_run
 from wlr_gym.gap import Budget, Recorded, decide
 from wlr_gym.gap.report.result import Explanation, Result, explanations
-from wlr_gym.gap.robot import next_run
 from wlr_gym.physics.effects import PatchEffect
 from wlr_gym.robot import load_robot
 
@@ -120,19 +119,19 @@ def test_later_rounds_build_on_what_was_found():
 def test_what_calibration_takes_up_does_not_tell():
     columns = np.array([[2.0, 0.0]])
     # a number of unit variance leaves d^2 / (1 + c^2)
-    assert next_run._told(np.array([3.0, 0.0]), columns) == pytest.approx(9.0 / (1.0 + 4.0))
-    assert next_run._told(np.array([0.0, 2.0]), columns) == pytest.approx(4.0)
-    assert next_run._told(np.array([0.0, 2.0]), columns[:0]) == pytest.approx(4.0)
+    assert decision._told(np.array([3.0, 0.0]), columns) == pytest.approx(9.0 / (1.0 + 4.0))
+    assert decision._told(np.array([0.0, 2.0]), columns) == pytest.approx(4.0)
+    assert decision._told(np.array([0.0, 2.0]), columns[:0]) == pytest.approx(4.0)
 
 
 def test_own_numbers_are_moved_towards_no_effect_and_those_that_say_nothing_are_not():
     values = {"mu": 0.3, "x_min": -1000.0, "x_max": 0.5, "y_min": -1000.0, "y_max": 1000.0}
     patch = Explanation("friction_patch", 0.5, (PatchEffect("friction_patch", ("ground",), values),))
-    moved = [dict(own.parameters) for (own,) in next_run._own_moved(patch)]
+    moved = [dict(own.parameters) for (own,) in decision._own_moved(patch)]
     assert moved == [{**values, "mu": pytest.approx(0.24)}, {**values, "x_min": -800.0}, {**values, "x_max": 0.4}]
     weak = Explanation("weak_motor", 0.5, (PatchEffect("weak_motor", ("wheel_lf",), {"scale": 0.8}),))
-    assert [own.parameters["scale"] for (own,) in next_run._own_moved(weak)] == [pytest.approx(0.84)]
-    assert next_run._own_moved(Explanation("nothing", 0.5, ())) == []
+    assert [own.parameters["scale"] for (own,) in decision._own_moved(weak)] == [pytest.approx(0.84)]
+    assert decision._own_moved(Explanation("nothing", 0.5, ())) == []
 
 
 @pytest.mark.slow
@@ -143,10 +142,10 @@ def test_a_motion_that_loads_what_is_in_question_promises_more(data):
     drive = excite("straight", robot=ROBOT, seconds=3.0)
     stand = decision.Motion("stand", np.repeat(drive.setpoints[:1], 150, axis=0), drive.period)
     # standing cannot promise more
-    (promised,) = next_run.promises(found, explanations(found), [stand, drive], ROBOT, driven)
-    (alone,) = next_run.promises(found, explanations(found), [stand], ROBOT, driven)
+    (promised,) = decision.promises(found, explanations(found), [stand, drive], ROBOT, driven)
+    (alone,) = decision.promises(found, explanations(found), [stand], ROBOT, driven)
     assert (promised.motion.name, alone.motion.name) == ("straight", "stand")
-    assert promised.most > next_run.TELLS > alone.most
+    assert promised.most > decision.TELLS > alone.most
     assert {"coulomb_friction", "viscous_friction"} & set(promised.pair)
 
 
@@ -159,26 +158,26 @@ def test_a_motion_that_loads_what_is_in_question_promises_more(data):
     ],
 )
 def test_motions_that_cannot_promise_more_are_not_worked_out(data, monkeypatch, bounds, whole, worked_out, best):
-    monkeypatch.setattr(next_run, "record_simulation", lambda path, motion, *_: data / "run_01.parquet")
-    monkeypatch.setattr(next_run, "RobotProblem", lambda *_, **__: None)
-    monkeypatch.setattr(next_run, "_own_uncertainty", lambda *_: [])
+    monkeypatch.setattr(decision, "record_simulation", lambda path, motion, *_: data / "run_01.parquet")
+    monkeypatch.setattr(decision, "RobotProblem", lambda *_, **__: None)
+    monkeypatch.setattr(decision, "_own_uncertainty", lambda *_: [])
     done = []
 
     def promise(problem, found, left, motion, free=None):
         if free is not None:
             done.append(motion.name)
         per_second, most = (bounds if free is None else whole)[motion.name]
-        return next_run.Promise(motion, per_second * motion.duration, most, ("x", "y"))
+        return decision.Promise(motion, per_second * motion.duration, most, ("x", "y"))
 
-    monkeypatch.setattr(next_run, "_promise", promise)
+    monkeypatch.setattr(decision, "_promise", promise)
     drive = excite("straight", robot=ROBOT, seconds=1.0)
     motions = [decision.Motion(name, drive.setpoints, drive.period) for name in bounds]
-    found = next_run.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, ROBOT, [])
+    found = decision.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, ROBOT, [])
     assert (done, found[0].motion.name) == (worked_out, best)
 
 
 def test_motions_keep_the_profile_of_the_runs_and_are_drawn_anew():
-    first, again = (next_run.motions_to_drive(ROBOT, GENTLE, driven) for driven in ([], ["random"]))
+    first, again = (decision.motions_to_drive(ROBOT, GENTLE, driven) for driven in ([], ["random"]))
     assert "steps" not in [motion.name for motion in first]  # made for no profile
     pairs = zip(first, again, strict=True)
     changed = [one.name for one, two in pairs if not np.array_equal(one.setpoints, two.setpoints, equal_nan=True)]
@@ -188,7 +187,7 @@ def test_motions_keep_the_profile_of_the_runs_and_are_drawn_anew():
 def test_runs_of_an_excitation_are_known_by_their_setpoints(data):
     whole = record_simulation(data / "run_03.parquet", excite("straight", robot=ROBOT), ROBOT, "gibbs_appell")
     runs = [read_run(path) for path in (data / "run_02.parquet", whole)]
-    assert next_run.driven_already(runs, ROBOT) == ["straight"]  # the first was cut short
+    assert decision.driven_already(runs, ROBOT) == ["straight"]  # the first was cut short
 
 
 # ---- rounds ----------------------------------------------------------------------------------------------------------
@@ -227,7 +226,7 @@ def answers(monkeypatch):
     def promises(found, left, motions, robot, runs, **options):
         names = (left[0].name, left[1].name)
         return [
-            next_run.Promise(motion, given["telling"], given["telling"], names) for motion in motions if motion.name == "turns"
+            decision.Promise(motion, given["telling"], given["telling"], names) for motion in motions if motion.name == "turns"
         ]
 
     monkeypatch.setattr(decision, "analyse", analyse)
@@ -297,7 +296,7 @@ def test_a_name_that_no_motion_tells_from_an_equivalent_one_is_decided_where_it_
     names = [candidate("coulomb_friction", 0.97, "selected"), candidate("viscous_friction", 0.03, "equivalent")]
     found = result("effect_found", (0.0, names))
     effect = {"name": "coulomb_friction", "where": ["wheel_lf"], "parameters": {}, "confidence": 1.0, "gain": 99.0}
-    answers.update(results=[Result.model_validate(found.model_dump() | {"effects": [effect]})], telling=1.5 * next_run.TELLS)
+    answers.update(results=[Result.model_validate(found.model_dump() | {"effects": [effect]})], telling=1.5 * decision.TELLS)
     history = decide(data, tmp_path / "out", record).history
     assert (history.ended, list(history.rounds[-1].names)) == ("decided", ["coulomb_friction", "viscous_friction"])
 

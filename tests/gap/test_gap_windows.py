@@ -1,13 +1,18 @@
 """Residuals by windows: where a window starts must not matter, what happens in it must."""
 
+import os
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.sensors import channel_noise
 from wlr_gym.gap.robot.windows import BLIND, BOUNCE, anchored_residuals, window_rows
+from wlr_gym.gap.workflow import analyse
+from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import JOINTS, load_robot
 
 NOISE = np.array([channel_noise(load_robot())[name] for name in CHANNELS])
@@ -198,3 +203,32 @@ def test_settings_do_not_touch_each_other():
     together = residuals(measured, simulated)
     for k in range(3):
         assert np.array_equal(together[k], residuals(measured, simulated[k : k + 1])[0], equal_nan=True)
+
+
+# ---- stored data sets of another simulator ---------------------------------------------------------------------------
+# Two minutes of a core each: two by default, all with ``WLR_TWIN_SETS=all`` or those named there.
+
+
+TWINS = Path(__file__).resolve().parents[3] / "shared" / "data" / "twin_dev"
+LABELS = yaml.safe_load((TWINS / "labels.yaml").read_text(encoding="utf-8")) if TWINS.is_dir() else {}
+ASKED = os.environ.get("WLR_TWIN_SETS", "backlash_rear_hips").split()
+#: Numbers that these data hardly tell: how high a load lies on a body that is to stay level.
+UNTOLD = {("payload", "z")}
+ERROR = 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in LABELS if name in ASKED or ASKED == ["all"]])
+def test_hidden_effects_are_named_placed_and_sized(name):
+    label = LABELS[name]
+    found = analyse(TWINS / name)
+    assert found.verdict == label["verdict"]
+    hidden = {(effect["name"], tuple(effect["where"])): effect["parameters"] for effect in label["effects"]}
+    assert {(effect.name, effect.where) for effect in found.effects} == set(hidden)
+    for effect in found.effects:
+        truth = hidden[effect.name, effect.where]
+        for parameter, estimate in effect.parameters.items():
+            neutral = EFFECTS[effect.name].parameters[parameter].neutral
+            size = truth[parameter] - (neutral if isinstance(neutral, float | int) else 0.6)
+            if (effect.name, parameter) not in UNTOLD:
+                assert estimate.value == pytest.approx(truth[parameter], abs=ERROR * abs(size)), (effect.name, parameter)

@@ -1,15 +1,19 @@
 """Validation on held-out runs: bars, reduction and its interval, channels."""
 
+from dataclasses import replace
+
+import gap_examples as examples
 import numpy as np
 import pytest
-from toy_problem import CHANNELS, NOISE, Toy, candidate, sized
+from toy_problem import CHANNELS, NOISE, Toy, candidate, coloured, sized
 
-from wlr_gym.gap.analysis import Place
+from wlr_gym.gap.analysis import EFFECT_FOUND, NOTHING_MISSING, Place
 from wlr_gym.gap.estimation.fit import fit
 from wlr_gym.gap.estimation.model import level, mean_squares, nominal_model
+from wlr_gym.gap.report.text import made_worse
 from wlr_gym.gap.selection.cross_validation import improvement
 from wlr_gym.gap.selection.screening import LEAST_GAIN
-from wlr_gym.gap.validation.held_out import _beyond_need, _interval, compare_models, reduction
+from wlr_gym.gap.validation.held_out import _beyond_need, _interval, compare_models, reduction, worse_channels
 from wlr_gym.gap.validation.localisation import MOST, informative_traces
 
 FITTED, HELD_OUT = [0, 1, 2, 4], [3, 5, 6]
@@ -173,3 +177,57 @@ def test_effect_with_which_the_held_out_error_grows_must_gain_as_much_as_one_mus
     gain = improvement(found, tau)
     assert 0.0 < gain < LEAST_GAIN
     assert (_beyond_need(problem, found, tau) < 0.0) is refuted
+
+
+# ---- channels that effects make worse --------------------------------------------------------------------------------
+
+
+RUNS = [0, 2, 3]
+ROWS = 1000
+
+
+def residuals(seed):
+    rng = np.random.default_rng(seed)
+    return [coloured(rng, (ROWS, 3), 0.9) for _ in RUNS]
+
+
+def test_a_channel_that_gets_worse_in_all_runs_is_named_and_no_other():
+    problem, before = Toy(runs=4, rows=ROWS), residuals(0)
+    after = [r * [1.0, 1.05, 1.005] for r in before]  # mean squares up by 0, 10 and 1 %
+    assert worse_channels(problem, RUNS, before, after).tolist() == [False, True, False]
+    assert not worse_channels(problem, RUNS, after, before).any()
+
+
+def test_other_noise_of_the_same_size_is_not_worse():
+    problem = Toy(runs=4, rows=ROWS)
+    found = [worse_channels(problem, RUNS, residuals(k), residuals(1000 + k)) for k in range(60)]
+    assert np.mean(found) <= 0.04
+
+
+def test_one_bad_block_does_not_make_a_channel_worse():
+    problem, before = Toy(runs=4, rows=ROWS), residuals(3)
+    after = [r.copy() for r in before]
+    after[0][:50, 0] += 6.0
+    assert np.sum(after[0][:, 0] ** 2) > 1.2 * np.sum(before[0][:, 0] ** 2)
+    assert not worse_channels(problem, RUNS, before, after).any()
+
+
+def test_channels_that_were_not_measured_are_neither():
+    problem = Toy(runs=4, rows=ROWS)
+    silent = [np.full((ROWS, 3), np.nan) for _ in RUNS]
+    assert not worse_channels(problem, RUNS, silent, silent).any()
+
+
+def test_the_report_says_so_first():
+    fine = examples.ALL[EFFECT_FOUND]
+    assert made_worse(fine) == ""
+    first, second, *rest = fine.channel_gaps
+    harmed = replace(first, calibrated=5.9, after=9.3, worse=True), replace(second, calibrated=2.0, after=2.1, worse=True)
+    bad = replace(fine, channel_gaps=(*harmed, *rest))
+    said = made_worse(bad)
+    assert said.startswith(f"2 of {len(bad.channel_gaps)} channels get significantly worse in the held-out runs: ")
+    assert said.index("5.90 to 9.30") < said.index("2.00 to 2.10")
+    assert made_worse(replace(bad, channel_gaps=(harmed[0], *rest))).startswith("One channel gets ")
+    many = [replace(gap, worse=True) for gap in bad.channel_gaps]
+    assert made_worse(replace(bad, channel_gaps=tuple(many))).endswith(f" and {len(many) - 4} more.")
+    assert made_worse(replace(examples.ALL[NOTHING_MISSING], channel_gaps=harmed)) == ""

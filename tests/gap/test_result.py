@@ -13,7 +13,7 @@ from wlr_gym.envs.tasks.identified import identified_events
 from wlr_gym.gap.analysis import Calibrated, Equivalent, FoundEffect, ParameterEstimate, RunGap
 from wlr_gym.gap.report import result
 from wlr_gym.gap.report.result import patch_of, read_result, result_of, write_result
-from wlr_gym.gap.robot.quantities import knobs
+from wlr_gym.gap.robot.candidates import knobs
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import load_robot
 

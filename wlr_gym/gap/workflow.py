@@ -30,7 +30,6 @@ from wlr_gym.gap.analysis import (
     IntakeFinding,
     ParameterEstimate,
     Threshold,
-    Turning,
 )
 from wlr_gym.gap.estimation.fit import Fit, fit, widened
 from wlr_gym.gap.estimation.model import mean_of_runs, mean_squares, nominal_model
@@ -103,13 +102,16 @@ def analyse(
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
     known, problem, findings = open_problem(data, known, rig, backend, threads, robot)
-    for finding in _first_of_every_run(findings):
+    first = {finding.run: finding for finding in reversed(findings) if finding.fatal and finding.run}
+    for finding in (one for one in findings if first.get(one.run) is one):
         tell(f"left out {finding.place}: {finding.said}", STAGES["reading"])
-    _refuse_left_out(heldout, findings)
+    for finding in findings:
+        if finding.fatal and finding.run in heldout:
+            raise InputError(f"--heldout {finding.run}: the run cannot be used: {finding.place}: {finding.said}")
     if problem is not None:
         _refuse_copies(problem, data)
     done = (
-        _bad_data(str(data), findings)
+        Analysis(str(data), BAD_DATA, "", tuple(findings), provenance=provenance())
         if problem is None
         else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
     )
@@ -123,22 +125,6 @@ def analyse(
     return done
 
 
-def _first_of_every_run(findings: Sequence[IntakeFinding]) -> list[IntakeFinding]:
-    """The first reason why each run that cannot be used is left out."""
-    first: dict[str, IntakeFinding] = {}
-    for finding in findings:
-        if finding.fatal and finding.run:
-            first.setdefault(finding.run, finding)
-    return list(first.values())
-
-
-def _refuse_left_out(heldout: Sequence[str], findings: Sequence[IntakeFinding]) -> None:
-    """A run that cannot be used cannot be held out either."""
-    for finding in findings:
-        if finding.fatal and finding.run in heldout:
-            raise InputError(f"--heldout {finding.run}: the run cannot be used: {finding.place}: {finding.said}")
-
-
 def _refuse_copies(problem: Problem, data: str | Path) -> None:
     """A run under two names would count twice, and could be fitted and held out."""
     readings = [(problem.times(k), problem.measured(k)) for k in range(len(problem.runs))]
@@ -146,10 +132,6 @@ def _refuse_copies(problem: Problem, data: str | Path) -> None:
         if all(np.array_equal(*pair, equal_nan=True) for pair in zip(readings[one], readings[two], strict=True)):
             names = f"{problem.runs[one]} and {problem.runs[two]}"
             raise InputError(f"{data}: {names} are the same run, reading by reading; keep one of them")
-
-
-def _bad_data(data: str, findings: Sequence[IntakeFinding]) -> Analysis:
-    return Analysis(data, BAD_DATA, "", tuple(findings), provenance=provenance())
 
 
 @_one_thread
@@ -165,7 +147,8 @@ def analyse_problem(
     """Analyse a problem that is open already; see :func:`analyse`."""
     clock = _Clock(tell)
     clock.start("choosing runs")
-    fitted, held_out, columns = _choose_runs(problem, heldout)
+    # columns: of the runs to fit, where they had to be simulated for the choice
+    fitted, held_out, columns = (*named_split(problem.runs, heldout), None) if heldout else informative_split(problem)
     clock.start("calibrating")
     start = calibrated_fit(problem, fitted, columns, clock.detail)
     clock.start("naming")
@@ -183,19 +166,21 @@ def analyse_problem(
     nameless = not search.fit.model.effects and error > problem.misfit * gap.noise_floor
     every = range(len(problem.runs))
     features = problem.features(base.model.setting, every)
-    places, maps = localise(
-        problem,
-        base.residuals,
-        _expected(problem, search.fit, is_incomplete=nameless),
-        search.fit.noise,
-        [features[k] for k in fitted],
-    )
+    # mean squares that a complete model leaves: the final one, or sensors alone where that cannot be complete
+    complete = mean_of_runs(mean_squares(search.fit.residuals, problem.cap))
+    complete = np.where(np.isfinite(complete), 1.0, np.nan) if nameless else complete
+    places, maps = localise(problem, base.residuals, complete, search.fit.noise, [features[k] for k in fitted])
     adequacy = adequacy_of(problem, fitted, search.fit)
     shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
     left = [residual[0] for residual in problem.residuals([search.fit.model.setting], every)]
     turned = turning(problem, left, features)  # few runs turn far, and held-out ones may be those
-    somewhere = _somewhere(problem, most_in(channel_gaps) if worst else places[0].name) if nameless else ()
-    effects = _effects(problem, search, fitted) or _turned(turned) or somewhere
+    worst_signal = (most_in(channel_gaps) if worst else places[0].name) if nameless else ""
+    somewhere = tuple(
+        FoundEffect(UNKNOWN, (signal.place,), {}, 1.0, math.nan) for signal in problem.signals if signal.name == worst_signal
+    )
+    # without name or formula: what goes with a joint's turning, else what the worst signal tells of
+    periodic = () if turned is None else (FoundEffect(UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
+    effects = _effects(problem, search, fitted) or periodic or somewhere
     kept = {candidate.label for candidate, _ in search.fit.model.effects}
     groups = _equivalent(problem, search)
     evidence = [one for number, look in enumerate(search.rounds, 1) for one in evidence_of(problem, number, look, fitted, kept)]
@@ -232,11 +217,6 @@ def analyse_problem(
         seconds=clock.seconds,
         provenance=provenance(),
     )
-
-
-def _choose_runs(problem: Problem, heldout: Sequence[str]) -> tuple[list[int], list[int], list[NDArray[np.float32]] | None]:
-    """Runs to fit, runs to hold out, and the columns of the first where they had to be simulated for the choice."""
-    return (*named_split(problem.runs, heldout), None) if heldout else informative_split(problem)
 
 
 def calibrated_fit(
@@ -309,23 +289,6 @@ def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], fre
     return FoundEffect(name, where, parameters, frequency, gain, candidate.formula, units, doc=candidate.doc)
 
 
-def _turned(turned: Turning | None) -> tuple[FoundEffect, ...]:
-    """An effect without name or formula, where nothing that has one explains what goes with a joint's turning."""
-    return () if turned is None else (FoundEffect(UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
-
-
-def _expected(problem: Problem, found: Fit, *, is_incomplete: bool) -> Array:
-    """Mean squares (signals) that a complete model leaves: the final one, or sensors alone where that cannot be complete."""
-    left = mean_of_runs(mean_squares(found.residuals, problem.cap))
-    return np.where(np.isfinite(left), 1.0, np.nan) if is_incomplete else left
-
-
-def _somewhere(problem: Problem, worst: str) -> tuple[FoundEffect, ...]:
-    """An effect without name or formula, at what the worst signal tells of."""
-    where = next(signal.place for signal in problem.signals if signal.name == worst)
-    return (FoundEffect(UNKNOWN, (where,), {}, 1.0, math.nan),)
-
-
 def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...]:
     groups = []
     for look, one in search.kept:
@@ -346,7 +309,6 @@ def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
 
 
 # ---- opening ---------------------------------------------------------------------------------------------------------
-
 
 #: Kinds of rigs.
 RIGS = ("pendulum",)

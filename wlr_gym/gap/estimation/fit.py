@@ -148,7 +148,6 @@ def corrected(columns: NDArray[np.float32], taken: Array, before: Array, after: 
 
 # ---- the fit ---------------------------------------------------------------------------------------------------------
 
-
 #: Step of finite differences in a quantity, in tolerances.
 STEP = 0.5
 #: Times that the noise follows the numbers before a descent.

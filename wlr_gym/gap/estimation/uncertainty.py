@@ -67,7 +67,7 @@ def estimates(problem: Problem, fit: Fit) -> list[dict[str, ParameterEstimate]]:
 
     Added to the uncertainty of the fit is the disagreement of two simulators of one system (``problem.disagreement``), the same
     share of all unknowns that say how large an effect is. An unknown that adds to calibrated parameters is known no better than
-    they are: only the sum is identifiable, up to the small errors of simulated responses.
+    they are: only the sum is identifiable, up to the small errors of simulated responses, to the variance of their mean.
     """
     spread = covariance(problem, fit)
     found, at = [], len(problem.quantities)
@@ -75,16 +75,12 @@ def estimates(problem: Problem, fit: Fit) -> list[dict[str, ParameterEstimate]]:
         own = slice(at, at + len(values))
         sizes = [(v - u.neutral) * u.is_size for u, v in zip(candidate.unknowns, values, strict=True)]
         away = problem.disagreement * np.array(sizes)
-        hidden = np.diag(np.maximum(_unidentifiable(candidate) - np.diag(spread)[own], 0.0))
+        met = candidate.tolerances or (None,) * len(values)
+        summed = [0.0 if one is None or one.replaces else one.size**2 / len(one.quantities) for one in met]
+        hidden = np.diag(np.maximum(np.array(summed) - np.diag(spread)[own], 0.0))
         found.append(_with_intervals(candidate, np.array(values), spread[own, own] + np.outer(away, away) + hidden))
         at += len(values)
     return found
-
-
-def _unidentifiable(candidate: Candidate) -> Array:
-    """Least variance (unknowns) of what is identifiable only as a sum with calibrated parameters: that of their mean."""
-    met = candidate.tolerances or (None,) * len(candidate.unknowns)
-    return np.array([0.0 if one is None or one.replaces else one.size**2 / len(one.quantities) for one in met])
 
 
 def _with_intervals(candidate: Candidate, values: Array, spread: Array) -> dict[str, ParameterEstimate]:

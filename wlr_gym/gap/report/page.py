@@ -28,15 +28,12 @@ from wlr_gym.gap.analysis import (
     Analysis,
     Calibrated,
     ChannelGap,
-    Detectable,
     Evidence,
     FoundEffect,
     GapFigures,
-    IntakeFinding,
     RunGap,
     Statistic,
 )
-from wlr_gym.gap.problem import Range
 from wlr_gym.gap.report.plots import draw
 from wlr_gym.gap.report.recommendation import record_commands
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, patch_of, read_result, result_of, write_result
@@ -100,18 +97,9 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
         pictures: name -> PNG, of :func:`wlr_gym.gap.report.plots.draw`.
         folder: where the results are, for the commands it shows.
     """
-    body = [
-        _header(analysis),
-        _where(analysis, pictures),
-        evidence_section(analysis, _pictures("evidence", pictures)),
-        _how_much(analysis, pictures),
-        _how_sure(analysis),
-        _next(analysis),
-        _calibration(analysis),
-        _intake(analysis),
-        _use(analysis, folder),
-        _footer(analysis),
-    ]
+    found = _header(analysis), _where(analysis, pictures), _what(analysis, pictures), _how_much(analysis, pictures)
+    more = _how_sure(analysis), _next(analysis), _calibration(analysis), _intake(analysis), _use(analysis, folder)
+    body = [*found, *more, _footer(analysis)]
     return document(f"{title(analysis)}: {analysis.data}", _COLOURS[analysis.verdict], body)
 
 
@@ -177,6 +165,92 @@ def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     return section("Where", text, table(headings, rows, {2}), *shown)
 
 
+# ---- what is missing -------------------------------------------------------------------------------------------------
+
+
+def _what(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
+    """What was found, what the data cannot distinguish it from, and every candidate."""
+    parts = [_effect(effect) for effect in analysis.effects]
+    if analysis.equivalent:
+        rows = [(listed([plain(name) for name in group.names], "or"), group.separating_run) for group in analysis.equivalent]
+        parts += [heading("Effects not distinguishable in these data"), table(("one of", "discriminating experiment"), rows)]
+    if analysis.evidence:
+        rounds = sorted({one.round for one in analysis.evidence})
+        parts += [heading("Candidates compared"), _COMPARED, _pictures("evidence", pictures)]
+        none = {one.round: one.none for one in analysis.thresholds}
+        for turn in rounds:
+            parts.append(_evidence([one for one in analysis.evidence if one.round == turn], turn, none.get(turn, math.nan)))
+    return section("What", *parts)
+
+
+_COMPARED = """<p>Every candidate was scored by its <i>predicted</i> improvement of the calibrated model (score test, a linear
+estimate). The best were added and refitted together with all calibrated parameters: their <i>gain</i> is the fall of minus two
+log posterior, of which chance alone gives about 1 for each fitted number. Their
+<i>probability</i> is among all that were refitted and none of them. One effect is selected per round, then the search starts
+again.</p>"""
+
+
+def _effect(effect: FoundEffect) -> str:
+    known = None if effect.doc else EFFECTS.get(effect.name)
+    doc = known.doc if known else effect.doc
+    meaning = f"What is missing: {doc}." if doc else "Nothing in the library explains it."
+    law = effect.formula or (known.equation if known else "")
+    unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
+    rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
+    tried = [
+        f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in effect.validity.items()
+    ]
+    return "\n".join(
+        [
+            heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
+            f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
+            f"</code>. Selection frequency {percent(effect.confidence)}.</p>",
+            f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
+            *([f"<p>Tried where {escape(listed(tried))}; beyond, it is untested.</p>"] if tried else []),
+            table(("parameter", "value (95 % interval)"), rows),
+        ]
+    )
+
+
+def _evidence(evidence: Sequence[Evidence], turn: int, none: float) -> str:
+    """The candidates of one round; ``none``: probability that none of them is missing."""
+    fitted = [one for one in evidence if one.outcome != REJECTED]
+    fitted.sort(key=lambda one: (one.outcome != SELECTED, -one.gain if math.isfinite(one.gain) else math.inf))
+    rows = [
+        (
+            plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), percent(one.probability),
+            one.outcome, one.reason,
+        )
+        for one in fitted
+    ]  # fmt: skip
+    screened = [one for one in evidence if one.outcome == REJECTED]
+    screened.sort(key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
+    rejected = [(plain(one.name), places(one.where), number(max(one.screened, 0.0)), one.reason) for one in screened]
+    classes = ["selected" if one.outcome == SELECTED else "" for one in fitted]
+    return "\n".join(
+        [
+            heading(f"Round {turn}: {counted(len(fitted), 'candidate')} refitted"),
+            table(
+                ("candidate", "where", "values", "gain", "predicted", "probability", "outcome", "reason"),
+                rows,
+                {3, 4, 5},
+                classes,
+            ),
+            f"<p>Probability that none of them is missing: {percent(none)}.</p>" if math.isfinite(none) else "",
+            folded(
+                f"{counted(len(rejected), 'effect')} rejected at screening",
+                table(("effect", "where it would gain most", "predicted", "reason"), rejected, {2}),
+            ),
+        ]
+    )
+
+
+def _values(one: Evidence) -> str:
+    known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
+    units = {name: spec.unit for name, spec in known.items()} | dict(one.units)
+    return ", ".join(f"{name} {number(value)}{unit_of(units.get(name, ''))}" for name, value in one.values.items())
+
+
 # ---- how much, how sure, what next -----------------------------------------------------------------------------------
 
 
@@ -234,14 +308,13 @@ def _how_sure(analysis: Analysis) -> str:
     if analysis.adequacy:
         parts += [heading("Is anything left?"), _adequacy(analysis.adequacy)]
     if analysis.detectable:
-        sizes = [(plain(name), one.parameter, _smallest(one)) for name, one in sorted(analysis.detectable.items())]
+        sizes = [
+            (plain(name), one.parameter, f"{number(one.value)}{unit_of(one.unit)}" if math.isfinite(one.value) else _NONE)
+            for name, one in sorted(analysis.detectable.items())
+        ]
         parts += [heading("What these runs would have shown"), _DETECTABLE]
         parts.append(table(("effect", "parameter", "smallest size"), sizes, {2}))
     return section("How sure", *parts)
-
-
-def _smallest(one: Detectable) -> str:
-    return f"{number(one.value)}{unit_of(one.unit)}" if math.isfinite(one.value) else "none that is plausible"
 
 
 def _adequacy(found: Adequacy) -> str:
@@ -274,6 +347,7 @@ _SELECTION_FREQUENCY = """<p>Selection frequency (bootstrap): the fitted runs ar
 with its part in the gain of every candidate (nothing is refitted). It is the share of these draws in which the effect improves
 the fit enough, the runs agree, and no other effect improves it more; of an effect without a formula, in which it is as clear.
 A 95 % interval misses the true number in one of 20 cases, provided that nothing else is wrong with the model.</p>"""
+_NONE = "none that is plausible"
 _DETECTABLE = """<p>The smallest size of each effect that would have been noticed, at the place where it is hardest to see.
 Smaller ones may be there. Of an effect with several directions (a displaced mass: x, y, z) it is the direction that shows best:
 in another it may stay hidden at any size.</p>"""
@@ -305,7 +379,13 @@ def _calibration(analysis: Analysis) -> str:
     )
     headings, right = ("number", "unit", "nominal", "fitted", "± (95 %)", "tolerance (1 sigma)", "moved"), {2, 3, 4, 5, 6}
     ordered = sorted(analysis.calibration.items(), key=lambda pair: -abs(_shift(pair[1])))
-    rows = [_moved(name, moved) for name, moved in ordered]
+    rows = [
+        (
+            name, moved.unit, number(moved.nominal, 4), number(moved.fitted, 4), number(moved.uncertainty, 2),
+            number(moved.sigma, 2), f"{_shift(moved):+.1f}",
+        )
+        for name, moved in ordered
+    ]  # fmt: skip
     far = sum(abs(_shift(moved)) >= _FAR for _, moved in ordered)
     rest = folded(f"{len(rows) - far} that moved by less than {_FAR:g} tolerances", table(headings, rows[far:], right))
     return section("Calibration", text, table(headings, rows[:far], right), rest if far < len(rows) else "")
@@ -314,13 +394,6 @@ def _calibration(analysis: Analysis) -> str:
 def _shift(moved: Calibrated) -> float:
     """By how many tolerances a number moved; 0 where there is none."""
     return (moved.fitted - moved.nominal) / moved.sigma if moved.sigma > 0 else 0.0
-
-
-def _moved(name: str, moved: Calibrated) -> tuple[str, ...]:
-    return (
-        name, moved.unit, number(moved.nominal, 4), number(moved.fitted, 4), number(moved.uncertainty, 2),
-        number(moved.sigma, 2), f"{_shift(moved):+.1f}",
-    )  # fmt: skip
 
 
 def _intake(analysis: Analysis) -> str:
@@ -332,7 +405,7 @@ def _intake(analysis: Analysis) -> str:
             "fatal" if one.fatal else "noted",
             one.run or "all",
             one.channel or "all",
-            _moment(one),
+            "" if one.time is None else f"{one.time:.2f} s",
             one.kind.replace("_", " "),
             one.said,
         )
@@ -341,10 +414,6 @@ def _intake(analysis: Analysis) -> str:
     classes = ["fatal" if one.fatal else "" for one in ordered]
     text = "<p>What was noticed about the data before any model was asked.</p>"
     return section("The data", text, table(("", "run", "channel", "from", "kind", "what was seen"), rows, classes=classes))
-
-
-def _moment(finding: IntakeFinding) -> str:
-    return "" if finding.time is None else f"{finding.time:.2f} s"
 
 
 def _use(analysis: Analysis, folder: Path) -> str:
@@ -405,100 +474,7 @@ def _footer(analysis: Analysis) -> str:
     return f"<footer><p>{escape(f'{total}{made}.')}</p></footer>"
 
 
-# ---- what is missing -------------------------------------------------------------------------------------------------
-
-
-def evidence_section(analysis: Analysis, picture: str) -> str:
-    """Return what was found, what the data cannot distinguish it from, and every candidate; ``picture`` is HTML."""
-    parts = [_effect(effect) for effect in analysis.effects]
-    if analysis.equivalent:
-        rows = [(listed([plain(name) for name in group.names], "or"), group.separating_run) for group in analysis.equivalent]
-        parts += [heading("Effects not distinguishable in these data"), table(("one of", "discriminating experiment"), rows)]
-    if analysis.evidence:
-        rounds = sorted({one.round for one in analysis.evidence})
-        parts += [heading("Candidates compared"), _COMPARED, picture]
-        none = {one.round: one.none for one in analysis.thresholds}
-        for turn in rounds:
-            parts.append(_evidence([one for one in analysis.evidence if one.round == turn], turn, none.get(turn, math.nan)))
-    return section("What", *parts)
-
-
-_COMPARED = """<p>Every candidate was scored by its <i>predicted</i> improvement of the calibrated model (score test, a linear
-estimate). The best were added and refitted together with all calibrated parameters: their <i>gain</i> is the fall of minus two
-log posterior, of which chance alone gives about 1 for each fitted number. Their
-<i>probability</i> is among all that were refitted and none of them. One effect is selected per round, then the search starts
-again.</p>"""
-
-
-def _effect(effect: FoundEffect) -> str:
-    known = None if effect.doc else EFFECTS.get(effect.name)
-    doc = known.doc if known else effect.doc
-    meaning = f"What is missing: {doc}." if doc else "Nothing in the library explains it."
-    law = effect.formula or (known.equation if known else "")
-    unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
-    rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
-    return "\n".join(
-        [
-            heading(f"{plain(effect.name).capitalize()}: {places(effect.where)}"),
-            f"<p>{escape(meaning)} In files: <code>{escape(effect.name)}</code>, where <code>{escape(', '.join(effect.where))}"
-            f"</code>. Selection frequency {percent(effect.confidence)}.</p>",
-            f"<p>Law: <code>{escape(law)}</code></p>" if law else unlawful,
-            *([f"<p>Tried where {_tried(effect.validity)}; beyond, it is untested.</p>"] if effect.validity else []),
-            table(("parameter", "value (95 % interval)"), rows),
-        ]
-    )
-
-
-def _tried(validity: Mapping[str, Range]) -> str:
-    texts = [f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in validity.items()]
-    return escape(listed(texts, "and"))
-
-
-def _evidence(evidence: Sequence[Evidence], turn: int, none: float) -> str:
-    """The candidates of one round; ``none``: probability that none of them is missing."""
-    fitted = sorted((one for one in evidence if one.outcome != REJECTED), key=_rank)
-    rows = [
-        (
-            plain(one.name), places(one.where), _values(one), number(one.gain), number(one.screened), percent(one.probability),
-            one.outcome, one.reason,
-        )
-        for one in fitted
-    ]  # fmt: skip
-    screened = [one for one in evidence if one.outcome == REJECTED]
-    screened.sort(key=lambda one: -one.screened if math.isfinite(one.screened) else math.inf)
-    rejected = [(plain(one.name), places(one.where), number(max(one.screened, 0.0)), one.reason) for one in screened]
-    classes = ["selected" if one.outcome == SELECTED else "" for one in fitted]
-    return "\n".join(
-        [
-            heading(f"Round {turn}: {counted(len(fitted), 'candidate')} refitted"),
-            table(
-                ("candidate", "where", "values", "gain", "predicted", "probability", "outcome", "reason"),
-                rows,
-                {3, 4, 5},
-                classes,
-            ),
-            f"<p>Probability that none of them is missing: {percent(none)}.</p>" if math.isfinite(none) else "",
-            folded(
-                f"{counted(len(rejected), 'effect')} rejected at screening",
-                table(("effect", "where it would gain most", "predicted", "reason"), rejected, {2}),
-            ),
-        ]
-    )
-
-
-def _rank(one: Evidence) -> tuple[bool, float]:
-    """Order of the fitted: the selected one, then by gain."""
-    return one.outcome != SELECTED, -one.gain if math.isfinite(one.gain) else math.inf
-
-
-def _values(one: Evidence) -> str:
-    known = EFFECTS[one.name].parameters if one.name in EFFECTS else {}
-    units = {name: spec.unit for name, spec in known.items()} | dict(one.units)
-    return ", ".join(f"{name} {number(value)}{unit_of(units.get(name, ''))}" for name, value in one.values.items())
-
-
 # ---- the folder ------------------------------------------------------------------------------------------------------
-
 
 REPORT_FILE = "report.html"
 #: Folder of the pictures.

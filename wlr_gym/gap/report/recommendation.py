@@ -176,7 +176,6 @@ def record_commands(excitations: Iterable[str]) -> list[str]:
 
 # ---- relations -------------------------------------------------------------------------------------------------------
 
-
 #: What effects outside the library change.
 _TORQUE = "torque in the {}"
 

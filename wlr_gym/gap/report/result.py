@@ -439,7 +439,6 @@ def read_result(path: str | Path) -> Result:
 
 # ---- what a result leaves open ---------------------------------------------------------------------------------------
 
-
 #: Probability from which on a name is decided.
 DECIDED = 0.95
 #: Name of the explanation that adds nothing to the effects found before.

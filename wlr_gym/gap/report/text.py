@@ -15,11 +15,9 @@ from wlr_gym.gap.analysis import (
     UNKNOWN,
     Adequacy,
     Analysis,
-    ChannelGap,
     FoundEffect,
     GapFigures,
     ParameterEstimate,
-    Statistic,
     Turning,
 )
 from wlr_gym.gap.validation.held_out import most_in, most_left
@@ -87,12 +85,13 @@ def places(where: Sequence[str]) -> str:
             return f"{group} {kind}s" if group else listed([f"{CORNER_NAMES[corner]} {kind}" for corner in corners])
     if set(where) == {*LEGS, *WHEELS}:
         return "all legs and wheels"
-    return listed([_place(name) for name in where])
-
-
-def _place(name: str) -> str:
-    kind, _, corner = name.rpartition("_")
-    return f"{CORNER_NAMES[corner]} {kind}" if corner in CORNER_NAMES else _PLACES.get(name, name.replace("_", " "))
+    split = [(name, *name.rpartition("_")) for name in where]
+    return listed(
+        [
+            f"{CORNER_NAMES[corner]} {kind}" if corner in CORNER_NAMES else _PLACES.get(name, name.replace("_", " "))
+            for name, kind, _, corner in split
+        ]
+    )
 
 
 def channel(name: str) -> str:
@@ -160,16 +159,12 @@ def _written(value: float, low: float, high: float) -> tuple[str, str, str]:
     """A value and its interval: down to the uncertainty, or, where the value is smaller than that, to its second digit."""
     uncertainty = 0.5 * (high - low)
     if uncertainty <= abs(value):
-        digits = _digits(value, uncertainty)
+        # three at least: a scale of 1.022, known to 0.004
+        digits = max(3, math.ceil(math.log10(abs(value) / uncertainty)) + 1) if uncertainty > 0.0 else 3
         return number(value, digits), number(low, digits), number(high, digits)
     decimals = max(0, 1 - math.floor(math.log10(uncertainty)))
     first, second, third = (f"{round(one, decimals) + 0.0:.{decimals}f}" for one in (value, low, high))
     return first, second, third
-
-
-def _digits(value: float, uncertainty: float) -> int:
-    """Significant digits that show a value down to its uncertainty, three at least: a scale of 1.022, known to 0.004."""
-    return max(3, math.ceil(math.log10(abs(value) / uncertainty)) + 1) if uncertainty > 0.0 else 3
 
 
 # ---- the verdict -----------------------------------------------------------------------------------------------------
@@ -192,7 +187,8 @@ def closure(analysis: Analysis) -> str:
         return ""
     above: dict[str, float] = {}
     for one in analysis.channel_gaps:
-        above[one.group] = above.get(one.group, 0.0) + _above(one, gap.noise_floor)
+        square = max(one.after**2 - gap.noise_floor**2, 0.0) if math.isfinite(one.after) else 0.0
+        above[one.group] = above.get(one.group, 0.0) + square
     most = max(above, key=lambda group: above[group], default="")
     share = above[most] / sum(above.values()) if above and sum(above.values()) > 0.0 else math.nan
     where = f"; {percent(share)} of it is in {_GROUPS.get(most, most.replace('_', ' '))}" if math.isfinite(share) else ""
@@ -200,11 +196,6 @@ def closure(analysis: Analysis) -> str:
         f"Not all is explained: an error of {error(gap.heldout_after)} is left in the held-out runs, above the noise floor of "
         f"{error(gap.noise_floor)}{where}."
     )
-
-
-def _above(gap: ChannelGap, floor: float) -> float:
-    """Mean square of a channel above the noise floor."""
-    return max(gap.after**2 - floor**2, 0.0) if math.isfinite(gap.after) else 0.0
 
 
 def below_floor(analysis: Analysis) -> str:
@@ -242,16 +233,12 @@ def adequacy(found: Adequacy) -> str:
     if not beyond:
         return f"{compared}, it leaves nothing in the fitted runs that chance does not explain.{untested}"
     levels = {name: level for name, (level, _) in found.channels.items() if level.rejected}
-    most = sorted(levels, key=lambda name: -_excess(levels[name]))[:3]
+    excess = {name: one.value**2 - one.expected**2 for name, one in levels.items()}
+    most = sorted(levels, key=lambda name: -excess[name])[:3]
     where = f" Most of the error that is not expected is in {listed(most)}." if found.level.rejected and most else ""
     apart = found.pulled.errors.rejected
     pulled = f" {found.pulled.run} pulls {found.pulled.number} farthest from the others." if apart else ""
     return f"{compared}, more than chance explains is left in the fitted runs: {listed(beyond)}.{where}{pulled}{untested}"
-
-
-def _excess(level: Statistic) -> float:
-    """Mean square above what is expected."""
-    return level.value**2 - level.expected**2
 
 
 def sentence(analysis: Analysis) -> str:

@@ -1,10 +1,12 @@
-"""What may be missing in the robot: every effect of the library, as its :class:`Search` says, and formulas.
+"""What calibration may move in the robot, and what may be missing beyond it: every effect of the library, and formulas.
 
-An effect that adds to a number which calibration may move too (dry friction, wheel radius, ...) needs no probe of its own: it
-is the same response without the tolerance.
+Calibration may move the numbers that the robot's file gives a tolerance, and the biases of its IMU (:func:`knobs`).
 
-Formulas are forces that no effect of the library describes, on single coordinates. Each is a sum of terms with one constant per
-term, so that it vanishes with its constants and its response is linear in them.
+An effect is tried as its :class:`Search` says (:func:`robot_candidates`). One that adds to a number which calibration may move
+too (dry friction, wheel radius, ...) needs no probe of its own: it is the same response without the tolerance.
+
+Formulas are forces that no effect of the library describes, on single coordinates (:func:`formula_candidates`). Each is a sum
+of terms with one constant per term, so that it vanishes with its constants and its response is linear in them.
 """
 
 from __future__ import annotations
@@ -19,14 +21,107 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.gap.problem import Candidate, Probe, Start, Tolerance, Unknown
-from wlr_gym.gap.robot.quantities import REACH
+from wlr_gym.gap.problem import Candidate, Probe, Quantity, Start, Tolerance, Unknown
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, PatchEffect
-from wlr_gym.physics.effects.effect import Change, Coordinates, Guess, Known, Observed, Places, Search
-from wlr_gym.robot import CORNERS, JOINTS, LEGS, WHEELS
+from wlr_gym.physics.effects.effect import Change, Guess, Known, Observed, Places, Search
+from wlr_gym.physics.plants.simulator import most_damping
+from wlr_gym.robot import CORNERS, JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.robot.parameter_table import SPECS, TABLE
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
+
+#: Tolerances that move several numbers as one: a floor is one floor, a host's latency one latency.
+SHARED = {"ground.mu": ("ground.mu_x", "ground.mu_y"), "command.delay": ("command.delay",)}
+#: Numbers of the contact spring, of which the robot's file has a guess and no tolerance: one sigma, relative, all wheels alike.
+#: A stiffness held too near to the guess makes the body heavier, and a payload is named.
+GUESSED = {"ground.normal_stiffness": 0.3, "ground.normal_damping": 0.5}
+#: Tolerances by which calibration may move a number; what needs more is a missing effect.
+REACH = 2.5
+#: The same of the biases of the IMU. They are drawn each time it is switched on: they get more room.
+REACH_OF_BIAS = 4.0
+#: What tyres and gears yield, all alike, of which no robot's file tells: one sigma from none, m/s, rad/s and a share. An effect
+#: is what goes beyond.
+YIELDS = {"ground.creep_speed": 0.001, "servo.creep_rate": 0.004, "ground.flattening": 0.3}
+#: A leg's own inertia is a hundredth of its rotor's: no run shows it.
+UNSEEN = ("leg.inertia",)
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A quantity, and the elements of the parameter table that it sets.
+
+    Attributes:
+        quantity: what is fitted.
+        elements: what it sets.
+        shares: of the quantity that each element gets; a robot's floor may grip less across than along.
+    """
+
+    quantity: Quantity
+    elements: tuple[str, ...]
+    shares: tuple[float, ...] = ()
+
+
+#: Share of the contact damping that the physics step still resolves to which calibration may go.
+RESOLVED = 0.8
+
+
+def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
+    """Return what calibration may move, from the robot's tolerances.
+
+    Args:
+        robot: the robot.
+        physics_step: s, with which it will be simulated.
+    """
+    nominal = Parameters.nominal(robot)
+    found: list[Knob] = []
+    for key, elements in SHARED.items():
+        if key in robot.tolerances:
+            targets = tuple(element for name in elements for element in SPECS[name].elements)
+            found.append(_knob(key, targets, nominal, robot))
+    for spec in TABLE:
+        if spec.tolerance in robot.tolerances and spec.tolerance not in (*UNSEEN, *SHARED):
+            found += [_knob(spec.tolerance, (element,), nominal, robot) for element in spec.elements]
+    resolved = RESOLVED * most_damping(nominal, physics_step)
+    for name, share in GUESSED.items():
+        spec, value = SPECS[name], float(nominal[name].mean())
+        quantity = _quantity(name, name, value, share * value)
+        if name == "ground.normal_damping":
+            quantity = replace(quantity, high=max(min(quantity.high, resolved), value))
+        found.append(Knob(quantity, tuple(spec.elements)))
+    found += [Knob(_quantity(name, name, 0.0, sigma), tuple(SPECS[name].elements)) for name, sigma in YIELDS.items()]
+    imu = robot.sensors.imu
+    for name, sigma in (("imu.gyro_bias", imu.gyro_bias), ("imu.accel_bias", imu.accel_bias)):
+        spec = SPECS[name]
+        found += [Knob(replace(_quantity(e, name, 0.0, sigma, REACH_OF_BIAS), drifts=True), (e,)) for e in spec.elements]
+    return tuple(knob for knob in found if knob.quantity.sigma > 0.0)  # what is known exactly does not move
+
+
+def _knob(key: str, elements: tuple[str, ...], nominal: Parameters, robot: Robot) -> Knob:
+    name = elements[0] if len(elements) == 1 else key
+    spec = SPECS[elements[0].partition("[")[0]]
+    value = float(nominal[elements[0]][0])
+    sigma = robot.tolerances[key].sigma(elements[0], value)
+    shares = tuple(float(nominal[element][0]) / value if value else 1.0 for element in elements)
+    return Knob(_quantity(name, spec.name, value, sigma), elements, shares)
+
+
+def _quantity(name: str, parameter: str, nominal: float, sigma: float, reach: float = REACH) -> Quantity:
+    spec = SPECS[parameter]
+    return Quantity(
+        name, spec.unit, nominal, sigma, max(spec.low, nominal - reach * sigma), min(spec.high, nominal + reach * sigma)
+    )
+
+
+def write(knobs: Sequence[Knob], values: Array, parameters: Parameters) -> None:
+    """Write quantities (settings, len(knobs)) into a batch of parameters."""
+    for knob, column in zip(knobs, values.T, strict=True):
+        for element, share in zip(knob.elements, knob.shares or [1.0] * len(knob.elements), strict=True):
+            parameters[element] = column * share
+
+
+# ---- effects of the library ------------------------------------------------------------------------------------------
+
 
 #: A prior is no wall: a size is sought so far beyond it too, in its width, where the simulator accepts it.
 BEYOND = 3.0
@@ -99,7 +194,10 @@ class _Library:
         if not starts:
             return None
         own = None if search.coordinates is None else search.coordinates(where, self.observed)
-        unknowns = self._unknowns(effect, search) if own is None else _fitted(own)
+        unknowns = self._unknowns(effect, search)
+        if own is not None:
+            numbers = own.numbers.items()
+            unknowns = tuple(Unknown(n, one.unit, one.neutral, one.low, one.high, one.step, one.is_size) for n, one in numbers)
         tolerances = tuple(self._tolerance(effect, where, unknown.name, known) for unknown in unknowns) if known else ()
         candidate = Candidate(effect.name, where, unknowns, starts, tolerances=tolerances, surcharge=search.surcharge)
         if own is None:
@@ -175,17 +273,11 @@ def _component(whole: Candidate, k: int) -> Candidate:
     return replace(whole, unknowns=(whole.unknowns[k],), starts=starts, tolerances=whole.tolerances[k : k + 1])
 
 
-def _fitted(coordinates: Coordinates) -> tuple[Unknown, ...]:
-    numbers = coordinates.numbers.items()
-    return tuple(Unknown(name, one.unit, one.neutral, one.low, one.high, one.step, one.is_size) for name, one in numbers)
-
-
 def _quantities(number: Known, where: Places) -> tuple[str, ...]:
     return tuple(dict.fromkeys(number.quantity.format(place) for place in where))
 
 
 # ---- what is read off the runs ---------------------------------------------------------------------------------------
-
 
 #: Periods per turn at which a wave is looked for.
 ORDERS = range(1, 65)
@@ -207,14 +299,11 @@ def observe(
         residuals: of the model, (rows, signals) per run.
     """
     orders = {joint: order for joint in JOINTS if (order := wave_order(joint, measured, residuals)) is not None}
-    return Observed(parameters, orders, _travel(simulated))
-
-
-def _travel(simulated: Sequence[Array]) -> tuple[float, float]:
-    """Where the robot has been: by the model, since not all runs have a camera."""
+    # where the robot has been: by the model, since not all runs have a camera
     x = np.concatenate([values[:, CHANNELS.index("cam_x")] for values in simulated])
     reached = x[np.isfinite(x)]  # a simulation may break down
-    return (float(reached.min()), float(reached.max())) if reached.size else (0.0, 0.0)
+    travel = (float(reached.min()), float(reached.max())) if reached.size else (0.0, 0.0)
+    return Observed(parameters, orders, travel)
 
 
 def wave_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]) -> float | None:

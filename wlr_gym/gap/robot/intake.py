@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.description import Motor
 
 # ---- a check ---------------------------------------------------------------------------------------------------------
-
 
 Array = NDArray[np.float64]
 
@@ -73,6 +73,9 @@ class IntakeCheck:
     look: Callable[[Run, str, Robot], Outcome]
 
 
+_Outcomes: TypeAlias = dict[tuple[IntakeCheck, str], Outcome]
+
+
 def findings_of(runs: Sequence[Run], checks: Sequence[IntakeCheck], robot: Robot) -> list[IntakeFinding]:
     """Return what the checks find, run by run.
 
@@ -89,51 +92,36 @@ def findings_of(runs: Sequence[Run], checks: Sequence[IntakeCheck], robot: Robot
             fault = _shared(runs, outcomes, check, channel) if seen is Sound.UNDECIDED else seen
             if channel not in told and isinstance(fault, ChannelFault):
                 told.add(channel)
-                found.append(_finding(run, check.kind, channel, fault))
+                time = None if fault.row is None else float(run["t"][fault.row] - run["t"][0])
+                said = fault.text, True, time, fault.expected, fault.remedy
+                found.append(IntakeFinding(run.name, channel, check.kind, *said))
     return found
 
 
-def _shared(
-    runs: Sequence[Run], outcomes: Sequence[dict[tuple[IntakeCheck, str], Outcome]], check: IntakeCheck, channel: str
-) -> ChannelFault | None:
+def _shared(runs: Sequence[Run], outcomes: Sequence[_Outcomes], check: IntakeCheck, channel: str) -> ChannelFault | None:
     """The fault that a run which does not show it has like the others; None where one shows that the channel is right."""
-    first = _only_faults(runs, outcomes, check, channel)
-    if first is None:
+    seen = [(run.name, outcome.get((check, channel))) for run, outcome in zip(runs, outcomes, strict=True)]
+    faults = [(name, one) for name, one in seen if isinstance(one, ChannelFault)]
+    if not faults or any(one is Sound.YES for _, one in seen):
         return None
-    text = f"the run does not show whether it is right, and it is {check.kind} in {first[0]}"
-    return ChannelFault(None, text, first[1].expected, first[1].remedy)
+    name, first = faults[0]
+    text = f"the run does not show whether it is right, and it is {check.kind} in {name}"
+    return ChannelFault(None, text, first.expected, first.remedy)
 
 
-def _of_one(run: Run, checks: Sequence[IntakeCheck], robot: Robot) -> dict[tuple[IntakeCheck, str], Outcome]:
-    outcomes: dict[tuple[IntakeCheck, str], Outcome] = {}
+def _of_one(run: Run, checks: Sequence[IntakeCheck], robot: Robot) -> _Outcomes:
+    """What each check finds in each channel of a run that is measured and in which no earlier check has found a fault."""
+    outcomes: _Outcomes = {}
     bad: set[str] = set()
     for check in checks:
         for channel in check.channels:
-            if place(channel) in bad or bad.intersection(WHOLE) or not _is_measured(run, channel):
+            measured = channel in WHOLE or (channel in run and bool(np.isfinite(run[channel]).any()))
+            if not measured or place(channel) in bad or bad.intersection(WHOLE):
                 continue
             outcomes[check, channel] = check.look(run, channel, robot)
             if isinstance(outcomes[check, channel], ChannelFault):
                 bad.add(place(channel))
     return outcomes
-
-
-def _only_faults(
-    runs: Sequence[Run], outcomes: Sequence[dict[tuple[IntakeCheck, str], Outcome]], check: IntakeCheck, channel: str
-) -> tuple[str, ChannelFault] | None:
-    """The first run with a fault that a check found, and the fault; None where a run shows that the channel is right."""
-    seen = [(run.name, outcome.get((check, channel))) for run, outcome in zip(runs, outcomes, strict=True)]
-    if any(one is Sound.YES for _, one in seen):
-        return None
-    return next(((name, one) for name, one in seen if isinstance(one, ChannelFault)), None)
-
-
-def _is_measured(run: Run, channel: str) -> bool:
-    return channel in WHOLE or (channel in run and bool(np.isfinite(run[channel]).any()))
-
-
-def _finding(run: Run, kind: str, channel: str, fault: ChannelFault) -> IntakeFinding:
-    time = None if fault.row is None else float(run["t"][fault.row] - run["t"][0])
-    return IntakeFinding(run.name, channel, kind, fault.text, True, time, fault.expected, fault.remedy)
 
 
 def place(channel: str) -> str:
@@ -164,7 +152,6 @@ def rate_of(run: Run, joint: str) -> Array:
 
 
 # ---- the run as a whole ----------------------------------------------------------------------------------------------
-
 
 #: s; shorter runs hold no window to compare.
 LEAST_SECONDS = 3.0
@@ -268,7 +255,6 @@ def stands_still(run: Run, channel: str, robot: Robot) -> Outcome:
 
 
 # ---- joints ----------------------------------------------------------------------------------------------------------
-
 
 #: Rows that a correlation needs.
 LEAST_ROWS = 100
@@ -528,7 +514,6 @@ def _stretches(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 # ---- inertial sensors ------------------------------------------------------------------------------------------------
 
-
 #: Turning by the gyroscope over turning by another sensor that means degrees per second: 57.3 against a true reference. Wheels
 #: that slip in a turn show two to three times the turn, and accelerations more tilt than there is: 17 to 57. Sound: 0.2 to 1.
 IN_DEGREES = 8.0
@@ -702,7 +687,6 @@ def _longest(chosen: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 # ---- all checks ------------------------------------------------------------------------------------------------------
-
 
 #: In the order in which they are made: what a check compares with has been checked before.
 CHECKS: tuple[IntakeCheck, ...] = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -19,9 +20,8 @@ from wlr_gym.data.runs import Run, read_dataset
 from wlr_gym.data.sensors import channel_noise, noise_parts
 from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
-from wlr_gym.gap.robot.candidates import formula_candidates, robot_candidates, shown_by, tried_effects
+from wlr_gym.gap.robot.candidates import Knob, formula_candidates, knobs, robot_candidates, shown_by, tried_effects, write
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
-from wlr_gym.gap.robot.quantities import Knob, knobs, write
 from wlr_gym.gap.robot.replay_loop import TRUTH, Replays
 from wlr_gym.gap.robot.simulate import KERNELS, PHYSICS_STEP, kernel_of, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, RunClock, anchored_residuals
@@ -129,7 +129,10 @@ class RobotProblem:
             for run in runs
         ]
 
-        self._compared = [_once_read(*one) for one in zip(self._measured, self.clocks, strict=True)]
+        self._compared = [values.copy() for values in self._measured]
+        for values, clock in zip(self._compared, self.clocks, strict=True):
+            if not clock.lead:  # a robot that is put into motion has no torque and no acceleration in its first row
+                values[0, UNREAD] = np.nan
 
     def times(self, run: int) -> Array:
         """Return the times (rows,) of a run, s."""
@@ -253,7 +256,12 @@ class RobotProblem:
         more, formulas = formula_candidates([self.times(r) - self.times(r)[0] for r in runs], residuals)
         possible = [probe for probe in (*probes, *more) if self._possible(setting, probe)]
         keys = {probe.key for probe in possible} | set(tolerances)
-        return possible, [usable for candidate in (*candidates, *formulas) if (usable := _with_starts(candidate, keys))]
+        usable = []  # candidates with those of their starts whose probes there are
+        for candidate in (*candidates, *formulas):
+            starts = tuple(one for one in candidate.starts if keys.issuperset(itertools.chain(*one.directions)))
+            if starts:
+                usable.append(replace(candidate, starts=starts))
+        return possible, usable
 
     def _possible(self, setting: Setting, probe: Probe) -> bool:
         """Whether a robot can have a probe's effects beside those it has.
@@ -300,15 +308,6 @@ class RobotProblem:
         return tuple(samples.values()), np.array(constants).reshape(len(settings), len(names))
 
 
-def _once_read(measured: Array, clock: RunClock) -> Array:
-    """What is compared of a run: a robot that is put into motion has no torque and no acceleration in its first row."""
-    if clock.lead:
-        return measured
-    compared = measured.copy()
-    compared[0, UNREAD] = np.nan
-    return compared
-
-
 def _place(channel: str) -> str:
     """The joint that a channel tells of; of the others, the body."""
     joint = channel.partition("_")[2]
@@ -331,12 +330,6 @@ def _taken(effects: Iterable[PatchEffect]) -> set[tuple[str, str]]:
     """Effects of which a place holds one, and their places."""
     searches = ((effect, EFFECTS[effect.name].search) for effect in effects if effect.name in EFFECTS)
     return {(effect.name, place) for effect, search in searches if search and search.one_per_place for place in effect.where}
-
-
-def _with_starts(candidate: Candidate, keys: set[str]) -> Candidate | None:
-    """The candidate with those of its starts whose probes there are; None where none is left."""
-    starts = tuple(start for start in candidate.starts if all(key in keys for part in start.directions for key in part))
-    return replace(candidate, starts=starts) if starts else None
 
 
 def _columns(truth: Array) -> dict[tuple[str, int], Array]:
@@ -373,7 +366,6 @@ def _features(truth: Array, t: Array) -> Mapping[str, Array]:
 
 
 # ---- opening a folder of runs ----------------------------------------------------------------------------------------
-
 
 #: Runs that an analysis needs: two to fit, one to hold out.
 LEAST_RUNS = 3

@@ -100,7 +100,6 @@ def arrive(now: Any, schedule: Any) -> None:
 
 # ---- what is read ----------------------------------------------------------------------------------------------------
 
-
 #: Ticks between two stored poses, from which the camera's are interpolated.
 POSE_TICKS = 3
 #: Truth channels that residuals are mapped over.
@@ -178,7 +177,8 @@ class Recorder:
         self._wheels = first.joint_position[:, WHEEL_SLICE]
         ticks = max(clock.ticks for clock in clocks) + 2
         rows = [len(clock.t) for clock in clocks]
-        columns = _truth_columns() if with_truth else np.zeros(0, np.int64)
+        every = np.arange(TRUTH_LAYOUT.width)
+        columns = np.concatenate([every[TRUTH_LAYOUT.slices[name] if with_truth else slice(0)] for name in TRUTH])
         self.tape: Tape = Tape(
             recent=np.zeros((3, count, len(CHANNELS))),
             shift=np.zeros((count, 4)),
@@ -212,7 +212,9 @@ class Recorder:
         anchor = int(np.searchsorted(tape.place[begin:end], tape.anchored[r]))
         first = max(anchor, int(np.searchsorted(clock.t[:last], clock.t[last] - horizon)))
         read = tape.values[self.settings * begin : self.settings * end].reshape(self.settings, end - begin, -1)
-        return _mean_or_zero(clock.efforts[first:last, WHEEL_SLICE] - read[:, first:last, _EFFORTS])
+        missing = clock.efforts[first:last, WHEEL_SLICE] - read[:, first:last, _EFFORTS]
+        known = np.isfinite(missing)
+        return np.where(known, missing, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
 
     def _mine(self, r: int) -> slice:
         return slice(r * self.settings, (r + 1) * self.settings)
@@ -233,18 +235,6 @@ class Recorder:
         values = tape.values[mine].reshape(shape)
         _show(tape.poses[:, self._mine(r)], offset, places, mount, scale, values[:, :, _CAMERA])
         return Replays(values, tape.truths[mine].reshape(shape) if self.with_truth else None)
-
-
-def _mean_or_zero(values: Array) -> Array:
-    """Means over the rows (settings, rows, columns) that are known; 0 where none is."""
-    known = np.isfinite(values)
-    return np.where(known, values, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-
-
-def _truth_columns() -> NDArray[np.int64]:
-    """Columns of the truth layout that :data:`TRUTH` names, in its order."""
-    columns = np.arange(TRUTH_LAYOUT.width)
-    return np.concatenate([columns[TRUTH_LAYOUT.slices[name]] for name in TRUTH])
 
 
 def _torque_changes(clocks: Sequence[RunClock], ticks: int, settings: int) -> dict[int, NDArray[np.bool_]]:
@@ -373,7 +363,6 @@ def _pose(stored: Any, offset: Any, out: Any) -> None:
 
 
 # ---- the loop --------------------------------------------------------------------------------------------------------
-
 
 #: First tick, last tick, which motors are on.
 Follow: TypeAlias = Callable[[int, int, NDArray[np.bool_] | None], None]

@@ -157,7 +157,9 @@ def _replay_chunk(
     lanes["command.delay"] = 0.0
     setpoints = WrittenSetpoints(clocks, run_of, delay)
     plant.use_setpoints(setpoints)
-    first = _join([_start(clock, robot, parameters) for clock in clocks])
+    states = [_start(clock, robot, parameters) for clock in clocks]
+    known = [name for name, value in vars(states[0]).items() if value is not None]
+    first = PlantState(**{name: np.concatenate([getattr(state, name) for state in states]) for name in known})
     try:
         recorder = Recorder(clocks, settings, first, delay, with_truth)
         readings = plant.reset(parameters=lanes, state=first)
@@ -283,8 +285,3 @@ def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
     reference[...] = wheels + (reference - wheels - per_rate * rates) * own_effort / per_effort + own_rate * rates
     state.time = np.full(count, clock.begin - clock.t[0])
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
-
-
-def _join(states: Sequence[PlantState]) -> PlantState:
-    known = [name for name, value in vars(states[0]).items() if value is not None]
-    return PlantState(**{name: np.concatenate([getattr(state, name) for state in states]) for name in known})

@@ -141,18 +141,14 @@ def anchored_residuals(t: Array, measured: Array, simulated: Array, noise: Array
     residual = measured - simulated
     residual[:, :, _PITCH] = _wrapped(residual[:, :, _PITCH])
     for window in windows:
-        for part in _parts(t, window):
+        for part in window_rows(t[window], WHEEL_WINDOW):
+            part = slice(window.start + part.start, window.start + part.stop)
             wheels = np.ascontiguousarray(residual[:, part, _WHEELS[0] : _WHEELS[-1] + 1])
             residual[:, part, _WHEELS[0] : _WHEELS[-1] + 1] = wheels - np.nanmean(wheels, axis=1, keepdims=True)
         _calm(residual[:, window])
         _take_out_pose(measured[window], simulated[:, window], residual[:, window], noise)
     residual /= noise
     return residual
-
-
-def _parts(t: Array, window: slice) -> list[slice]:
-    """Cut a window into parts over which wheel angles are compared."""
-    return [slice(window.start + p.start, window.start + p.stop) for p in window_rows(t[window], WHEEL_WINDOW)]
 
 
 def _calm(residual: Array) -> None:

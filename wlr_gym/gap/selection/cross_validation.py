@@ -98,8 +98,13 @@ def fit_finalists(
         wholes.append(cheapest(problem, both, current.noise.autocorrelation_time))
     if not wholes:
         return [], bare
-    autocorrelation_time = max(wholes, key=lambda whole: _own_gain(problem, whole, bare)).noise.autocorrelation_time
-    if bare.columns is current.columns and _far_apart(problem, bare.model, current.model):  # they are of another minimum
+    # the best of them is that which improves the fit most under the noise that it leaves itself
+    best = max(
+        wholes, key=lambda one: total_cost(problem, bare.model, bare.residuals, one.noise.autocorrelation_time) - one.cost
+    )
+    autocorrelation_time = best.noise.autocorrelation_time
+    apart = np.abs(scaled_numbers(problem, bare.model) - scaled_numbers(problem, current.model)).max(initial=0.0)
+    if bare.columns is current.columns and apart > 1.0:  # a tolerance or a step: they are of another minimum
         bare = _plain(problem, runs, bare, bare.model, None, autocorrelation_time)
     if not problem.thorough:
         pairs = zip(wholes, chosen, strict=True)
@@ -110,16 +115,6 @@ def fit_finalists(
         )
     found = [_evaluated(problem, runs, h, whole, bare, autocorrelation_time) for h, whole in zip(chosen, wholes, strict=True)]
     return sorted(found, key=lambda final: -final.hypothesis.gain), bare
-
-
-def _own_gain(problem: Problem, whole: Fit, bare: Fit) -> float:
-    """Improvement of the fit under the noise that a model itself leaves."""
-    return total_cost(problem, bare.model, bare.residuals, whole.noise.autocorrelation_time) - whole.cost
-
-
-def _far_apart(problem: Problem, one: FittedModel, other: FittedModel) -> bool:
-    """Whether a number of two models differs by more than a tolerance, or an unknown by more than a step."""
-    return bool(np.abs(scaled_numbers(problem, one) - scaled_numbers(problem, other)).max(initial=0.0) > 1.0)
 
 
 def worth_a_fit(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -289,14 +284,10 @@ def _tolerances_do(problem: Problem, runs: Sequence[int], threshold: float, fina
         ).cost
         for found in (bare, final.fit)
     ]
-    room = 1.0 if _has_a_number_of_its_own(final.hypothesis.candidate) else CLEARLY
+    met = [tolerance for tolerance in final.hypothesis.candidate.tolerances if tolerance is not None]
+    adds_to_one = bool(met) and all(len(tolerance.quantities) == 1 for tolerance in met)  # zero of a joint, camera's angle
+    room = 1.0 if adds_to_one else CLEARLY
     return costs[0] - costs[1] < room * asked_of(final.hypothesis.candidate, threshold)
-
-
-def _has_a_number_of_its_own(candidate: Candidate) -> bool:
-    """Whether each unknown that meets calibrated parameters adds to one of them (zero of a joint, angle of the camera)."""
-    met = [tolerance for tolerance in candidate.tolerances if tolerance is not None]
-    return bool(met) and all(len(tolerance.quantities) == 1 for tolerance in met)
 
 
 def shown_by_some_runs_only(hypothesis: Hypothesis, threshold: float) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.estimation.model import FittedModel, Noise
-from wlr_gym.gap.problem import Candidate, Problem, Unknown
+from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, asked_of
 
 Array = NDArray[np.float64]
@@ -73,7 +73,12 @@ class Hypothesis:
     @property
     def at_bound(self) -> bool:
         """Whether an unknown ended at the edge of its plausible range (other than its neutral value)."""
-        return any(_is_at_bound(unknown, value) for unknown, value in zip(self.candidate.unknowns, self.values, strict=True))
+        for unknown, value in zip(self.candidate.unknowns, self.values, strict=True):
+            low, high = unknown.bounds
+            too_much = value >= high - 1e-9 * abs(high) and high != unknown.neutral
+            if too_much or (value <= low + 1e-9 * abs(low) and low != unknown.neutral):
+                return True
+        return False
 
     @property
     def plausible(self) -> bool:
@@ -89,12 +94,6 @@ class Hypothesis:
         """Whether the runs agree that it is there."""
         help_, harm = self.by_run.clip(min=0.0).sum(), -self.by_run.clip(max=0.0).sum()
         return bool(harm <= MOST_HARM * help_)
-
-
-def _is_at_bound(unknown: Unknown, value: float) -> bool:
-    low, high = unknown.bounds
-    too_much = value >= high - 1e-9 * abs(high) and high != unknown.neutral
-    return too_much or (value <= low + 1e-9 * abs(low) and low != unknown.neutral)
 
 
 def within_tolerance(problem: Problem, model: FittedModel) -> bool:
@@ -123,7 +122,6 @@ def fall_by_run(before: Sequence[Array], after: Sequence[Array], noise: Noise) -
 
 
 # ---- probability -----------------------------------------------------------------------------------------------------
-
 
 #: Prior probability that nothing is missing; the names share the rest, and the places of a name share its part.
 NOTHING = 0.5
@@ -178,7 +176,6 @@ def credible_names(hypotheses: Sequence[Hypothesis], shares: Sequence[float]) ->
 
 
 # ---- bootstrap and equivalence ---------------------------------------------------------------------------------------
-
 
 #: Bootstrap samples of the runs.
 SAMPLES = 500

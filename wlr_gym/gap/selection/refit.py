@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,13 +93,18 @@ def _descended(problem: Problem, runs: Sequence[int], current: Fit, trials: list
     products = {key: channel_products(known, len(problem.signals), problem.threads) for key, known in kinds.items()}
     for done in range(rounds):
         autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
-        if done >= PATIENCE:
-            trials = _given_up(problem, trials, autocorrelation_time)
+        if done >= PATIENCE:  # what is far behind the best counts as converged
+            _, least = _least_costs(problem, trials, autocorrelation_time)
+            enough = HOPELESS * (least[-1] - min(least.values()))
+            trials = [replace(t, converged=t.converged or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
         going = [trial for trial in trials if not trial.converged]
         if not going:
             break
         moved_on = _improved(problem, runs, current, going, products)
-        trials = _hopeful(problem, [*(trial for trial in trials if trial.converged), *moved_on], autocorrelation_time)
+        both = [*(trial for trial in trials if trial.converged), *moved_on]
+        costs, least = _least_costs(problem, both, autocorrelation_time)
+        room = max(max(least.values()) - min(least.values()), LEAST_GAIN)
+        trials = [t for cost, t in zip(costs, both, strict=True) if cost - least[t.of] < BEHIND * room]  # the better start
     return trials
 
 
@@ -186,20 +192,6 @@ def _least_costs(
     return costs, {of: min(c for c, t in zip(costs, trials, strict=True) if t.of == of) for of in {t.of for t in trials}}
 
 
-def _hopeful(problem: Problem, trials: Sequence[_Trial], autocorrelation_time: Array) -> list[_Trial]:
-    """Of two starts of a hypothesis the better one, if the other is far behind."""
-    costs, least = _least_costs(problem, trials, autocorrelation_time)
-    room = max(max(least.values()) - min(least.values()), LEAST_GAIN)
-    return [t for c, t in zip(costs, trials, strict=True) if c - least[t.of] < BEHIND * room]
-
-
-def _given_up(problem: Problem, trials: Sequence[_Trial], autocorrelation_time: Array) -> list[_Trial]:
-    """The trials; those of hypotheses that are far behind the best count as converged."""
-    _, least = _least_costs(problem, trials, autocorrelation_time)
-    enough = HOPELESS * (least[-1] - min(least.values()))
-    return [replace(t, converged=t.converged or (t.of >= 0 and least[-1] - least[t.of] < enough)) for t in trials]
-
-
 def _starts(problem: Problem, current: Fit, scores: Sequence[Score], given: Sequence[NDArray[np.float32]]) -> list[_Trial]:
     """Where refits begin. The model as given keeps the effects found before."""
     as_given = untouched(problem, current.model)
@@ -235,37 +227,19 @@ def _simulated(problem: Problem, trials: Sequence[_Trial], runs: Sequence[int]) 
 
 
 def refit_thoroughly(problem: Problem, runs: Sequence[int], current: Fit, scores: Sequence[Score]) -> list[Hypothesis]:
-    """Fit every hypothesis in full, from its first guess and from its probes; best first."""
-    autocorrelation_time, scatter = current.noise.autocorrelation_time, current.noise.scatter
-    fits = [
-        min(
-            (
-                fit(
-                    problem,
-                    runs,
-                    current.model.with_effect(score.candidate, values),
-                    autocorrelation_time=autocorrelation_time,
-                    scatter=scatter,
-                    steps=problem.steps,
-                )
-                for values in _starting_values(score)
-            ),
-            key=lambda found: found.cost,
-        )
-        for score in scores
-    ]
-    fits.append(
-        fit(problem, runs, current.model, autocorrelation_time=autocorrelation_time, scatter=scatter, steps=problem.steps)
-    )
+    """Fit every hypothesis in full, from its first guess and from its first two probes; best first."""
+    noise = current.noise
+    options: Any = {"autocorrelation_time": noise.autocorrelation_time, "scatter": noise.scatter, "steps": problem.steps}
+    fits = []
+    for score in scores:
+        candidate = score.candidate
+        starts = dict.fromkeys((score.values, *(candidate.probed(start) for start in candidate.starts[:2])))
+        tried = [fit(problem, runs, current.model.with_effect(candidate, values), **options) for values in starts]
+        fits.append(min(tried, key=lambda found: found.cost))
+    fits.append(fit(problem, runs, current.model, **options))
     trials = [_Trial(k, found.columns, found.columns, found.model, found.residuals) for k, found in enumerate(fits)]
     autocorrelation_time = _best_autocorrelation_time(problem, current, trials)
     return _ranked(problem, scores, [t.model for t in trials], [t.residuals for t in trials], autocorrelation_time)
-
-
-def _starting_values(score: Score) -> list[tuple[float, ...]]:
-    """The first guess, and the first two probes."""
-    candidate = score.candidate
-    return list(dict.fromkeys((score.values, *(candidate.probed(start) for start in candidate.starts[:2]))))
 
 
 def _bordered(

@@ -24,7 +24,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,7 +235,6 @@ def shortened(candidate: Candidate, start: Start, amplitude: Array, shares: Sequ
 
 # ---- under the alternative -------------------------------------------------------------------------------------------
 
-
 #: Times that the noise follows the candidate.
 ROUNDS = 2
 #: Candidates that explain most squares, whatever their autocorrelation, and are scored under the alternative.
@@ -276,7 +274,7 @@ def rescored(
             groups.setdefault(signal.group, []).append(channel)
     here = replace(found, away=np.zeros_like(found.away))  # numbers that a group says nothing about stay
     alone = [
-        replace(system, found=here, channels=np.array(channels)).best(scores, SCORED_PER_GROUP)[0][0]
+        _System(problem, fit, here, products, np.array(channels)).best(scores, SCORED_PER_GROUP)[0][0]
         for channels in groups.values()
     ]
     return everywhere, sorted(alone, key=lambda score: -score.gain)
@@ -327,56 +325,21 @@ class Products:
         return Products(by_run, by_run_known, push_by_run, gram, push, np.asarray(square), rows, columns)
 
 
-@dataclass(frozen=True, eq=False)
 class _System:
-    """What candidates are scored with; ``channels``: the signals that count."""
+    """What candidates are scored with, of some signals (``channels``) or all; arrays as in :class:`Products`."""
 
-    problem: Problem
-    fit: Fit
-    found: Responses
-    products: Products
-    channels: NDArray[np.intp]
-
-    @property
-    def known(self) -> int:
-        """Number of fitted numbers."""
-        return len(self.found.tight)
-
-    @cached_property
-    def rows(self) -> Array:
-        """Measured rows (channels)."""
-        return self.products.rows[self.channels]
-
-    @cached_property
-    def square(self) -> Array:
-        """Squares of the residuals (channels)."""
-        return self.products.square[self.channels]
-
-    @cached_property
-    def push(self) -> Array:
-        """Products of columns and residuals (channels, columns)."""
-        return self.products.push[self.channels]
-
-    @cached_property
-    def gram(self) -> Array:
-        """Products of columns (channels, columns, columns)."""
-        return self.products.gram[self.channels]
-
-    @cached_property
-    def residuals(self) -> list[Array]:
-        """Residuals (channels, rows) of each run."""
-        return [np.ascontiguousarray(residual.T[self.channels]) for residual in self.fit.residuals]
-
-    @cached_property
-    def columns(self) -> list[NDArray[np.float32]]:
-        """Columns (channels, columns, rows) of each run."""
-        every = len(self.channels) == len(self.products.rows)
-        return self.products.columns if every else [columns[self.channels] for columns in self.products.columns]
-
-    @cached_property
-    def gram_known(self) -> Array:
-        """The same of the fitted numbers (channels, numbers, numbers)."""
-        return np.ascontiguousarray(self.gram[:, : self.known, : self.known])
+    def __init__(self, problem: Problem, fit: Fit, found: Responses, products: Products, channels: NDArray[np.intp]) -> None:
+        self.problem, self.fit, self.found, self.products = problem, fit, found, products
+        self.known: int = len(found.tight)
+        self.is_whole: bool = len(channels) == len(products.rows)
+        self.rows, self.square, self.push = products.rows[channels], products.square[channels], products.push[channels]
+        self.gram: Array = products.gram[channels]
+        self.gram_known: Array = np.ascontiguousarray(self.gram[:, : self.known, : self.known])
+        self.residuals: list[Array] = [np.ascontiguousarray(residual.T[channels]) for residual in fit.residuals]
+        every = products.columns
+        self.columns: list[NDArray[np.float32]] = every if self.is_whole else [columns[channels] for columns in every]
+        #: Of the model without a candidate, every row independent.
+        self.white = Noise(fit.noise.square[channels], np.full(len(channels), fit.noise.scatter), self.rows, fit.noise.scatter)
 
     def best(self, scores: Sequence[Score], count: int) -> tuple[list[Score], list[Score]]:
         """Return the candidates that explain most squares, or gain most under the noise of the model without them, best
@@ -395,7 +358,7 @@ class _System:
 
     def _rough(self, starts: Sequence[Start]) -> Array:
         """Improvement by each start if every row were independent: what orders candidates before their noise is known."""
-        weight, known = self._white().weight, self.known
+        weight, known = self.white.weight, self.known
         whole, push = np.tensordot(weight, self.gram, 1), weight @ self.push
         own, gradient = with_tolerances(whole[:known, :known].copy(), push[:known].copy(), self.found)
         following = -np.linalg.solve(own, np.column_stack([gradient, whole[:known]]))  # how the fitted numbers follow
@@ -408,18 +371,10 @@ class _System:
             amplitude = -np.linalg.solve(corner + border @ (following[:, 1:] @ mix.T), mix @ push + border @ following[:, 0])
             step += amplitude @ mix
             step[:known] += following[:, 1:] @ (amplitude @ mix)
-        after = channel_costs(np.maximum(self._squares(steps), 0.0) / np.maximum(self.rows, 1)) @ self.rows
-        return after[-1] - after[:-1]
-
-    def _squares(self, steps: Array) -> Array:
-        """Squares of the residuals (steps, channels) after steps of all columns (steps, columns)."""
         curved = in_threads(self.problem.threads, lambda gram: np.einsum("sm,sm->s", steps @ gram, steps), self.gram)
-        return self.square + 2.0 * steps @ self.push.T + np.stack(curved, axis=1)
-
-    def _white(self) -> Noise:
-        """The noise of the model without a candidate, every row independent."""
-        noise = self.fit.noise
-        return Noise(noise.square[self.channels], np.full(len(self.channels), noise.scatter), self.rows, noise.scatter)
+        squares = self.square + 2.0 * steps @ self.push.T + np.stack(curved, axis=1)  # (steps, channels) after them
+        after = channel_costs(np.maximum(squares, 0.0) / np.maximum(self.rows, 1)) @ self.rows
+        return after[-1] - after[:-1]
 
     def _parts(self, start: Start) -> _Directions:
         """Products of the fitted numbers and of the directions of a start."""
@@ -440,7 +395,7 @@ class _System:
     def _under_alternative(self, candidate: Candidate, start: Start) -> tuple[float, tuple[float, ...], Array]:
         """Improvement of the fit by one start of a candidate, the values it leads to, and the step of the fitted numbers."""
         parts, found, known = self._parts(start), self.found, self.known
-        noise = self._white() if len(self.channels) < len(self.products.rows) else self.fit.noise
+        noise = self.fit.noise if self.is_whole else self.white
         for _ in range(ROUNDS):
             x, _ = _step(parts, noise, found, candidate, start)
             noise = self._noise_after(parts, start, x)
@@ -466,7 +421,7 @@ class _System:
         own = series_times(left)
         scatter = self.fit.noise.scatter
         noise = Noise(parts.mean_squares(x), scatter * own, parts.rows, scatter)
-        if len(self.channels) == len(self.products.rows):
+        if self.is_whole:
             scatter = min(scatter, self._scatter(noise, start, x))
         return Noise(noise.square, scatter * own, parts.rows, scatter)
 
@@ -538,7 +493,6 @@ def _step(
 
 
 # ---- what chance gives -----------------------------------------------------------------------------------------------
-
 
 #: Draws of the signs.
 DRAWS = 200
@@ -623,7 +577,6 @@ def _block_pushes(problem: Problem, runs: Sequence[int], left: Sequence[Array], 
 
 
 # ---- what is refitted ------------------------------------------------------------------------------------------------
-
 
 #: Hypotheses that are refitted in one round for their scores, at most.
 SHORTLIST = 8

@@ -58,7 +58,9 @@ from wlr_gym.gap.selection.screening import (
 Array = NDArray[np.float64]
 Tell = Callable[[str], None]
 
-#: Share of :attr:`wlr_gym.gap.problem.Problem.misfit`, in units of sensor noise, above which an error is much.
+#: Share of :attr:`wlr_gym.gap.problem.Problem.misfit`, in units of sensor noise, above which an error is so much that effects
+#: whose refits have told nothing are worth a fit in full. Refits keep the calibrated parameters' responses of the model without
+#: the effect: where motors reach the voltage of their supply, a descent ends at once.
 MUCH_LEFT = 0.55
 #: Beside a formula, which only resembles the law, an effect must improve the fit by this share of what the formula did.
 BESIDE_FORMULA = 0.1
@@ -175,7 +177,7 @@ def search_effects(
     if given is None and not problem.thorough:
         given = linearise(problem, untouched(problem, start.model), runs)[1]
     current, calibrated, rounds, again = start, start, [], None
-    models = [start.model]
+    had = [[candidate.label for candidate, _ in start.model.effects]]
 
     def settled(bare: Fit) -> bool:
         """Whether the calibrated model stands: once calibrated anew it does, else where none without an effect is lower."""
@@ -185,7 +187,9 @@ def search_effects(
         first = screened(problem, runs, current, tell, excluded)
         scores, alone, found, products = first.scores, first.alone, first.found, first.products
         by_chance = np.zeros(0) if problem.thorough else largest_by_chance(problem, runs, current, found, products, scores)
-        threshold = max(acceptance_threshold(current.cost, by_chance), BESIDE_FORMULA * _by_formulas(current, rounds))
+        formulas = {candidate.label for candidate, _ in current.model.effects if candidate.formula}
+        gains = [one.gain for look in rounds if (one := look.selected) is not None and one.candidate.label in formulas]
+        threshold = max(acceptance_threshold(current.cost, by_chance), BESIDE_FORMULA * max(gains, default=0.0))
         visible = {score.candidate.label for score in first.linear if is_visible(score, threshold)}
         scores = [replace(score, visible=score.candidate.label in visible) for score in scores]
         chosen = scores if problem.thorough else with_proposals(shortlist(scores, threshold), alone)
@@ -200,7 +204,8 @@ def search_effects(
             finals, bare = fit_finalists(problem, runs, current, worth_a_fit(hypotheses), bare, tell)
         if settled(bare):
             accepted, finals, bare = accept(problem, runs, threshold, finals, bare, tell)
-        if accepted is None and _much_is_left(problem, bare) and settled(bare):
+        left = level(mean_squares(bare.residuals, problem.cap))
+        if accepted is None and left > MUCH_LEFT * problem.misfit and settled(bare):
             more, bare = fit_finalists(problem, runs, current, left_to_fit(hypotheses, finals), bare, tell)
             accepted, more, bare = accept(problem, runs, threshold, more, bare, tell)
             finals = sorted((*finals, *more), key=lambda final: -final.hypothesis.gain)
@@ -212,24 +217,19 @@ def search_effects(
             given = _as_given(problem, runs, current, given)
             continue
         merged = _merged(problem, finals, hypotheses, bare, accepted or (finals[0] if finals else None))
-        selected = None if accepted is None else _labelled(merged, accepted.hypothesis)
+        chosen_label = accepted and accepted.hypothesis.candidate.label
+        selected = next((one for one in merged if one.candidate.label == chosen_label), None)
         rounds.append(Round(scores, merged, selected, threshold, by_chance))
         if accepted is None:
             break
         tell(f"selected: {accepted.hypothesis.candidate.label}")
         current = widened(problem, runs, remove_redundant(problem, runs, accepted.fit, tell))
-        if len(current.model.effects) >= MOST_EFFECTS or any(_same(current.model, earlier) for earlier in models):
+        labels = [candidate.label for candidate, _ in current.model.effects]
+        if len(labels) >= MOST_EFFECTS or labels in had:
             break
-        models.append(current.model)
+        had.append(labels)
         given = _as_given(problem, runs, current, given)
     return SearchResult(calibrated, current, rounds, swap_each(problem, runs, current) if problem.thorough else {})
-
-
-def _by_formulas(current: Fit, rounds: Sequence[Round]) -> float:
-    """The largest improvement by a formula that the model has."""
-    formulas = {candidate.label for candidate, _ in current.model.effects if candidate.formula}
-    selected = [look.selected for look in rounds if look.selected is not None]
-    return max((one.gain for one in selected if one.candidate.label in formulas), default=0.0)
 
 
 def _as_given(
@@ -279,15 +279,6 @@ def _deeper(problem: Problem, current: Fit, bare: Fit) -> bool:
     return min(lower) > LEAST_GAIN
 
 
-def _much_is_left(problem: Problem, found: Fit) -> bool:
-    """Whether so much is left that effects whose refits have told nothing are worth a fit in full.
-
-    Refits keep the calibrated parameters' responses of the model without the effect: where motors reach the voltage of their
-    supply, a descent ends at once.
-    """
-    return level(mean_squares(found.residuals, problem.cap)) > MUCH_LEFT * problem.misfit
-
-
 def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tuple[Hypothesis, list[Hypothesis]]]:
     """Put every candidate in the place of each effect of a model of several, and fit it there."""
     swaps: dict[str, tuple[Hypothesis, list[Hypothesis]]] = {}
@@ -309,10 +300,6 @@ def swap_each(problem: Problem, runs: Sequence[int], final: Fit) -> dict[str, tu
         if own:
             swaps[candidate.label] = (own[0], rivals)
     return swaps
-
-
-def _same(one: FittedModel, other: FittedModel) -> bool:
-    return [candidate.label for candidate, _ in one.effects] == [candidate.label for candidate, _ in other.effects]
 
 
 def remove_redundant(problem: Problem, runs: Sequence[int], current: Fit, tell: Tell = lambda text: None) -> Fit:
@@ -364,12 +351,7 @@ def _merged(
     return sorted(merged, key=lambda hypothesis: -hypothesis.gain)
 
 
-def _labelled(hypotheses: Sequence[Hypothesis], wanted: Hypothesis) -> Hypothesis:
-    return next(hypothesis for hypothesis in hypotheses if hypothesis.candidate.label == wanted.candidate.label)
-
-
 # ---- outcomes --------------------------------------------------------------------------------------------------------
-
 
 #: Reason why an effect that was selected is not kept.
 REFUTED = "the held-out runs refute it"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,7 +134,11 @@ def information_of(problem: Problem, residuals: Sequence[Array], columns: Sequen
         if not candidate.formula:
             largest.setdefault(candidate.name, candidate)
     places = {quantity.name: k for k, quantity in enumerate(problem.quantities)}
-    added = {name: rows for name, candidate in largest.items() if (rows := _numbers_of(candidate, places))}
+    added: dict[str, list[int]] = {}  # which numbers an effect adds to, if its first guess needs nothing else
+    for name, candidate in largest.items():
+        keys = {key: None for direction in candidate.starts[0].directions for key in direction}
+        if keys and keys.keys() <= places.keys():
+            added[name] = [places[key] for key in keys]
     more = [candidate for name, candidate in largest.items() if name not in added]
     settings = [model.with_effect(one, one.probed(one.starts[0])).setting for one in more]
     found = problem.residuals(settings, runs) if settings else [np.zeros((0, *residual.shape)) for residual in residuals]
@@ -145,9 +149,3 @@ def information_of(problem: Problem, residuals: Sequence[Array], columns: Sequen
         np.stack([(one * one).sum(axis=1) for one in own]) / AUTOCORRELATION_TIME,
         tuple(added.values()),
     )
-
-
-def _numbers_of(candidate: Candidate, places: Mapping[str, int]) -> list[int]:
-    """Which numbers an effect adds to, if its first guess needs nothing else; empty otherwise."""
-    keys = {key: None for direction in candidate.starts[0].directions for key in direction}
-    return [places[key] for key in keys] if keys.keys() <= places.keys() else []

@@ -96,12 +96,7 @@ def _beyond_need(problem: Problem, found: Sequence[Array], autocorrelation_time:
     """How much more the held-out runs gain by an effect, in minus two log likelihood, than they must.
 
     By chance they may lose, but not as much as an effect must gain to be selected (:data:`LEAST_GAIN`). Where their error
-    clearly grows, they must gain as much.
-
-    Args:
-        problem: the system.
-        found: residuals (2, rows, channels), one array per run, without the effect and with it.
-        autocorrelation_time: of the model with it.
+    clearly grows, they must gain as much. ``found``: residuals (2, rows, channels) per run, without the effect and with it.
     """
     before, after = (level(mean_squares([r[k] for r in found], problem.cap)) for k in (0, 1))
     grows = after > (1.0 + LEAST_GROWTH) * before
@@ -191,7 +186,6 @@ def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, flo
 
 
 # ---- channels that effects make worse --------------------------------------------------------------------------------
-
 
 #: s; length of a block.
 BLOCK = 2.0

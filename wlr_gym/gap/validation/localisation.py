@@ -115,7 +115,6 @@ def _heat_map(problem: Problem, rows: Array, channels: Sequence[int], name: str,
 
 # ---- traces ----------------------------------------------------------------------------------------------------------
 
-
 #: Traces of an analysis.
 MOST = 6
 #: Shown where nothing stands out.

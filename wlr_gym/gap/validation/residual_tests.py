@@ -129,13 +129,15 @@ def adequacy_of(problem: Problem, runs: Sequence[int], found: Fit) -> Adequacy |
         np.stack([one.autocorrelation_time for one in all_left]),
     )
     run, which = np.unravel_index(int(np.argmax(seen.pulls)), seen.pulls.shape)
+    names = [quantity.name for quantity in problem.quantities]
+    names += [f"{candidate.label} {one.name}" for candidate, _ in found.model.effects for one in candidate.unknowns]
     return Adequacy(
         REPLICATES,
         compared(np.sqrt(np.nanmean(levels**2, axis=1))),
         compared(np.exp(np.nanmean(np.log(autocorrelation_times), axis=1))),
         compared(np.array([one.scatter for one in all_left])),
         Pulled(
-            _number_names(problem, found)[which],
+            names[int(which)],
             problem.runs[runs[int(run)]],
             compared(np.array([one.pulls.max() for one in all_left])),
         ),
@@ -160,13 +162,7 @@ def compared(values: Array) -> Statistic:
     return Statistic(observed, float(np.median(others)), limit, (1 + larger) / (1 + len(others)))
 
 
-def _number_names(problem: Problem, found: Fit) -> list[str]:
-    effects = [f"{candidate.label} {unknown.name}" for candidate, _ in found.model.effects for unknown in candidate.unknowns]
-    return [*(quantity.name for quantity in problem.quantities), *effects]
-
-
 # ---- periodic residuals ----------------------------------------------------------------------------------------------
-
 
 #: Periods per turn that are tried.
 ORDERS = (1, 2, 3)
@@ -225,14 +221,11 @@ def _best_order(joint: str, signal: str, residuals: Sequence[Array], angles: Seq
 def _falls(runs: Sequence[tuple[Array, Array]], order: int) -> Array:
     """Squared residuals (5, runs): how far they fall with this order, with those beside it, with a wave in time, and all."""
     falls = [[_predicted(*run, other) for run in runs] for other in (order, order - BESIDE, order + BESIDE)]
-    in_time = [_predicted(residual, _steady(angle), order) for residual, angle in runs]
+    in_time = []  # over the same turning at one speed, a clock's
+    for residual, angle in runs:
+        rows = np.arange(len(angle))
+        in_time.append(_predicted(residual, np.polyval(np.polyfit(rows, angle, 1), rows), order))
     return np.array([*falls, in_time, [float(residual @ residual) for residual, _ in runs]])
-
-
-def _steady(angle: Array) -> Array:
-    """The same turning at one speed: a clock's."""
-    rows = np.arange(len(angle))
-    return np.asarray(np.polyval(np.polyfit(rows, angle, 1), rows), np.float64)
 
 
 def _share(falls: Array) -> float:
