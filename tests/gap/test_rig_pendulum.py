@@ -37,8 +37,7 @@ from wlr_gym.gap.rig.problem import LOST, law_candidates, smoothed_state
 from wlr_gym.gap.selection.search import search_effects
 from wlr_gym.gap.validation.data_split import named_split
 from wlr_gym.gap.workflow import analyse
-from wlr_gym.physics.effects import Patch, save_patch
-from wlr_gym.physics.effects.effect import PatchEffect
+from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
 from wlr_gym.physics.plants.drive import TEETH_DAMPING, fitted_weight
 from wlr_gym.physics.servo import motor_constants, motor_torque
 
