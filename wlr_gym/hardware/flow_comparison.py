@@ -1,4 +1,4 @@
-"""Is what the flow sensor says plausible beside wheels and gyroscope? One that is mounted turned or measures wrong is found.
+"""The flow sensor against wheels and gyroscope: is it plausible while the robot drives, how is it mounted, what is its scale.
 
 Over way that the wheels roll, slip is small as a rule and along the wheels' heading: flow that points elsewhere is no slip.
 """
@@ -123,7 +123,7 @@ class FlowSupervision:
             self._note = "" if RATIO[0] < ratio < RATIO[1] else f"way: {ratio:.2f} of the wheels' (slip, or a wrong scale)"
 
 
-# --- scale and mounting of an optical-flow sensor from a straight drive or push: against the wheels, or a tape measure
+# ---- scale and mounting from a straight drive ----
 
 
 #: rad/s of yaw up to which a row counts: then all wheels roll alike.

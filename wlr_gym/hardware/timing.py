@@ -1,4 +1,4 @@
-"""Clocks; control steps against absolute deadlines, and statistics of what they took."""
+"""Clocks; control steps against absolute deadlines, and statistics of what they took; real-time scheduling."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ class Pacer:
         return found | {name: percentiles(values) for name, values in times.items() if len(values)}
 
 
-# --- real-time scheduling (Linux): the program that drives goes before all others, and its memory is not swapped out --
+# ---- real-time scheduling (Linux) ----
 
 
 #: Arguments of mlockall (sys/mman.h): what is mapped now, and what will be.

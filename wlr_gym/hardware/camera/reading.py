@@ -1,4 +1,7 @@
-"""Which camera sees the robot, and what it sees, loaded from ``configs/camera/*.yaml``."""
+"""A camera above the floor: its file (``configs/camera/*.yaml``), its readings, and when each frame was exposed.
+
+One reading per frame, with a pose or with the reason why there is none.
+"""
 
 from __future__ import annotations
 
@@ -121,7 +124,7 @@ def load_camera_file(source: str | Path | CameraFile) -> CameraFile:
     return parse_config(CameraFile, content, where)
 
 
-# --- what the camera hands to the control loop: one reading per frame, with a pose or with the reason why there is none
+# ---- readings ----
 
 
 Array = NDArray[np.float64]
@@ -204,7 +207,7 @@ def unpack(data: bytes) -> CameraReading:
     return CameraReading(number, time, arrival, found, STATUSES[status], pose, covariance)
 
 
-# --- when a frame was exposed, on this computer's clock: from the driver's time stamp, or from its arrival ------------
+# ---- when a frame was exposed ----
 
 
 #: s within which a driver's stamp and the arrival are taken to be of one clock (Linux drivers stamp by the monotonic one).

@@ -1,4 +1,8 @@
-"""True poses of an emulated robot, from its process to the one that films it by rendering: a ring in shared memory."""
+"""Frames of an emulated robot, rendered from its true pose, and what can go wrong with a camera.
+
+:class:`PoseFeed` brings true poses from the emulator's process to the one that films it: a ring in shared memory. Nothing but
+pictures, their time stamps and their arrival leaves this module; the detector finds the pose, as on the robot.
+"""
 
 from __future__ import annotations
 
@@ -110,7 +114,7 @@ def scene_pose(pose: RobotPose) -> ScenePose:
     return ScenePose(pose.position, rotation_matrix(pose.quaternion[None])[0], pose.legs)
 
 
-# --- frames of an emulated robot, rendered from its true pose, and what can go wrong with a camera --------------------
+# ---- pictures ----
 
 
 #: Instants of an exposure at which the robot is drawn.

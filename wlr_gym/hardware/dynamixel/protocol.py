@@ -103,7 +103,7 @@ class Status(NamedTuple):
         return self.error & ~ALERT
 
 
-# --- CRC and stuffing -------------------------------------------------------------------------------------------------
+# ---- encoding ----
 
 
 def stuff(body: bytes) -> bytes:

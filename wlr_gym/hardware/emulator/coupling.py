@@ -17,7 +17,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.checks import check_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.tables import (
     CURRENT_MODE,
@@ -133,14 +134,14 @@ class PlantCoupling:
             if not self._torque[0, k]:
                 self._own_law[k] = False
                 continue
-            setpoint = self._native_setpoint if native else self._voltage_setpoint
-            self._setpoints[0, k], tuning = setpoint(k, drive, servo)
+            wanted = self._native_setpoint(k, drive) if native else self._voltage_setpoint(k, drive, servo)
+            self._setpoints[0, k], tuning = wanted
             if tuning != self._tuning[k]:
                 self._tuning[k], retune = tuning, True
         if retune:
             self._tune()
 
-    def _native_setpoint(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> tuple[float, tuple[float, ...]]:
+    def _native_setpoint(self, k: int, drive: MotorDrive) -> tuple[float, tuple[float, ...]]:
         """Return the plant's setpoint for a mode that the plant has itself, and its gains and profile."""
         if _IS_LEG[k]:
             gain = drive.position_gain * self._gain_factor[k]
@@ -243,8 +244,7 @@ class PlantCoupling:
         Raises:
             InputError: no such joint, or a torque beyond the parameter's bounds.
         """
-        if joint not in JOINTS:
-            raise unknown_name("joint", joint, JOINTS)
+        check_name("joint", joint, JOINTS)
         self._parameters["servo.coulomb_friction"][0, JOINTS.index(joint)] = torque
         self.plant.set_parameters(self._parameters)
 

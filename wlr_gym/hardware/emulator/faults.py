@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.checks import check_name
+from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.camera.reading import CAMERA_FAULTS
 
 
@@ -106,12 +107,10 @@ def parse_fault(text: str, places: Collection[str]) -> Fault:
         InputError: unknown kind, place or key, or a value that is no number in range; names the nearest valid one.
     """
     kind, *words = text.split() or [""]
-    if kind not in FAULTS:
-        raise unknown_name("fault", kind, FAULTS)
+    check_name("fault", kind, FAULTS)
     where = tuple(word for word in words if "=" not in word)
     for place in where:
-        if place not in places:
-            raise unknown_name("place", place, places, f"fault '{text}'")
+        check_name("place", place, places, f"fault '{text}'")
     numbers = {"value": FAULTS[kind].value, "duration": FAULTS[kind].duration}
     for word in words:
         if "=" in word:
@@ -121,8 +120,7 @@ def parse_fault(text: str, places: Collection[str]) -> Fault:
 
 
 def _number(key: str, text: str, where: str) -> float:
-    if key not in _KEYS:
-        raise unknown_name("key", key, _KEYS, f"fault '{where}'")
+    check_name("key", key, _KEYS, f"fault '{where}'")
     try:
         value = float(text)
     except ValueError:

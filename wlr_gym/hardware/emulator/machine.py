@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from wlr_gym.base.checks import check_name
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.hardware.config import FlowPort, Hardware, check_fit
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, error_names, load_table
@@ -213,8 +214,7 @@ class Machine:
         Raises:
             InputError: unknown joint, torque that is on, or a plant whose state cannot be set.
         """
-        if joint not in JOINTS:
-            raise unknown_name("joint", joint, JOINTS)
+        check_name("joint", joint, JOINTS)
         self.coupling.turn(joint, angle)
 
     def straighten(self, leg: str) -> None:
@@ -223,8 +223,7 @@ class Machine:
         Raises:
             InputError: unknown leg, torque that is on, or a plant whose state cannot be set.
         """
-        if leg not in LEGS:
-            raise unknown_name("leg", leg, LEGS)
+        check_name("leg", leg, LEGS)
         self.turn(leg, float(np.pi / 2 - self.plant.mechanical_state().joint_position[0, JOINTS.index(leg)]))
 
     # ---- IMU ----
@@ -377,8 +376,8 @@ def run_command(machine: Machine, text: str) -> str:
     if word in FAULTS:
         return f"{machine.time:.3f} s: {machine.inject(text)}"
     if word == "clear":
-        if rest and rest[0] not in FAULTS:
-            raise unknown_name("fault", rest[0], FAULTS)
+        if rest:
+            check_name("fault", rest[0], FAULTS)
         machine.clear(rest[0] if rest else None)
         return "cleared"
     if word == "turn":
