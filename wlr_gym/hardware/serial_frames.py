@@ -109,7 +109,7 @@ class SerialDevice:
         """Return all bytes that have come; does not wait."""
         data = b""
         for _ in range(_LARGEST_BACKLOG):
-            part = self.wait(0.0)
+            part = self.serial.read(_CHUNK)
             data += part
             if not part:
                 break
