@@ -135,8 +135,9 @@ class Machine:
         self.faults: FaultBoard = FaultBoard(self.options.seed)
         self.watchers: list[Callable[[], None]] = []
         port, sensor = hardware.flow, robot.sensors.flow
-        has_flow = port is not None and sensor is not None
-        self._flow = EmulatedFlow(port, sensor, self.faults, self.options.tick) if has_flow else None
+        self._flow: EmulatedFlow | None = None
+        if port is not None and sensor is not None:
+            self._flow = EmulatedFlow(port, sensor, self.faults, self.options.tick)
         self.is_plugged: dict[str, bool] = dict.fromkeys([*hardware.buses, *self.sensors], True)
         self.pulls: dict[str, int] = dict.fromkeys(self.is_plugged, 0)
         self._due: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in self.is_plugged}
