@@ -42,7 +42,7 @@ def test_an_emulated_camera_is_for_an_emulated_robot():
 
 def test_a_camera_is_no_part_of_a_simulator(tmp_path):
     words = ["--backend", "mujoco", "--camera", "emulated", "--excitation", "straight", "--out", str(tmp_path)]
-    with pytest.raises(InputError, match="--camera is about the robot: leave --backend mujoco out"):
+    with pytest.raises(InputError, match="--camera: it is about the robot: leave --backend mujoco out"):
         run_command("record", words)
 
 

@@ -789,7 +789,7 @@ def test_options_that_make_no_sense(tmp_path):
     for words, message in (
         (["--tests", "latncy", "--out", str(tmp_path)], "unknown test 'latncy' (did you mean 'latency'?)"),
         ([], "--out: expected a folder"),
-        (["--fault", "drop legs", "--out", str(tmp_path)], "--fault is for the emulated robot"),
+        (["--fault", "drop legs", "--out", str(tmp_path)], "--fault: it is for the emulated robot"),
         (["--effects", "stiff_leg", "--out", str(tmp_path)], "--effects: a real robot has its own"),
     ):
         with pytest.raises(InputError, match=re.escape(message)):

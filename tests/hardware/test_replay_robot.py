@@ -97,9 +97,9 @@ def test_segments_forgive_what_wheels_drifted_and_nothing_else(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"backend": "mujoco"}, "--emulated is about the robot: add --backend dynamixel"),
-        ({"backend": "mujoco", "emulated": False, "hardware": "no.yaml"}, "--hardware is about the robot: add --backend"),
-        ({"backend": "mujoco", "emulated": False, "yes": True}, "--yes is about the robot: add --backend dynamixel"),
+        ({"backend": "mujoco"}, "--emulated: it is about the robot: add --backend dynamixel"),
+        ({"backend": "mujoco", "emulated": False, "hardware": "no.yaml"}, "--hardware: it is about the robot: add --backend"),
+        ({"backend": "mujoco", "emulated": False, "yes": True}, "--yes: it is about the robot: add --backend dynamixel"),
         ({"video": "a.webp"}, "--video: a film needs a simulator"),
         ({"emulated": False, "port": ("leg=/dev/x",), "yes": True}, "no bus 'leg'"),
     ],

@@ -88,7 +88,7 @@ def test_another_robot_is_refused(old, tmp_path):
     [
         (["--reseal"], "expected policies"),
         (["--reseal", "pid"], "'pid' is an agent"),
-        (["--reseal", "velocity_blind", "--out", "x.onnx"], "neither --out nor --card"),
+        (["--reseal", "velocity_blind", "--out", "x.onnx"], "--out: --reseal rewrites policies where they are: leave it out"),
         (["velocity_blind", "--robot", "nominal"], "--robot: of archives (.zip) and with --reseal only"),
         (["velocity_blind", "path_blind"], "expected one policy, got 2"),
     ],

@@ -15,16 +15,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
+from rich.console import Console
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
+from wlr_gym.base.text import duration
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import Count, JsonOption, PatchOption, Seed, SensorsOption, port_pairs
-from wlr_gym.cli.terminal import print_json, wait_for_enter
+from wlr_gym.cli.options import Count, JsonOption, PatchOption, Seed, SensorsOption, port_pairs, refuse_given
+from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
+from wlr_gym.policy import policy_environment
+from wlr_gym.robot import load_robot
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.learning.adaptation import Adapted
     from wlr_gym.learning.adaptation.driving import RealRobot
 
@@ -80,8 +82,6 @@ def run(options: AdaptOptions) -> int:
     Raises:
         InputError: bad options, runs of another robot, a policy that does not fit, a folder of another command.
     """
-    from rich.console import Console
-
     from wlr_gym.learning.adaptation import adapt
     from wlr_gym.learning.adaptation.state import NUMBERS_FILE
 
@@ -128,18 +128,16 @@ def _check(options: AdaptOptions) -> None:
         raise InputError(f"nothing to adapt to: give {robots}")
     if options.emulated and (options.robot_runs or options.hardware):
         raise InputError("--emulated: an emulated robot, a real one (--hardware) or its runs (--robot-runs): one of them")
-    if options.effects and not options.emulated:
-        raise InputError("--effects: a real robot has its own; they are for --emulated")
-    if options.port and options.hardware is None:
-        raise InputError("--port: it goes with --hardware")
+    if not options.emulated:
+        refuse_given(options, ("effects",), "it is for the emulated robot: a real one has its own")
+    if options.hardware is None:
+        refuse_given(options, ("port",), "it goes with --hardware")
 
 
 def _real(options: AdaptOptions, console: Console) -> RealRobot:
     from wlr_gym.hardware.config import load_hardware, with_ports
     from wlr_gym.hardware.safety.preflight import require_ports
     from wlr_gym.learning.adaptation import RealRobot
-    from wlr_gym.policy import policy_environment
-    from wlr_gym.robot import load_robot
 
     hardware, ports = options.hardware or "nominal", port_pairs(options.port)
 
@@ -153,8 +151,6 @@ def _real(options: AdaptOptions, console: Console) -> RealRobot:
 
 
 def _print(found: Adapted, content: dict[str, Any], console: Console) -> None:
-    from wlr_gym.base.text import duration
-    from wlr_gym.cli.terminal import print_table
     from wlr_gym.learning.adaptation.state import headline
 
     rows = [

@@ -14,17 +14,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import numpy as np
+from rich.console import Console
 from tyro.conf import Positional
 
 from wlr_gym.base.checks import Interval, check_name
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import check_new_file, make_output_folder, refuse_existing
 from wlr_gym.base.paths import find_config
+from wlr_gym.base.progress import progress
 from wlr_gym.base.text import tally
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import Count, ForceOption, JsonOption, RobotOption, WiredRobotOption
 from wlr_gym.cli.terminal import NobodyThereError, ask_terminal, print_json
-from wlr_gym.robot import JOINTS, LEGS, full_name
+from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
+from wlr_gym.perception.markers.targets import load_target
+from wlr_gym.robot import JOINTS, LEGS, Robot, full_name, load_robot
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,7 +40,6 @@ if TYPE_CHECKING:
     from wlr_gym.perception.markers.calibration import Board, Readout
     from wlr_gym.perception.markers.camera import Camera
     from wlr_gym.perception.vision.video import Frames
-    from wlr_gym.robot import Robot
 
 #: Shows a text, waits for Enter, returns what was typed.
 Ask = Callable[[str], str]
@@ -174,9 +177,6 @@ def calibrate_camera(options: CameraOptions) -> int:
 
 
 def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[Camera, Readout]:
-    from rich.console import Console
-
-    from wlr_gym.base.progress import progress
     from wlr_gym.perception.markers.calibration import Readout, calibrate, calibrate_film
 
     with progress(Console(highlight=False)) as tell:
@@ -213,7 +213,6 @@ def write_targets(options: TargetsOptions) -> int:
     """Write the sheets into a folder."""
     require_package("cv2", "vision")
     from wlr_gym.perception.markers.calibration import Board
-    from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 
     body, floor = load_target(options.markers), load_target(options.floor)
@@ -421,8 +420,6 @@ def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
 @contextlib.contextmanager
 def _dialogue() -> Iterator[None]:
     """Turn trouble with the hardware into an :class:`InputError`: nothing moves, so there is nothing to save."""
-    from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
-
     try:
         yield
     except (NoAnswerError, RefusedError, ConnectionError) as error:
@@ -439,7 +436,6 @@ def calibrate_flow(options: FlowOptions) -> int:
     from wlr_gym.hardware.calibration import with_flow_calibration
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.flow_comparison import calibrate_flow as find
-    from wlr_gym.robot import load_robot
 
     hardware = load_hardware(options.hardware)
     robot = load_robot(options.robot or hardware.robot or "nominal")

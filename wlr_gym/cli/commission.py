@@ -13,22 +13,22 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
 from wlr_gym.base.paths import find_config
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, RobotOption
+from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, RobotOption, refuse_given
 from wlr_gym.cli.terminal import ask_terminal, print_json, print_table
+from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.hardware.commissioning.runner import StandFinding, StandResult
     from wlr_gym.hardware.commissioning.stand import Person
     from wlr_gym.hardware.commissioning.stand_tests import StandTest
     from wlr_gym.hardware.config import Hardware, Measured
     from wlr_gym.hardware.link import Link
-    from wlr_gym.robot import Robot
 
 #: File in ``--out`` with all results.
 REPORT = "commission.json"
@@ -38,21 +38,16 @@ COPY = "hardware.yaml"
 
 @dataclass(frozen=True)
 class CommissionOptions(JsonOption, ForceOption, RobotOption, PatchOption):
-    """Test a robot on a stand.
-
-    Attributes:
-        out: folder for runs and results, made if it is not there; needed for all but --list.
-        tests: which tests to make; none = all. See --list. With --force, results of the others in --out are kept.
-        fault: with --emulated: what goes wrong, as in wlr emulate: "delay legs value=0.015".
-        list: show the tests.
-        yes: do not ask before each test, and write the hardware file; what hands have to do is asked for all the same.
-    """
-
     out: Path | None = None
+    """Folder for runs and results, made if it is not there; needed for all but --list."""
     tests: tuple[str, ...] = ()
+    """Which tests to make; none = all. See --list. With --force, results of the others in --out are kept."""
     fault: tuple[str, ...] = ()
+    """With --emulated: what goes wrong, as in wlr emulate: "delay legs value=0.015"."""
     list: bool = False
+    """Show the tests."""
     yes: bool = False
+    """Do not ask before each test, and write the hardware file; what hands have to do is asked for all the same."""
 
 
 def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> int:
@@ -65,8 +60,6 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
     Raises:
         InputError: unknown robot, hardware, test or patch, options that make no sense, ports that cannot be opened.
     """
-    from rich.console import Console
-
     from wlr_gym.hardware.commissioning.stand_tests import choose
 
     console = Console(soft_wrap=True, highlight=False, stderr=options.json)
@@ -76,8 +69,8 @@ def run(options: CommissionOptions, ask: Callable[[str], str] | None = None) -> 
         return OK
     if options.out is None:
         raise InputError("--out: expected a folder for runs and results")
-    if options.fault and not options.emulated:
-        raise InputError("--fault is for the emulated robot: add --emulated")
+    if not options.emulated:
+        refuse_given(options, ("fault",), "it is for the emulated robot: add --emulated")
     options.refuse_results(options.out, REPORT)
     if not (options.out / REPORT).is_file():  # a hardware file that no session wrote
         refuse_existing(options.out / COPY, options.force)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from rich.console import Console
+
 from wlr_gym.base.checks import Interval
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import output_folder, write_json, write_text
@@ -20,15 +22,15 @@ from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import Count, ForceOption, JsonOption, PatchOption, Seconds, Seed, settings_of
 from wlr_gym.cli.terminal import print_json, print_table
+from wlr_gym.robot import Robot, load_robot
+from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from wlr_gym.data.comparison import ComparedPlant, Comparison
+    from wlr_gym.data.compared_plants import ComparedPlant
+    from wlr_gym.data.comparison import Comparison
     from wlr_gym.data.comparison_report import ReportTable
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
-    from wlr_gym.robot import Robot
 
 
 #: Share of the time that driving takes, about; drawing takes the rest.
@@ -76,9 +78,7 @@ def run(options: CompareOptions) -> int:
     Raises:
         InputError: unknown plant, excitation, effect or robot, unreadable runs, numbers out of range.
     """
-    from rich.console import Console
-
-    from wlr_gym.data.comparison import parse_plant
+    from wlr_gym.data.compared_plants import parse_plant
     from wlr_gym.data.comparison_report import markdown, summary_table, tables
 
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
@@ -109,10 +109,9 @@ def run(options: CompareOptions) -> int:
 
 def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     from wlr_gym.data.excitations import EXCITATIONS, excite
+    from wlr_gym.data.read import read_runs
     from wlr_gym.data.record import motion_of
     from wlr_gym.data.replay import robot_of
-    from wlr_gym.data.runs import read_runs
-    from wlr_gym.robot import load_robot
 
     if options.runs is None:
         robot = load_robot(options.robot or "nominal")
@@ -128,7 +127,6 @@ def _patches(options: CompareOptions, motions: Sequence[Motion], robot: Robot) -
     """Return what to compare with, each tried on the parameters first so that a refusal leaves no folder behind."""
     from wlr_gym.data.comparison import severe_patch
     from wlr_gym.physics.effects import EFFECTS, apply_patch, compose
-    from wlr_gym.robot.parameters import Parameters
 
     given = options.patch()
     patches = [given]

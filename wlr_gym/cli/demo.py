@@ -16,11 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.console import Console
+
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import CONFIG_FILE, record_provenance
 from wlr_gym.base.settings import read_yaml
+from wlr_gym.base.text import duration
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
 from wlr_gym.cli.options import Count, ForceOption, JsonOption, Seed
 from wlr_gym.cli.terminal import print_json
@@ -56,9 +59,6 @@ def run(options: DemoOptions) -> int:
     Raises:
         InputError: bad options, or a folder that holds anything else.
     """
-    from rich.console import Console
-
-    from wlr_gym.base.text import duration
     from wlr_gym.demo import stage
     from wlr_gym.demo.page import write_page
     from wlr_gym.demo.workers import WORKERS, run_workers

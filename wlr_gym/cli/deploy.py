@@ -7,21 +7,35 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.text import Text
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import require_ending, require_output_place
 from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import JsonOption, PatchOption, Seconds, Seed, environment_of, note_untrained, port_pairs, read_camera
-from wlr_gym.cli.terminal import print_json, wait_for_enter
-from wlr_gym.robot import JOINTS
+from wlr_gym.cli.options import (
+    CameraOption,
+    JsonOption,
+    PatchOption,
+    Seconds,
+    Seed,
+    camera_note,
+    environment_of,
+    note_untrained,
+    port_pairs,
+    refuse_given,
+)
+from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
+from wlr_gym.envs.registry import task_source_of
+from wlr_gym.policy import Policy, contract_of, environment_for, make_policy, policy_environment, untrained
+from wlr_gym.robot import JOINTS, load_robot, robot_hash
 
 if TYPE_CHECKING:
     from wlr_gym.data.logs.write import McapStream
@@ -31,28 +45,20 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import DrivingPad, Keys
     from wlr_gym.hardware.safety.rules import RobotStatus
-    from wlr_gym.physics.plants.base import RobotOptions
-    from wlr_gym.policy import Policy
 
 
 @dataclass(frozen=True)
-class DeployOptions(JsonOption, PatchOption):
+class DeployOptions(JsonOption, PatchOption, CameraOption):
     policy: tyro.conf.Positional[str]
     """Policy file or folder, run folder, or name of an agent or shipped policy."""
     env: str | None = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
-    robot: str | None = None
+    robot: str | None = field(default=None, kw_only=True)
     """Robot file, or name in configs/robot/; default: that of the hardware file, else the policy's."""
-    hardware: str = "nominal"
-    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
-    port: tuple[str, ...] = ()
-    """Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0."""
-    emulated: bool = False
+    emulated: bool = field(default=False, kw_only=True)
     """Drive an emulated robot, which is started for the purpose."""
     stepped: bool = False
     """With --emulated: in emulated time, without ports: faster, and the same bits each time."""
-    camera: str | None = None
-    """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
     dry_run: bool = False
     """Do everything but write to the servos: nothing moves."""
     fault: tuple[str, ...] = ()
@@ -94,7 +100,7 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
         require_priority("--realtime", options.realtime)
     _check_emulation(options)
     _check_training(options)
-    read_camera(options.camera, options.emulated)
+    options.camera_file()
     options.patch()  # a bad one is refused before a robot is started for it
     _check_faults(options)
     require_output_place(options.out)
@@ -106,19 +112,15 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
 
 
 def _check_emulation(options: DeployOptions) -> None:
-    if not options.emulated and (options.stepped or options.fault):
-        raise InputError("--stepped and --fault are for the emulated robot: add --emulated")
+    if not options.emulated:
+        refuse_given(options, ("stepped", "fault", "effects"), "it is for the emulated robot: add --emulated")
     if options.stepped and options.realtime is not None:
         raise InputError("--realtime: emulated time is not real time; leave out --stepped")
-    if options.effects and not options.emulated:
-        raise InputError("--effects: a real robot has its own; add --emulated")
     if options.emulated and options.port:
         raise InputError("--port: the emulated robot brings its own ports")
 
 
 def _check_training(options: DeployOptions) -> None:
-    from wlr_gym.policy import untrained
-
     words = untrained(options.policy)
     if words and not (options.emulated or options.dry_run):
         raise InputError(f"{words}; a real robot moves with one of these, or with your own")
@@ -129,7 +131,6 @@ def _check_faults(options: DeployOptions) -> None:
         return
     from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.emulator import parse_fault
-    from wlr_gym.robot import JOINTS
 
     places = (*JOINTS, *load_hardware(options.hardware).buses, "imu", "flow", "camera")
     for fault in options.fault:
@@ -172,26 +173,20 @@ def run(options: DeployOptions) -> int:
     from wlr_gym.hardware.safety.preflight import require_ports
     from wlr_gym.hardware.timing import real_time
     from wlr_gym.learning.evaluation import make_core
-    from wlr_gym.policy import environment_for
 
     command = checked_command(options)
     environment = environment_of(options.env, options.policy)
     note_untrained([options.policy])
-    settings = robot_options(options)
-    keywords = {
-        "backend": "dynamixel",
-        "hardware": settings,
-        "robot": driven_robot(options),
-        "episode_length": options.seconds,
-    }
-    policy = _make_policy(options.policy, environment, keywords, command)
+    robot = driven_robot(options)
+    policy = _make_policy(options, environment, robot, command)
     console = Console()
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
+        ports = port_pairs(options.port)
         if options.emulated and not options.stepped:
-            ports = stack.enter_context(_emulator(options, console, keywords["robot"]))
-            poses = ports.pop(_POSES, None)
-            keywords["hardware"] = replace(settings, ports=ports, poses=None if poses is None else Path(poses))
-        core = make_core(environment, 1, environment_for(options.policy, keywords))
+            ports |= stack.enter_context(_emulator(options, console, robot))
+        poses = ports.pop(_POSES, None)
+        keywords = {"backend": "dynamixel", "hardware": _robot(options, ports, poses), "episode_length": options.seconds}
+        core = make_core(environment, 1, environment_for(options.policy, keywords | {"robot": robot}))
         stack.callback(core.close)
         _say_what_is_not_known(core, options.policy, console)
         loop = loop_of(core)
@@ -250,8 +245,6 @@ def driven_robot(options: DeployOptions) -> Any:
     made for another robot than that of the nominal wiring, it is the policy's.
     """
     from wlr_gym.hardware.config import load_hardware
-    from wlr_gym.policy import policy_environment
-    from wlr_gym.robot import load_robot, robot_hash
 
     made_for = policy_environment(options.policy).get("robot")
     if options.robot is not None or made_for is None:
@@ -263,37 +256,24 @@ def driven_robot(options: DeployOptions) -> Any:
     return made_for if options.hardware == DeployOptions.hardware and not is_same else wired
 
 
-def robot_options(options: DeployOptions) -> RobotOptions:
-    """Return which robot is driven, and how it is connected; an emulated one in real time gets its ports once it runs."""
-    from wlr_gym.physics.plants.base import RobotOptions
-
-    return RobotOptions(
-        hardware=options.hardware,
-        ports=port_pairs(options.port),
-        emulated=options.emulated and options.stepped,
-        dry_run=options.dry_run,
-        log=options.out,
-        deadman=_PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
-        effects=options.patch() if options.stepped else None,
-        camera=options.camera,
-        seed=options.seed,
-    )
-
-
-def _make_policy(source: str, environment: str, keywords: Mapping[str, Any], command: Mapping[str, float]) -> Policy:
+def _make_policy(options: DeployOptions, environment: str, robot: Any, command: Mapping[str, float]) -> Policy:
     """Return the policy; it needs no robot, so names and what does not fit are told before one is started.
 
     Raises:
         InputError: an unknown environment or command, a command out of range, or a policy that does not fit the environment.
     """
     from wlr_gym.envs.core import make_task
-    from wlr_gym.envs.registry import task_source_of
     from wlr_gym.envs.settings import read_settings
     from wlr_gym.envs.tasks import contract
     from wlr_gym.envs.tasks.terms import COMMANDS
-    from wlr_gym.policy import environment_for, make_policy
 
-    task = make_task(task_source_of(environment), read_settings(environment_for(source, keywords)))
+    keywords = {
+        "backend": "dynamixel",
+        "hardware": {"hardware": options.hardware},
+        "robot": robot,
+        "episode_length": options.seconds,
+    }
+    task = make_task(task_source_of(environment), read_settings(environment_for(options.policy, keywords)))
     for name, value in command.items():
         if name not in task.commands:
             raise unknown_name("command", name, task.commands, "--command")
@@ -302,15 +282,31 @@ def _make_policy(source: str, environment: str, keywords: Mapping[str, Any], com
             raise InputError(
                 f"--command {name}={value:g}: expected {low:g} to {high:g} ({COMMANDS[name].unit}), the range of the task"
             )
-    return make_policy(source, contract(task, {}))
+    return make_policy(options.policy, contract(task, {}))
+
+
+def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> dict[str, Any]:
+    """Return which robot is driven, and how it is connected."""
+    return {
+        "hardware": options.hardware,
+        "ports": ports,
+        "emulated": options.emulated and options.stepped,
+        "effects": options.patch() if options.stepped else None,
+        "camera": options.camera,
+        "poses": None if poses is None else Path(poses),
+        "dry_run": options.dry_run,
+        "log": options.out,
+        "seed": options.seed,
+        "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
+    }
 
 
 def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Console) -> list[DrivingPad]:
     """Return the gamepad that steers, or none; refuse one whose sticks steer none of the task's commands."""
-    if options.gamepad is None:
-        return []
     from wlr_gym.hardware.operator import DrivingPad
 
+    if options.gamepad is None:
+        return []
     terms, buttons = core.task.config.commands.terms, loop.hardware.gamepad
     ranges = {name: (float(terms[name][0]), float(terms[name][1])) for name in core.task.commands}
     text = f"gamepad: hold button {buttons.deadman} to drive; {buttons.stop}: stop; {buttons.motors_off}: motors off at once"
@@ -320,10 +316,10 @@ def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Co
 
 def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -> McapStream | None:
     """Return what writes the run into an MCAP file while it goes on, or None."""
-    if path is None:
-        return None
     from wlr_gym.data.logs.write import McapStream
 
+    if path is None:
+        return None
     loop.recorder.stream = stack.enter_context(McapStream(path, loop.recorder.columns[1:], loop.recorder.meta, loop.robot))
     return loop.recorder.stream
 
@@ -352,7 +348,6 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
     from wlr_gym.data.runs import write_robot
     from wlr_gym.hardware.config import load_hardware
-    from wlr_gym.robot import load_robot
 
     hardware = load_hardware(options.hardware)
     if hardware.flow is not None and hardware.flow.driver == "spi":
@@ -391,9 +386,6 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
 
 def _say_what_is_not_known(core: Core, policy: str, console: Console) -> None:
-    from wlr_gym.cli.options import camera_note
-    from wlr_gym.policy import contract_of
-
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
     try:
         trained = contract_of(policy)["environment"]
@@ -430,10 +422,6 @@ def _serving(
 
 
 def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
-    from rich.text import Text
-
-    from wlr_gym.cli.terminal import print_table
-
     colour = "green" if result.well else "red"
     console.print(Text.assemble(("ended: ", "bold"), (result.reason, colour)))
     statistics = result.statistics

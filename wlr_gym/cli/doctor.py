@@ -12,37 +12,34 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from rich.console import Console
+from rich.text import Text
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import CameraOption, JsonOption
 from wlr_gym.cli.terminal import print_json, wait_for_enter
+from wlr_gym.hardware.dynamixel.protocol import BusGoneError
+from wlr_gym.policy import camera_share, check_contract, contract_of, environment_for, find_policy, misses_camera
+from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.hardware.config import Hardware
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.safety.preflight import Check
-    from wlr_gym.robot import Robot
 
 
 @dataclass(frozen=True)
 class DoctorOptions(JsonOption, CameraOption):
-    """Look at a robot.
-
-    Attributes:
-        policy: policy file or folder, run folder or shipped policy that is to drive it: does it fit this robot?
-        mend: write the register values that mend what is wrong; says which, and asks first (servos' torque must be off).
-        scan: search every bus at every baud rate for servos, whatever their ids.
-        verbose: show every check of every joint.
-    """
-
     policy: Annotated[str | None, tyro.conf.Positional] = None
+    """Policy file or folder, run folder or shipped policy that is to drive it: does it fit this robot?"""
     mend: bool = False
+    """Write the register values that mend what is wrong; says which, and asks first (servos' torque must be off)."""
     scan: bool = False
+    """Search every bus at every baud rate for servos, whatever their ids."""
     verbose: bool = False
+    """Show every check of every joint."""
 
 
 def run(options: DoctorOptions) -> int:
@@ -51,10 +48,6 @@ def run(options: DoctorOptions) -> int:
     Raises:
         InputError: unknown robot, hardware or policy, nothing to scan.
     """
-    from rich.console import Console
-
-    from wlr_gym.policy import find_policy
-
     if options.policy is not None:
         find_policy(options.policy)
     if options.scan and options.emulated:
@@ -74,7 +67,6 @@ def run(options: DoctorOptions) -> int:
 
 def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions, console: Console) -> list[Check]:
     """Return all checks of ports, adapters, servos, buses, IMU and camera; mends and scans where that was asked for."""
-    from wlr_gym.hardware.dynamixel.protocol import BusGoneError
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight
     from wlr_gym.hardware.safety.preflight import check_camera
@@ -126,7 +118,6 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
     """Return whether a policy was made for this robot, its observations and its control period, and for its sensors."""
     from wlr_gym.hardware.safety.preflight import Check
     from wlr_gym.learning.evaluation.rollout import make_core
-    from wlr_gym.policy import camera_share, check_contract, contract_of, environment_for, misses_camera
 
     remedy = "Choose another policy, train it for this robot, or name the robot file it was trained with (--robot)."
     try:
@@ -152,7 +143,6 @@ def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Chec
 
 def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console) -> None:
     """Print who answers on the buses; raise ``BusGoneError`` where a port is gone."""
-    from wlr_gym.hardware.dynamixel.protocol import BusGoneError
     from wlr_gym.hardware.servos import find_servos
 
     for name in buses:
@@ -169,8 +159,6 @@ def _scan(link: Link, hardware: Hardware, buses: Sequence[str], console: Console
 
 
 def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) -> None:
-    from rich.text import Text
-
     from wlr_gym.hardware.safety.preflight import mendable
 
     for line, style in _lines(checks, options.verbose):

@@ -15,6 +15,8 @@ from wlr_gym.base.checks import Interval
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import PatchOption, Seconds, Seed
+from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.emulator import Machine, Server
@@ -22,43 +24,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EmulateOptions(PatchOption):
-    """Emulate the robot.
-
-    Attributes:
-        backend: simulator behind the servos.
-        robot: robot file, or name in configs/robot/; default: the one that the hardware file names.
-        hardware: hardware file (wiring, mounting, safety limits), or name in configs/hardware/.
-        links: folder for links to the ports with fixed names (one per bus, imu, and flow); made if it is not there.
-        control: path of a Unix socket that takes command lines.
-        fault: faults to start with, each in quotes.
-        stand: on a stand, wheels off the floor, for wlr calibrate joints; on the floor it collapses where motors are off.
-        stepped: time passes only by the command ``step SECONDS``; answers then come at once.
-        tick: emulated time per step, s.
-        usb_latency: how long the adapter holds back unfilled packets, s (16 ms as an FTDI adapter comes, 1 ms as advised).
-        wire_time: let bytes take their time on the wire.
-        factory: servos as out of the box: id 1, 57600 bit/s. They then answer all at once, as real ones do.
-        firmware: version the servos report; fast reads need 45.
-        seed: seed of sensor noise and faults.
-        seconds: stop after this long; 0 = run until Ctrl-C.
-        poses: file that the true pose goes into, for a camera that films by rendering (wlr deploy --camera).
-    """
-
     backend: str = "gibbs_appell"
+    """Simulator behind the servos."""
     robot: str | None = None
+    """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
     hardware: str = "nominal"
+    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
     links: Path | None = None
+    """Folder for links to the ports with fixed names (one per bus, imu, and flow); made if it is not there."""
     control: Path | None = None
+    """Path of a Unix socket that takes command lines."""
     fault: tuple[str, ...] = ()
+    """Faults to start with, each in quotes."""
     stand: bool = False
+    """On a stand, wheels off the floor, for wlr calibrate joints; on the floor it collapses where motors are off."""
     stepped: bool = False
+    """Time passes only by the command ``step SECONDS``; answers then come at once."""
     tick: Seconds = 0.001
+    """Emulated time per step, s."""
     usb_latency: Annotated[float, Interval("s", least=0.0)] = 0.001
+    """How long the adapter holds back unfilled packets, s (16 ms as an FTDI adapter comes, 1 ms as advised)."""
     wire_time: bool = True
+    """Let bytes take their time on the wire."""
     factory: bool = False
+    """Servos as out of the box: id 1, 57600 bit/s. They then answer all at once, as real ones do."""
     firmware: Annotated[int, Interval(least=0, most=255)] = 45
+    """Version the servos report; fast reads need 45."""
     seed: Seed = 0
+    """Seed of sensor noise and faults."""
     seconds: Annotated[float, Interval("s", least=0.0)] = 0.0
+    """Stop after this long; 0 = run until Ctrl-C."""
     poses: Path | None = None
+    """File that the true pose goes into, for a camera that films by rendering (wlr deploy --camera)."""
 
 
 def run(options: EmulateOptions) -> int:
@@ -100,8 +97,6 @@ def machine_of(options: EmulateOptions) -> Machine:
     from wlr_gym.hardware.emulator.machine import EmulatedStand
     from wlr_gym.physics.effects import apply_patch
     from wlr_gym.physics.plants import check_simulator
-    from wlr_gym.robot import load_robot
-    from wlr_gym.robot.parameters import Parameters
 
     check_simulator(options.backend, "--backend")
     timing = NO_TIME if options.stepped else LineTiming(wire=options.wire_time, usb_latency=options.usb_latency)

@@ -27,6 +27,7 @@ from wlr_gym.cli.options import (
     SensorsOption,
     environment_of,
     note_untrained,
+    refuse_given,
     settings_of,
 )
 from wlr_gym.cli.terminal import print_json, print_table
@@ -171,13 +172,9 @@ def _accept(options: EvaluateOptions) -> int:
     """Run the acceptance test, print its table, write it."""
     if len(options.policy) != 1:
         raise InputError(f"--accept: expected one policy, got {len(options.policy)}")
-    card_only = {
-        "--full": options.full, "--sweep": options.sweep, "--backend": options.backend, "--record": options.record,
-        "--video": options.video, "--seed": options.seed != FIRST_SEED,
-    }  # fmt: skip
-    given = [name for name, value in card_only.items() if value]
-    if given:
-        raise InputError(f"--accept: {given[0]} is of the card; leave it out")
+    refuse_given(
+        options, ("full", "sweep", "backend", "record", "video", "seed"), "it is of the card: leave it out with --accept"
+    )
     _subjects(options)
     if options.out is not None:
         refuse_existing(options.out / ACCEPTANCE_FILE, options.force)

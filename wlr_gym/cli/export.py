@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -20,12 +20,25 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing, require_ending
+from wlr_gym.base.provenance import PROVENANCE_FILE
+from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import ForceOption, JsonOption, environment_of
+from wlr_gym.cli.options import ForceOption, JsonOption, environment_of, refuse_given
 from wlr_gym.cli.terminal import print_json
-
-if TYPE_CHECKING:
-    from wlr_gym.policy import Parity
+from wlr_gym.envs.registry import task_name_of
+from wlr_gym.policy import (
+    Parity,
+    export_policy,
+    exportable,
+    fed_environment,
+    find_policy,
+    load_agent_config,
+    make_policy,
+    policy_environment,
+    shipped_names,
+    write_model_card,
+)
+from wlr_gym.policy.export import reseal
 
 #: Episodes whose observations are compared, and their length, s.
 ROBOTS = 16
@@ -76,10 +89,10 @@ def _do(options: ExportOptions) -> Any:
         raise InputError(f"expected one policy, got {len(options.policy)}; several go with --reseal")
     if options.policy[0].endswith(".zip"):
         return _import(options)
-    if options.robot is not None:
-        raise InputError("--robot: of archives (.zip) and with --reseal only; other policies carry the robot of their training")
-    if options.env or options.config or options.normalizer:
-        raise InputError("--env, --config and --normalizer: of archives (.zip) only; other policies say themselves")
+    refuse_given(
+        options, ("robot",), "of archives (.zip) and with --reseal only; other policies carry the robot of their training"
+    )
+    refuse_given(options, ("env", "config", "normalizer"), "of archives (.zip) only; other policies say themselves")
     if options.card is None:
         return _export(options)
     if options.out is None:
@@ -100,8 +113,9 @@ def _export_runs(options: ExportOptions, form: str) -> list[Path]:
     from wlr_gym.data.logs.write import FORMATS
     from wlr_gym.data.runs import read_run, some_runs
 
-    if any((options.card, options.env, options.config, options.normalizer, options.reseal, options.robot)):
-        raise InputError(f"--to {form} writes runs: the options of policies do not go with it")
+    refuse_given(
+        options, ("card", "env", "config", "normalizer", "reseal", "robot"), f"it is of policies; --to {form} writes runs"
+    )
     paths = [run for name in map(Path, options.policy) for run in (some_runs(name) if name.is_dir() else [name])]
     if not paths:
         raise InputError("--to: expected runs, or folders of runs")
@@ -128,11 +142,7 @@ def _check_targets(paths: Sequence[Path], targets: Sequence[Path], force: bool) 
 
 
 def _reseal(options: ExportOptions) -> dict[str, list[str]]:
-    from wlr_gym.policy import find_policy
-    from wlr_gym.policy.export import reseal
-
-    if options.out is not None or options.card is not None:
-        raise InputError("--reseal rewrites policies where they are: neither --out nor --card goes with it")
+    refuse_given(options, ("out", "card"), "--reseal rewrites policies where they are: leave it out")
     if not options.policy:
         raise InputError("--reseal: expected policies: files, folders or names of shipped ones")
     changes = {}
@@ -144,8 +154,6 @@ def _reseal(options: ExportOptions) -> dict[str, list[str]]:
 
 
 def _export(options: ExportOptions) -> dict[str, Any]:
-    from wlr_gym.policy import export_policy, exportable
-
     out, folder = _target(options), exportable(options.policy[0])
     make_output_folder(out.parent)
     print(f"exporting {options.policy[0]}, then comparing: some seconds", flush=True)
@@ -166,9 +174,7 @@ def _written(out: Path, parity: Parity, original: str, real: str) -> dict[str, A
 def _import(options: ExportOptions) -> dict[str, Any]:
     import gymnasium
 
-    from wlr_gym.envs.registry import task_name_of
     from wlr_gym.learning.foreign import import_policy
-    from wlr_gym.policy import fed_environment, load_agent_config
 
     if options.env is None:
         raise InputError(f"{options.policy[0]}: an archive does not say what it was trained in: give --env ID")
@@ -181,8 +187,6 @@ def _import(options: ExportOptions) -> dict[str, Any]:
 
 
 def _write_card(source: str, evaluation: Path, force: bool) -> dict[str, Any]:
-    from wlr_gym.policy import find_policy, shipped_names, write_model_card
-
     policy = find_policy(source)
     for name in ("card.json", "card.md"):
         if not (evaluation / name).is_file():
@@ -199,7 +203,6 @@ def _write_card(source: str, evaluation: Path, force: bool) -> dict[str, Any]:
 def real_observations(source: Path) -> NDArray[np.float32]:
     """Return the observations (M, D) of a policy that drives robots in the environment it was trained in."""
     from wlr_gym.learning.evaluation.rollout import make_core, seen_observations
-    from wlr_gym.policy import make_policy, policy_environment
 
     with closing(make_core(environment_of(None, source), ROBOTS, policy_environment(source))) as core:
         return seen_observations(core, make_policy(source, core.contract()), SECONDS)
@@ -207,8 +210,6 @@ def real_observations(source: Path) -> NDArray[np.float32]:
 
 def training_facts(folder: Path) -> dict[str, Any]:
     """Return what the run folder around a policy says of its training, as far as it does: command, git commit, wall time."""
-    from wlr_gym.base.provenance import PROVENANCE_FILE
-    from wlr_gym.base.settings import read_yaml
     from wlr_gym.learning.evaluation import read_curve
 
     facts: dict[str, Any] = {}

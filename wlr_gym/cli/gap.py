@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from rich.console import Console
 from tyro.conf import Positional
 
 from wlr_gym.base.checks import Interval, check_folder, check_name
@@ -27,17 +28,15 @@ from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.text import duration
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import Count, ForceOption, JsonOption, PatchOption, RobotOption, noise_seed, settings_of
+from wlr_gym.cli.options import Count, ForceOption, JsonOption, PatchOption, RobotOption, noise_seed, refuse_given, settings_of
 from wlr_gym.cli.terminal import print_json, print_table
+from wlr_gym.robot import Robot, load_robot
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.data.excitations import Motion
     from wlr_gym.gap.analysis import Analysis
     from wlr_gym.gap.decision import Decided, Recorded, Recorder
     from wlr_gym.physics.effects import Patch
-    from wlr_gym.robot import Robot
 
 
 #: s between two looks for the run that was asked for.
@@ -87,8 +86,6 @@ def run(options: GapOptions) -> int:
     Raises:
         InputError: no such data, unknown effect, rig, backend or run, an output folder that cannot be used.
     """
-    from rich.console import Console
-
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.report.page import check_folder as check_results
     from wlr_gym.gap.report.result import RESULT_FILE
@@ -159,14 +156,13 @@ def _check(options: GapOptions) -> None:
     from wlr_gym.gap.rig.own import load_rig
     from wlr_gym.gap.workflow import OWN_RIG, RIGS
     from wlr_gym.physics.plants import check_simulator
-    from wlr_gym.robot import load_robot
 
     check_folder(options.data, of="runs")
     check_simulator(options.backend, "--backend")
     if options.rig is not None and options.rig not in RIGS and not options.rig.endswith(OWN_RIG):
         raise unknown_name("rig", options.rig, RIGS)
-    if options.rig is not None and (options.backend != GapOptions.backend or options.robot is not None):
-        raise InputError(f"--rig {options.rig}: the rig has a simulator of its own: leave --backend and --robot out")
+    if options.rig is not None:
+        refuse_given(options, ("backend", "robot"), f"--rig {options.rig} has a simulator of its own: leave it out")
     if options.rig is not None and options.rig.endswith(OWN_RIG):
         load_rig(options.rig)
     if options.robot is not None:
@@ -174,11 +170,12 @@ def _check(options: GapOptions) -> None:
     for name in options.effects:
         if Path(name).resolve().parent == options.out.resolve() and Path(name).is_file():
             raise InputError(f"--effects {name}: the results would replace it: give another --out")
-    if options.until_decided and (options.rig is not None or options.heldout):
-        raise InputError("--until-decided: runs of the robot, held out anew in every round: leave --rig and --heldout out")
-    given = [one.name for one in fields(DecideOptions) if getattr(options, one.name) != one.default]
-    if given and not options.until_decided:
-        raise InputError(f"--{given[0].replace('_', '-')}: it is for --until-decided")
+    if options.until_decided:
+        refuse_given(
+            options, ("rig", "heldout"), "--until-decided drives the robot, and holds out anew in every round: leave it out"
+        )
+    else:
+        refuse_given(options, [one.name for one in fields(DecideOptions)], "it is for --until-decided")
     runs = [path.stem for path in run_files(options.data)] if options.rig is None else []
     for name in options.heldout if runs else ():
         check_name("run", name, runs, "--heldout")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
+from rich.console import Console
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
@@ -24,8 +25,6 @@ from wlr_gym.cli.options import JsonOption, Seconds
 from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.data.logs import ImportedRun, Proposal
 
 
@@ -54,8 +53,6 @@ def run(options: ImportOptions) -> int:
     Raises:
         InputError: unreadable logs, a map that does not fit, runs that a reader would refuse.
     """
-    from rich.console import Console
-
     from wlr_gym.data.logs import import_log, read_map
     from wlr_gym.data.logs.importing import MAP_FILE, require_own
 

@@ -98,6 +98,23 @@ class SensorsOption:
         return None if self.sensors is None else tuple(name for name in self.sensors if name != "none")
 
 
+def refuse_given(options: Any, names: Iterable[str], why: str) -> None:
+    """Refuse options that do not go with others.
+
+    Args:
+        options: of the command.
+        names: of the fields that must be as they are by default.
+        why: added to the message.
+
+    Raises:
+        InputError: naming the first that is given.
+    """
+    for one in fields(options):
+        if one.name in names and getattr(options, one.name) != one.default:
+            place = one.name.upper() if "Positional" in str(one.type) else f"--{one.name.replace('_', '-')}"
+            raise InputError(f"{place}: {why}")
+
+
 def require_simulator(backend: str, robot: str) -> None:
     """Raise :class:`InputError` where ``--backend`` is no simulator; ``robot`` says what a real robot is for."""
     from wlr_gym.physics.plants import REAL, check_simulator
@@ -152,18 +169,6 @@ class WiredRobotOption:
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
     emulated = False  # an option of RobotOption
-    camera = None  # an option of CameraOption
-
-    def ports(self) -> dict[str, str]:
-        """Return the ports of ``--port``: name -> device.
-
-        Raises:
-            InputError: a port that is not name=value, or ports of a robot that has none.
-        """
-        ports = port_pairs(self.port)
-        if ports and self.emulated:
-            raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
-        return ports
 
     def load_hardware(self) -> Hardware:
         """Return the hardware, with the ports of ``--port``.
@@ -173,7 +178,10 @@ class WiredRobotOption:
         """
         from wlr_gym.hardware.config import load_hardware, with_ports
 
-        return with_ports(load_hardware(self.hardware), self.ports())
+        ports = port_pairs(self.port)
+        if ports and self.emulated:
+            raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
+        return with_ports(load_hardware(self.hardware), ports)
 
     def robot_name(self) -> str:
         """Return the robot file that is asked for, else the one that the hardware file names, else ``nominal``."""
@@ -205,56 +213,44 @@ class WiredRobotOption:
         link.servos.set_patience(CALM_PATIENCE)
         return link
 
-    def link_to(self, robot: Robot, hardware: Hardware) -> Link:
-        """Return connections to a robot, closed."""
+    def link_to(self, robot: Robot, hardware: Hardware, patch: Patch | None = None, seed: int = 0) -> Link:
+        """Return connections to a robot, closed.
+
+        Args:
+            robot, hardware: of the robot.
+            patch: what an emulated one has that the nominal one lacks.
+            seed: of an emulated one's noise.
+
+        Raises:
+            InputError: a patch for a real robot.
+        """
         camera = self.camera_file()
         if self.emulated:
-            from wlr_gym.hardware.emulator import Machine
-            from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
+            from wlr_gym.hardware.emulator import Machine, MachineOptions
+            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot, with_flow_port
 
-            return emulated_link(Machine(robot, with_flow_port(robot, hardware)), camera)
+            hardware = with_flow_port(robot, hardware)
+            if patch is None:
+                return emulated_link(Machine(robot, hardware, MachineOptions(seed=seed)), camera)
+            return emulated_robot(robot, hardware, patch, camera=camera, seed=seed)
         from wlr_gym.hardware.link import serial_link
 
+        if patch is not None and patch.effects:
+            raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
         return serial_link(robot, hardware, camera)
 
     def camera_file(self) -> CameraFile | None:
-        """Return the camera of ``--camera``; None = there is none.
-
-        Raises:
-            InputError: unknown or broken file, or an emulated camera for a real robot.
-        """
-        return read_camera(self.camera, self.emulated)
-
-    def refuse_effects(self, patch: Patch) -> None:
-        """Refuse effects for a real robot.
-
-        Raises:
-            InputError: there are some.
-        """
-        if patch.effects and not self.emulated:
-            raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
+        """Return the camera above the floor; None = the command has none."""
+        return None
 
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
-        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``.
-
-        Args:
-            robot: the robot.
-            log: folder of the runs.
-            meta: of the runs.
-            patch: what an emulated robot has that its file does not say.
-            seed: of an emulated robot's noise.
-
-        Raises:
-            InputError: options that make no sense, files that cannot be read.
-        """
+        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``. ``seed``: :meth:`link_to`."""
         from wlr_gym.hardware.plant import RobotPlant
-        from wlr_gym.physics.plants.base import RobotOptions
+        from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 
-        self.refuse_effects(patch)
-        self.camera_file()
-        ports = self.ports()
-        options = RobotOptions(self.hardware, ports, self.emulated, log=log, effects=patch, camera=self.camera, seed=seed)
-        return RobotPlant(robot, 1, hardware=options, meta=meta)
+        options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)
+        link = self.link_to(robot, self.load_hardware(), patch, seed)
+        return RobotPlant(robot, 1, PlantOptions(), options, link=link, meta=meta)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,14 +261,8 @@ class RobotOption(WiredRobotOption):
     """An emulated robot in this process and in emulated time, instead of the ports."""
 
     def refuse_robot_options(self, remedy: str) -> None:
-        """Refuse options that are about the robot where none is driven; ``remedy`` says what to do.
-
-        Raises:
-            InputError: one is given.
-        """
-        for one in fields(self):
-            if one.name in _ROBOT_ONLY and getattr(self, one.name) != one.default:
-                raise InputError(f"--{one.name} is about the robot: {remedy}")
+        """Refuse options that are about the robot where none is driven; ``remedy`` says what to do."""
+        refuse_given(self, _ROBOT_ONLY, f"it is about the robot: {remedy}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,16 +272,19 @@ class CameraOption(RobotOption):
     camera: str | None = None
     """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
 
+    def camera_file(self) -> CameraFile | None:
+        """Return the camera of ``--camera``; None = there is none.
 
-def read_camera(source: str | None, is_emulated: bool) -> CameraFile | None:
-    """Return the camera of ``--camera``; see :meth:`WiredRobotOption.camera_file`."""
-    from wlr_gym.hardware.camera.reading import load_camera_file
+        Raises:
+            InputError: unknown or broken file, or an emulated camera for a real robot.
+        """
+        from wlr_gym.hardware.camera.reading import load_camera_file
 
-    if source == "emulated" and not is_emulated:
-        raise InputError(
-            "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
-        )
-    return None if source is None else load_camera_file(source)
+        if self.camera == "emulated" and not self.emulated:
+            raise InputError(
+                "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
+            )
+        return None if self.camera is None else load_camera_file(self.camera)
 
 
 def camera_note(environment: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from rich.console import Console
 
 from wlr_gym.base.checks import Interval, check_name
 from wlr_gym.base.errors import InputError
@@ -28,17 +29,18 @@ from wlr_gym.cli.options import (
     require_simulator,
 )
 from wlr_gym.cli.terminal import print_json
+from wlr_gym.policy import Policy, environment_for, make_policy
+from wlr_gym.render.teleop import HELP, Gamepad, Keyboard, Ranges, Script
+from wlr_gym.render.video import check_video
 from wlr_gym.render.view import CAMERAS, LARGEST, SMALLEST, View, fits, require_display
 from wlr_gym.render.web.page import HOST, PORT
+from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.learning.evaluation.film import Driver
-    from wlr_gym.policy import Policy
-    from wlr_gym.render.teleop import Ranges, Script
     from wlr_gym.render.viewer import KeyCallback, Viewer
     from wlr_gym.render.web.live import WebViewer
-    from wlr_gym.robot import Robot
 
     NewViewer = Callable[["PlayOptions", Robot, KeyCallback | None], Viewer | WebViewer]
 
@@ -94,7 +96,6 @@ def run(options: PlayOptions) -> int:
     """Play, until the window is closed or the video is written."""
     from wlr_gym.envs.tasks.task import having
     from wlr_gym.learning.evaluation import make_core
-    from wlr_gym.policy import environment_for, make_policy
 
     _check(options)
     keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
@@ -119,8 +120,6 @@ def run(options: PlayOptions) -> int:
 
 
 def _check(options: PlayOptions) -> None:
-    from wlr_gym.render.video import check_video
-
     require_simulator(options.backend, "a real robot is driven with wlr deploy; wlr play takes a simulator")
     if options.gamepad and (options.command is not None or options.video is not None):
         raise InputError("--gamepad drives in the window: leave out --command and --video")
@@ -150,8 +149,6 @@ def _view(options: PlayOptions) -> View:
 
 
 def _driver(options: PlayOptions, core: Core) -> Driver | None:
-    from wlr_gym.render.teleop import Gamepad, Keyboard, Script
-
     names = core.task.commands
     terms = core.task.config.commands.terms
     ranges = {name: (float(terms[name][0]), float(terms[name][1])) for name in names}
@@ -181,8 +178,6 @@ def _check_commands(script: Script, ranges: Ranges, robot: Robot) -> None:
 
 
 def _film(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None) -> None:
-    from rich.console import Console
-
     from wlr_gym.learning.evaluation.film import film, film_length
     from wlr_gym.render import write_video
 
@@ -208,8 +203,6 @@ def _print_film(options: PlayOptions, core: Core) -> None:
 
 
 def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
-    from rich.console import Console
-
     from wlr_gym.learning.evaluation import read_subjects
     from wlr_gym.learning.evaluation.film import film_beside
 
@@ -230,7 +223,6 @@ def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
 
 
 def _window_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> Viewer:
-    from wlr_gym.render.teleop import HELP
     from wlr_gym.render.viewer import Viewer
 
     if on_key is not None:
@@ -252,7 +244,6 @@ def show(
 ) -> None:
     """Play in a window until it is closed, on a page until Ctrl-C, or for ``options.seconds``; ``new_viewer`` makes either."""
     from wlr_gym.learning.evaluation.film import commands, drive, present_time
-    from wlr_gym.render.teleop import Keyboard
 
     period = core.task.config.control_period
     with closing(new_viewer(options, core.task.robot, driver.press if isinstance(driver, Keyboard) else None)) as viewer:

@@ -13,52 +13,49 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.console import Console
+
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
-from wlr_gym.cli.options import CameraOption, ForceOption, JsonOption, PatchOption, Seconds, Seed, noise_seed
-from wlr_gym.cli.terminal import confirm, print_json
+from wlr_gym.cli.options import CameraOption, ForceOption, JsonOption, PatchOption, Seconds, Seed, noise_seed, refuse_given
+from wlr_gym.cli.terminal import confirm, print_json, print_table
+from wlr_gym.robot import Robot, load_robot
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.data.excitations import Motion
     from wlr_gym.data.format import RunMeta
     from wlr_gym.hardware.deployment import DriveResult
-    from wlr_gym.robot import Robot
 
 
 @dataclass(frozen=True)
 class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
-    """Record runs.
-
-    Attributes:
-        excitation: motions to drive, by name, see: wlr record --list; several make a data set.
-        commands: files with setpoints to drive: of --commands-only, or of whole runs.
-        out: folder for the runs, made if it is not there; needed for all but --list.
-        backend: dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco.
-        seed: seed of the motions (default: 0), and of the noise of a simulator or an emulated robot.
-        noise_seed: seed of an emulated robot's noise: noise_seed of a run's events repeats it (with the same --seed); default:
-            from --seed and the run's number, without --seed drawn anew.
-        seconds: cut each motion off after this long.
-        commands_only: write the setpoints only, one file per motion.
-        list: show the excitations.
-        ground: what the floor is like, for meta.yaml.
-        notes: free text for meta.yaml.
-        yes: do not ask before every motion of the robot.
-    """
-
     excitation: tuple[str, ...] = ()
+    """Motions to drive, by name, see: wlr record --list; several make a data set."""
     commands: tuple[Path, ...] = ()
+    """Files with setpoints to drive: of --commands-only, or of whole runs."""
     out: Path | None = None
+    """Folder for the runs, made if it is not there; needed for all but --list."""
     backend: str = "dynamixel"
+    """dynamixel = the robot (with --emulated an emulated one), or a simulator: gibbs_appell, mujoco."""
     seed: Seed | None = None
+    """Seed of the motions (default: 0), and of the noise of a simulator or an emulated robot."""
     noise_seed: Seed | None = None
+    """Seed of an emulated robot's noise: noise_seed of a run's events repeats it (with the same --seed); default: from --seed
+    and the run's number, without --seed drawn anew."""
     seconds: Seconds | None = None
+    """Cut each motion off after this long."""
     commands_only: bool = False
+    """Write the setpoints only, one file per motion."""
     list: bool = False
+    """Show the excitations."""
     ground: str | None = None
+    """What the floor is like, for meta.yaml."""
     notes: str | None = None
+    """Free text for meta.yaml."""
     yes: bool = False
+    """Do not ask before every motion of the robot."""
 
 
 def run(options: RecordOptions) -> int:
@@ -67,13 +64,9 @@ def run(options: RecordOptions) -> int:
     Raises:
         InputError: unknown motion, backend, robot or patch, options that make no sense, ports that cannot be opened.
     """
-    from rich.console import Console
-
-    from wlr_gym.base.files import refuse_existing
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, same_profile, write_commands
     from wlr_gym.physics.plants import REAL, check_backend
-    from wlr_gym.robot import load_robot
 
     console = Console(soft_wrap=True, highlight=False)
     check_backend(options.backend)
@@ -82,8 +75,8 @@ def run(options: RecordOptions) -> int:
     if options.list:
         _list(console, robot, options.json)
         return OK
-    if options.noise_seed is not None and not options.emulated:
-        raise InputError("--noise-seed is for the emulated robot: add --emulated")
+    if not options.emulated:
+        refuse_given(options, ("noise_seed",), "it is for the emulated robot: add --emulated")
     if options.backend not in REAL:
         options.refuse_robot_options(f"leave --backend {options.backend} out")
     if options.out is None:
@@ -156,7 +149,6 @@ def _results(options: RecordOptions, found: Sequence[dict[str, object]]) -> None
 
 
 def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
-    from wlr_gym.base.text import counted
     from wlr_gym.data import read_run
 
     ended = drive.reason or "to its end"
@@ -180,7 +172,6 @@ def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
 def _record_simulations(
     options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console
 ) -> int:
-    from wlr_gym.base.files import make_output_folder
     from wlr_gym.base.random import spawn_seeds
     from wlr_gym.data.record import next_run, record_simulation
 
@@ -198,7 +189,6 @@ def _record_simulations(
 
 
 def _list(console: Console, robot: Robot, as_json: bool) -> None:
-    from wlr_gym.cli.terminal import print_table
     from wlr_gym.data.excitations import EXCITATIONS, excite
 
     lengths = {name: excite(name, robot=robot).duration for name in EXCITATIONS}

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.console import Console
 from tyro.conf import Positional
 
 from wlr_gym.base.checks import check_number
@@ -25,10 +26,10 @@ from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, RobotOption, settings_of
 from wlr_gym.cli.terminal import confirm, print_json, print_table
+from wlr_gym.render.video import check_video
+from wlr_gym.robot import CORNERS, JOINTS
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.data import Run
     from wlr_gym.data.replay import ChannelError, ReplayResult
     from wlr_gym.physics.effects import Patch
@@ -64,12 +65,10 @@ def run(options: ReplayOptions) -> int:
     Raises:
         InputError: unreadable runs, patch, robot or backend.
     """
-    from rich.console import Console
-
-    from wlr_gym.data.replay import LEAD, prepare, save_plots
-    from wlr_gym.data.runs import read_runs
+    from wlr_gym.data.read import read_runs
+    from wlr_gym.data.replay import LEAD, prepare
+    from wlr_gym.data.replay_plots import save_plots
     from wlr_gym.physics.plants import REAL, check_backend
-    from wlr_gym.render.video import check_video
 
     console = Console()
     check_backend(options.backend)
@@ -119,8 +118,8 @@ def _films(options: ReplayOptions, names: Sequence[str]) -> list[Path]:
 
 
 def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
+    from wlr_gym.data.film import FPS, film_length, replay_film
     from wlr_gym.data.replay import prepare
-    from wlr_gym.data.watch import FPS, film_length, replay_film
     from wlr_gym.render import write_video
 
     for result, target in zip(results, _films(options, [result.run.name for result in results]), strict=True):
@@ -143,7 +142,8 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.data import read_run
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, motion_of
-    from wlr_gym.data.replay import compare_repeat, robot_of
+    from wlr_gym.data.repetition import compare_repeat
+    from wlr_gym.data.replay import robot_of
     from wlr_gym.hardware.deployment import drive_robot
 
     motions = [motion_of(measured) for measured in runs]
@@ -183,7 +183,6 @@ def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, othe
 def _grouped(errors: Sequence[tuple[str, ChannelError]]) -> dict[str, list[ChannelError]]:
     """Put the errors of a joint group (``pos_leg``) together, and those of every other channel by themselves."""
     from wlr_gym.data.format import CHANNELS, COLUMNS
-    from wlr_gym.robot import JOINTS
 
     groups: dict[str, list[ChannelError]] = {}
     for name, error in sorted(errors, key=lambda pair: CHANNELS.index(pair[0])):
@@ -213,7 +212,6 @@ def _print_errors(errors: Sequence[tuple[str, ChannelError]], title: str, consol
 
 def _print_joints(errors: Sequence[tuple[str, ChannelError]], console: Console) -> None:
     from wlr_gym.data.format import COLUMNS
-    from wlr_gym.robot import CORNERS
 
     rows = [
         (group, *(_in_noise_units([e for name, e in errors if name == f"{group}_{corner}"]) for corner in CORNERS))

@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from rich.console import Console
 from tyro.conf import Positional
 
 from wlr_gym.base.errors import InputError
@@ -18,12 +19,12 @@ from wlr_gym.base.text import counted, pairs
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.terminal import ask_terminal, print_json, print_table
-
-if TYPE_CHECKING:
-    from wlr_gym.physics.feasibility import RobotFinding
-    from wlr_gym.robot import Robot
-    from wlr_gym.robot.interchange import ImportedRobot, LinkTree
-    from wlr_gym.robot.outline import Question
+from wlr_gym.physics.feasibility import ENTRIES, RobotFinding, capability_of, examine_robot, unusual
+from wlr_gym.robot import Robot, load_robot, robot_hash
+from wlr_gym.robot.interchange import ImportedRobot, LinkTree, parse_urdf, recognise, urdf_text
+from wlr_gym.robot.interchange.robot_file import base_beside, of_all, robot_over, robot_text
+from wlr_gym.robot.interchange.urdf import NOT_IN_URDF
+from wlr_gym.robot.outline import QUESTIONS, Question, derived_numbers, question_of
 
 Format = Literal["mjcf", "urdf"]
 #: End of a file's name -> format.
@@ -108,11 +109,6 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     Raises:
         InputError: a bad option, or answers that no robot file can hold; nothing is written.
     """
-    from wlr_gym.physics.feasibility import examine_robot
-    from wlr_gym.robot import load_robot
-    from wlr_gym.robot.interchange.recognition import base_beside, of_all, robot_over, robot_text
-    from wlr_gym.robot.outline import QUESTIONS, derived_numbers, question_of
-
     check_new_file(options.out, options.force, endings=ENDINGS)
     base, name = load_robot(options.base), options.name or options.out.stem
     words = pairs("--set", options.set, "body.mass=12")
@@ -160,8 +156,6 @@ def _asked(question: Question, default: Any, ask: Callable[[str], str]) -> Any:
 
 def _unusual(answers: Mapping[str, Any]) -> list[str]:
     """Return what is outside the usual, in words."""
-    from wlr_gym.physics.feasibility import unusual
-
     lists = {key: value if isinstance(value, list) else [value] for key, value in answers.items()}
     return [str(finding) for key, values in lists.items() for finding in unusual(key, values)]
 
@@ -187,9 +181,6 @@ def print_findings(robot: Robot, findings: Sequence[RobotFinding]) -> None:
 
 def check_robot(options: CheckOptions) -> int:
     """Print what is wrong or odd; 1 when something stands against the robot."""
-    from wlr_gym.physics.feasibility import examine_robot
-    from wlr_gym.robot import load_robot
-
     robot = load_robot(options.robot, check=False)
     findings = examine_robot(robot)
     if options.json:
@@ -202,10 +193,6 @@ def check_robot(options: CheckOptions) -> int:
 
 def show_robot(options: ShowOptions) -> int:
     """Print the numbers of a robot, and draw it."""
-    from rich.console import Console
-
-    from wlr_gym.robot import load_robot, robot_hash
-
     if options.picture is not None:
         check_new_file(options.picture, options.force, "--picture", PICTURES, any_case=True)
     robot = load_robot(options.robot)
@@ -225,8 +212,6 @@ def show_robot(options: ShowOptions) -> int:
 
 
 def _numbers(robot: Robot) -> dict[str, dict[str, Any]]:
-    from wlr_gym.physics.feasibility import ENTRIES, capability_of
-
     can = capability_of(robot)
     values = {name: getattr(can, name) for name in ENTRIES}
     return {
@@ -241,10 +226,6 @@ def import_robot(options: RobotImportOptions) -> int:
     Raises:
         InputError: no such file, another kind of robot, or numbers that no robot file can hold; nothing is written.
     """
-    from wlr_gym.physics.feasibility import examine_robot
-    from wlr_gym.robot.interchange import recognise
-    from wlr_gym.robot.interchange.recognition import base_beside, of_all, robot_over, robot_text
-
     check_new_file(options.out, options.force, endings=ENDINGS)
     found = recognise(_read(options.file), idealise=options.idealise)
     name = options.name or found.name or options.out.stem
@@ -271,7 +252,6 @@ def _explained(found: ImportedRobot, base: str) -> list[str]:
 def _read(path: Path) -> LinkTree:
     """Read a file by what it holds, not by its name."""
     from wlr_gym.physics.plants.mujoco.mjcf import read_mjcf
-    from wlr_gym.robot.interchange import parse_urdf
 
     try:
         text = path.read_text(encoding="utf-8")
@@ -287,9 +267,6 @@ def export_robot(options: RobotExportOptions) -> int:
         InputError: no such robot, or a file that is there or of no known format.
     """
     from wlr_gym.physics.plants.mujoco.mjcf import NOT_IN_MJCF, mjcf_text
-    from wlr_gym.robot import load_robot
-    from wlr_gym.robot.interchange import urdf_text
-    from wlr_gym.robot.interchange.urdf import NOT_IN_URDF
 
     by_name = SUFFIXES.get(options.out.suffix.lower())
     kind = options.format or by_name

@@ -14,7 +14,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
 from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import Count, JsonOption, ray_address
+from wlr_gym.cli.options import Count, JsonOption, ray_address, refuse_given
 from wlr_gym.cli.terminal import print_json
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
 from wlr_gym.learning.sweep.results import PAGE_FILE, TABLE_FILE, name_of
@@ -53,7 +53,8 @@ def run(options: SweepOptions) -> int:
     """Train, say how it goes, and print where table and page are."""
     ray = ray_address(options.ray)
     if options.resume is not None:
-        _require_own_plan(options)
+        own = ("what", "config", "agent", "init", "search", "seeds", "out", "robot", "set")
+        refuse_given(options, own, "--resume continues a sweep as it was planned; beside it there are --ray and --workers only")
         found = resume_sweep(options.resume, ray=ray, workers=options.workers, say=_say)
     else:
         plan = _plan(options)
@@ -64,12 +65,6 @@ def run(options: SweepOptions) -> int:
 
 def _say(line: str) -> None:
     print(line, flush=True)
-
-
-def _require_own_plan(options: SweepOptions) -> None:
-    own = (options.what, options.config, options.agent, options.init, options.search, options.seeds, options.out, options.robot)
-    if any(value is not None for value in own) or options.set:
-        raise InputError("--resume continues a sweep as it was planned; beside it there are --ray and --workers only")
 
 
 def _plan(options: SweepOptions) -> SweepPlan:

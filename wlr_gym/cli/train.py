@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption, PatchOption, Seed, environment_of
+from wlr_gym.cli.options import JsonOption, PatchOption, Seed, environment_of, refuse_given
 from wlr_gym.cli.terminal import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
 from wlr_gym.policy import Training, TrainingProgress, find_policy
@@ -56,7 +56,8 @@ def run(options: TrainOptions) -> int:
     seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
     updates: deque[TrainingProgress] = deque(maxlen=1)
     if options.resume is not None:
-        _require_own_settings(options)
+        own = ("env", "out", "config", "seed", "backend", "robot", "init", "set", "effects")
+        refuse_given(options, own, "--resume uses the settings of the run folder: leave it out")
         policy = resume_training(
             options.resume,
             total_steps=options.total_steps,
@@ -111,12 +112,3 @@ def _config(options: TrainOptions, environment: str) -> dict[str, Any]:
     if patch := options.patch():  # its content, so that the run folder says what was added
         config["environment"] = (config.get("environment") or {}) | {"effects": patch.content()["effects"]}
     return with_robot(config, options.robot)
-
-
-def _require_own_settings(options: TrainOptions) -> None:
-    own = (options.env, options.out, options.config, options.seed, options.backend, options.robot, options.init)
-    if any(value is not None for value in own) or options.set or options.effects:
-        raise InputError(
-            "--resume uses the settings of the run folder; leave out the environment, --out, --config, --set, --seed, "
-            "--backend, --robot, --init and --effects"
-        )

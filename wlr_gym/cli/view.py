@@ -26,27 +26,22 @@ FIRST = ("cam_xy", "vel_wheel", "pos_leg")
 
 @dataclass(frozen=True)
 class ViewOptions(PatchOption):
-    """Watch runs.
-
-    Attributes:
-        runs: runs (CSV or Parquet), or folders of runs.
-        backend: simulator of the ghost.
-        robot: robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one.
-        ghost: replay the run, and show that robot, too.
-        segment: time between the points at which the ghost starts anew from the measured robot, s; inf = never.
-        host: name or address to listen on; localhost = this machine, and ssh to it, only.
-        port: where it is taken, the next free one.
-        seconds: end after this time; default: at Ctrl-C.
-    """
-
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Runs (CSV or Parquet), or folders of runs."""
     backend: str = "gibbs_appell"
+    """Simulator of the ghost."""
     robot: str | None = None
+    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     ghost: bool = True
+    """Replay the run, and show that robot, too."""
     segment: float = 10.0
+    """Time between the points at which the ghost starts anew from the measured robot, s; inf = never."""
     host: str = HOST
+    """Name or address to listen on; localhost = this machine, and ssh to it, only."""
     port: int = PORT
+    """Where it is taken, the next free one."""
     seconds: Seconds | None = None
+    """End after this time; default: at Ctrl-C."""
 
 
 def run(options: ViewOptions) -> int:

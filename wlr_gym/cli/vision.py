@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import math
 import shutil
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
+from rich.console import Console
 from tyro.conf import Positional
 
 from wlr_gym.base.checks import Interval
@@ -25,13 +27,11 @@ from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import ForceOption, JsonOption, Seconds, settings_of
 from wlr_gym.cli.terminal import print_json, print_table
+from wlr_gym.perception.markers.targets import Target
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from wlr_gym.data import Run
     from wlr_gym.perception.markers.camera import Camera
-    from wlr_gym.perception.markers.targets import Target
     from wlr_gym.perception.vision import VideoAnalysis
     from wlr_gym.perception.vision.sheets import SheetCheck
     from wlr_gym.perception.vision.tracking import Sample, VideoFrame
@@ -92,7 +92,6 @@ def run(options: VisionOptions) -> int:
         InputError: unreadable video, run, camera or target; wrong image size; no floor frame; nothing to align on.
     """
     require_package("cv2", "vision")
-    from rich.console import Console
 
     from wlr_gym.data import read_run
     from wlr_gym.perception.vision import load_camera, load_target, save_video_analysis
@@ -143,7 +142,6 @@ def _filmed(options: VisionOptions, camera: Camera, console: Console) -> VisionO
 def _analyse(
     options: VisionOptions, measured: Run, camera: Camera, body: Target, floor: Target, console: Console
 ) -> VideoAnalysis:
-    from contextlib import nullcontext
 
     from wlr_gym.perception.vision import Frames, analyse
     from wlr_gym.perception.vision.video import AnnotatedVideo

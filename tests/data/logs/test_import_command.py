@@ -170,7 +170,7 @@ def test_a_run_goes_out_and_comes_back_without_a_map(tmp_path, capsys):
         (["import", "nothing.mcap", "--suggest"], "nothing.mcap: no such file or folder"),
         (["import", "LAB"], "--out: expected a folder"),
         (["import", "LAB", "--out", "runs"], "give --map, or --suggest"),
-        (["export", "runs", "--to", "mcap", "--robot", "nominal"], "the options of policies do not go with it"),
+        (["export", "runs", "--to", "mcap", "--robot", "nominal"], "--robot: it is of policies; --to mcap writes runs"),
     ],
 )
 def test_bad_words(bag, tmp_path, monkeypatch, capsys, words, message):

@@ -94,7 +94,7 @@ def test_the_command_says_so_by_its_exit_code(tmp_path, capsys):
     assert main(["evaluate", "pid", "do_nothing", "--accept"]) == 2
     assert "--accept: expected one policy, got 2" in capsys.readouterr().err
     assert main(["evaluate", "pid", "--accept", "--backend", "mujoco"]) == 2
-    assert "--accept: --backend is of the card" in capsys.readouterr().err
+    assert "--backend: it is of the card: leave it out with --accept" in capsys.readouterr().err
 
 
 def test_references_are_the_controller_underneath_and_the_blind_policy():
