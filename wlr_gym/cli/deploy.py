@@ -1,4 +1,8 @@
-"""Options of ``wlr deploy``, and what it refuses before anything else: before an operator is asked or a robot started."""
+"""Drive the robot with a policy: check, ramp to the start pose, run at 50 Hz through the command limiter, stop, torque off.
+
+Space switches the motors off at once, q stops, and so do Ctrl-C, SIGTERM and SIGHUP. Try it without a robot: --emulated. Wheels
+off the ground the first time; see docs/robot.md.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,6 @@ from wlr_gym.cli.options import (
     PatchOption,
     Seconds,
     Seed,
-    camera_note,
     environment_of,
     note_untrained,
     port_pairs,
@@ -34,7 +37,16 @@ from wlr_gym.cli.options import (
 )
 from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
 from wlr_gym.envs.registry import task_source_of
-from wlr_gym.policy import Policy, contract_of, environment_for, make_policy, policy_environment, untrained
+from wlr_gym.policy import (
+    Policy,
+    camera_share,
+    contract_of,
+    environment_for,
+    make_policy,
+    misses_camera,
+    policy_environment,
+    untrained,
+)
 from wlr_gym.robot import JOINTS, load_robot, robot_hash
 
 if TYPE_CHECKING:
@@ -45,6 +57,13 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import DrivingPad, Keys
     from wlr_gym.hardware.safety.rules import RobotStatus
+
+#: How a stop begins that an emulated robot in real time owes to a busy computer.
+_LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
+#: s for which the dead-man button of a gamepad may be let go.
+_PAD_DEADMAN = 0.2
+#: File of an emulated robot's true pose, and its key among the ports.
+_POSES = "poses"
 
 
 @dataclass(frozen=True)
@@ -83,83 +102,6 @@ class DeployOptions(JsonOption, PatchOption, CameraOption):
     """Do not ask before the robot moves."""
     status: bool = True
     """Show a live status."""
-
-
-def checked_command(options: DeployOptions) -> dict[str, float]:
-    """Return the held command, from options that make sense.
-
-    Raises:
-        InputError: the first option that does not.
-    """
-    from wlr_gym.hardware.config import require_deadman
-    from wlr_gym.hardware.timing import require_priority
-
-    if options.deadman is not None:
-        require_deadman("--deadman", options.deadman)
-    if options.realtime is not None:
-        require_priority("--realtime", options.realtime)
-    _check_emulation(options)
-    _check_training(options)
-    options.camera_file()
-    options.patch()  # a bad one is refused before a robot is started for it
-    _check_faults(options)
-    require_output_place(options.out)
-    if options.mcap is not None:
-        if options.mcap.exists():
-            raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
-        require_ending(options.mcap, (".mcap",), "--mcap")
-    return _command(options)
-
-
-def _check_emulation(options: DeployOptions) -> None:
-    if not options.emulated:
-        refuse_given(options, ("stepped", "fault", "effects"), "it is for the emulated robot: add --emulated")
-    if options.stepped and options.realtime is not None:
-        raise InputError("--realtime: emulated time is not real time; leave out --stepped")
-    if options.emulated and options.port:
-        raise InputError("--port: the emulated robot brings its own ports")
-
-
-def _check_training(options: DeployOptions) -> None:
-    words = untrained(options.policy)
-    if words and not (options.emulated or options.dry_run):
-        raise InputError(f"{words}; a real robot moves with one of these, or with your own")
-
-
-def _check_faults(options: DeployOptions) -> None:
-    if not options.fault:
-        return
-    from wlr_gym.hardware.config import load_hardware
-    from wlr_gym.hardware.emulator import parse_fault
-
-    places = (*JOINTS, *load_hardware(options.hardware).buses, "imu", "flow", "camera")
-    for fault in options.fault:
-        try:
-            parse_fault(fault, places)
-        except InputError as error:
-            raise InputError(f"--fault: {error}") from None
-
-
-def _command(options: DeployOptions) -> dict[str, float]:
-    commands = pairs("--command", options.command, "yaw_rate=0.1")
-    try:
-        numbers = {name: float(text) for name, text in commands.items()}
-    except ValueError:
-        numbers = {"": float("nan")}
-    if not all(map(math.isfinite, numbers.values())):
-        raise InputError(f"--command {' '.join(options.command)}: expected name=number")
-    return numbers
-
-
-# --- drive the robot with a policy: check, ramp to the start pose, run at 50 Hz through the command limiter, stop, torq
-
-
-#: How a stop begins that an emulated robot in real time owes to a busy computer.
-_LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
-#: s for which the dead-man button of a gamepad may be let go.
-_PAD_DEADMAN = 0.2
-#: File of an emulated robot's true pose, and its key among the ports.
-_POSES = "poses"
 
 
 def run(options: DeployOptions) -> int:
@@ -214,6 +156,53 @@ def run(options: DeployOptions) -> int:
         _report_stream(stream, console)
     console.print(busy_note(options, result.reason), style="yellow", end="")
     return OK if result.well else FAILED
+
+
+def checked_command(options: DeployOptions) -> dict[str, float]:
+    """Return the held command, from options that make sense: before an operator is asked or a robot started.
+
+    Raises:
+        InputError: the first option that does not.
+    """
+    from wlr_gym.hardware.config import load_hardware, require_deadman
+    from wlr_gym.hardware.timing import require_priority
+
+    if options.deadman is not None:
+        require_deadman("--deadman", options.deadman)
+    if options.realtime is not None:
+        require_priority("--realtime", options.realtime)
+    if not options.emulated:
+        refuse_given(options, ("stepped", "fault", "effects"), "it is for the emulated robot: add --emulated")
+    if options.stepped:
+        refuse_given(options, ("realtime",), "emulated time is not real time; leave out --stepped")
+    if options.emulated:
+        refuse_given(options, ("port",), "the emulated robot brings its own ports")
+    elif not options.dry_run and (words := untrained(options.policy)):
+        raise InputError(f"{words}; a real robot moves with one of these, or with your own")
+    options.camera_file()
+    options.patch()
+    if options.fault:
+        from wlr_gym.hardware.emulator import parse_fault
+
+        places = (*JOINTS, *load_hardware(options.hardware).buses, "imu", "flow", "camera")
+        try:
+            for fault in options.fault:
+                parse_fault(fault, places)
+        except InputError as error:
+            raise InputError(f"--fault: {error}") from None
+    require_output_place(options.out)
+    if options.mcap is not None:
+        if options.mcap.exists():
+            raise InputError(f"--mcap {options.mcap}: is there already; a stream goes into a new file")
+        require_ending(options.mcap, (".mcap",), "--mcap")
+    command = pairs("--command", options.command, "yaw_rate=0.1")
+    try:
+        numbers = {name: float(text) for name, text in command.items()}
+    except ValueError:
+        numbers = {"": float("nan")}
+    if not all(map(math.isfinite, numbers.values())):
+        raise InputError(f"--command {' '.join(options.command)}: expected name=number")
+    return numbers
 
 
 def _results(result: Deployment, loop: ControlLoop) -> dict[str, Any]:
@@ -386,13 +375,16 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
 
 def _say_what_is_not_known(core: Core, policy: str, console: Console) -> None:
+    """Say what is not measured, and what to expect of a policy without a camera that had one in most of its training."""
     console.print(f"not measured on a robot, and left out: {', '.join(core.unmeasured)}", style="dim")
     try:
         trained = contract_of(policy)["environment"]
     except InputError:  # an agent that was not trained
         trained = core.contract()
-    if not core.settings.has_camera and (note := camera_note(trained)):
-        console.print(f"note: {note}", style="yellow")
+    if not core.settings.has_camera and misses_camera(trained):
+        share = camera_share(trained)
+        had = "the slip observer is meant to have" if share >= 1.0 else f"in {share:.0%} of its training the policy had"
+        console.print(f"note: {had} a camera, and none is named (--camera): expect worse tracking", style="yellow")
 
 
 @contextlib.contextmanager
@@ -440,7 +432,7 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
         console.print(f"written: {', '.join(map(str, written))}", soft_wrap=True)
 
 
-# --- the live status of a robot that drives: its joints, and what supervision sees, beside the limits it holds it to --
+# ---- the live status -------------------------------------------------------------------------------------------------
 
 
 class RobotView:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -285,21 +285,6 @@ class CameraOption(RobotOption):
                 "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
             )
         return None if self.camera is None else load_camera_file(self.camera)
-
-
-def camera_note(environment: Mapping[str, Any]) -> str:
-    """Return what to expect of a policy without a camera that had one in most of its training; empty = nothing.
-
-    Args:
-        environment: its contract's.
-    """
-    from wlr_gym.policy import camera_share, misses_camera
-
-    if not misses_camera(environment):
-        return ""
-    share = camera_share(environment)
-    had = "the slip observer is meant to have" if share >= 1.0 else f"in {share:.0%} of its training the policy had"
-    return f"{had} a camera, and none is named (--camera): expect worse tracking"
 
 
 def port_pairs(words: Sequence[str]) -> dict[str, str]:

@@ -164,7 +164,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
         yield compare_repeat(measured, read_run(drive.run), chosen, options.segment)
 
 
-# --- tables -----------------------------------------------------------------------------------------------------------
+# ---- tables ----------------------------------------------------------------------------------------------------------
 
 
 def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, other: str) -> None:

@@ -152,7 +152,7 @@ def _is_number(cells: Sequence[str]) -> bool:
     return all(_NUMBER.fullmatch(cell) for cell in cells)
 
 
-# --- results as JSON on the standard output, alone: what else a command prints goes to the standard error meanwhile ---
+# ---- results as JSON, alone on the standard output: what else is printed goes to the standard error meanwhile ----------
 
 
 #: The standard output, while only results may be printed on it.
