@@ -122,7 +122,7 @@ def test_a_commanded_path_is_drawn_on_the_floor_it_was_commanded_on(shape):
         (["WLR-Pth-v0"], "did you mean 'WLR-Path-v0'?"),
         (["--json"], "--json: says what was written: add --video"),
         (["--beside", "pid"], "--beside: two robots are shown in a video only"),
-        (["--video", "film.webp", "--fps", "0"], "--fps 0: expected 1 to 1000"),
+        (["--video", "film.webp", "--fps", "0"], "--fps 0: expected a number from 1 to 1000"),
         (["--video", "film.avi"], "--video film.avi: expected a file that ends in"),
         (["--video", "nowhere/film.webp"], "--video nowhere/film.webp: folder nowhere does not exist"),
         (["--video", "film.webp", "--seconds", "-1"], "--seconds -1: expected more than 0"),
