@@ -26,8 +26,7 @@ from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
-    from wlr_gym.data.compared_plants import ComparedPlant
-    from wlr_gym.data.comparison import Comparison
+    from wlr_gym.data.comparison import ComparedPlant, Comparison
     from wlr_gym.data.comparison_report import ReportTable
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
@@ -78,7 +77,7 @@ def run(options: CompareOptions) -> int:
     Raises:
         InputError: unknown plant, excitation, effect or robot, unreadable runs, numbers out of range.
     """
-    from wlr_gym.data.compared_plants import parse_plant
+    from wlr_gym.data.comparison import parse_plant
     from wlr_gym.data.comparison_report import markdown, summary_table, tables
 
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
@@ -109,9 +108,9 @@ def run(options: CompareOptions) -> int:
 
 def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     from wlr_gym.data.excitations import EXCITATIONS, excite
-    from wlr_gym.data.read import read_runs
     from wlr_gym.data.record import motion_of
     from wlr_gym.data.replay import robot_of
+    from wlr_gym.data.runs import read_runs
 
     if options.runs is None:
         robot = load_robot(options.robot or "nominal")

@@ -65,9 +65,8 @@ def run(options: ReplayOptions) -> int:
     Raises:
         InputError: unreadable runs, patch, robot or backend.
     """
-    from wlr_gym.data.read import read_runs
-    from wlr_gym.data.replay import LEAD, prepare
-    from wlr_gym.data.replay_plots import save_plots
+    from wlr_gym.data.replay import LEAD, prepare, save_plots
+    from wlr_gym.data.runs import read_runs
     from wlr_gym.physics.plants import REAL, check_backend
 
     console = Console()
@@ -118,8 +117,8 @@ def _films(options: ReplayOptions, names: Sequence[str]) -> list[Path]:
 
 
 def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
-    from wlr_gym.data.film import FPS, film_length, replay_film
     from wlr_gym.data.replay import prepare
+    from wlr_gym.data.watch import FPS, film_length, replay_film
     from wlr_gym.render import write_video
 
     for result, target in zip(results, _films(options, [result.run.name for result in results]), strict=True):
@@ -142,8 +141,7 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.data import read_run
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, motion_of
-    from wlr_gym.data.repetition import compare_repeat
-    from wlr_gym.data.replay import robot_of
+    from wlr_gym.data.replay import compare_repeat, robot_of
     from wlr_gym.hardware.deployment import drive_robot
 
     motions = [motion_of(measured) for measured in runs]
