@@ -21,7 +21,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
 from wlr_gym.base.text import duration
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import Count, JsonOption, PatchOption, Seed, SensorsOption, port_pairs, refuse_given
+from wlr_gym.cli.options import Count, JsonOption, PatchOption, Seed, SensorsOption, handed, port_pairs, refuse_given
 from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
 from wlr_gym.policy import policy_environment
 from wlr_gym.robot import load_robot
@@ -90,28 +90,12 @@ def run(options: AdaptOptions) -> int:
     real = _real(options, console) if options.hardware is not None else None
     try:
         with progress(console) as tell:
-            found = adapt(
-                options.policy,
-                options.out,
-                robot_runs=options.robot_runs,
-                driven=real,
-                effects=options.patch() if options.emulated else None,
-                backend=options.backend,
-                environment=options.env,
-                robot=options.robot,
-                excitations=options.excitation,
-                budget_runs=options.budget_runs,
-                budget_seconds=options.budget_seconds,
-                drives=options.drives,
-                drive_seconds=options.drive_seconds,
-                steps=options.steps,
-                learning_rate=options.learning_rate,
-                episodes=options.episodes,
-                sensors=options.present() or (),
-                seed=options.seed,
-                threads=options.threads or os.cpu_count() or 1,
-                tell=partial(tell, ""),
-            )
+            own = {
+                "driven": real, "effects": options.patch() if options.emulated else None, "environment": options.env,
+                "excitations": options.excitation, "sensors": options.present() or (),
+                "threads": options.threads or os.cpu_count() or 1, "tell": partial(tell, ""),
+            }  # fmt: skip
+            found = adapt(**handed(options, adapt, **own))
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted; the same command goes on where it was") from None
     content = json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"))

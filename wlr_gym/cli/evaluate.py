@@ -26,6 +26,7 @@ from wlr_gym.cli.options import (
     Seed,
     SensorsOption,
     environment_of,
+    handed,
     note_untrained,
     refuse_given,
     settings_of,
@@ -179,19 +180,14 @@ def _accept(options: EvaluateOptions) -> int:
     if options.out is not None:
         refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
     with output_folder(options.out), _progress(options.progress) as tell:
-        result = accept(
-            options.policy[0],
-            options.env,
-            references=options.baselines,
-            floors=None if options.randomization is None else (options.randomization,),
-            episodes=ACCEPTANCE_EPISODES if options.episodes is None else options.episodes,
-            blocks=ACCEPTANCE_BLOCKS if options.blocks is None else options.blocks,
-            sensors=options.present(),
-            robot=options.robot,
-            effects=options.patch(),
-            threads=options.threads,
-            tell=tell,
-        )
+        own = {
+            "policy": options.policy[0], "env_id": options.env, "references": options.baselines,
+            "floors": None if options.randomization is None else (options.randomization,),
+            "episodes": ACCEPTANCE_EPISODES if options.episodes is None else options.episodes,
+            "blocks": ACCEPTANCE_BLOCKS if options.blocks is None else options.blocks,
+            "sensors": options.present(), "effects": options.patch(), "tell": tell,
+        }  # fmt: skip
+        result = accept(**handed(options, accept, **own))
     if options.json:
         print_json(result)
     _print(f"acceptance of {result.policy}: {result.blocks} x {result.episodes} episodes a family", acceptance_rows(result))
@@ -257,25 +253,8 @@ def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
             first.append(rollout)
 
     with _progress(options.progress) as tell:
-        card = evaluate(
-            options.policy,
-            options.env,
-            baselines=options.baselines,
-            episodes=options.episodes or 0,
-            blocks=options.blocks or 0,
-            seed=options.seed,
-            backend=str(options.backend),
-            other_episodes=options.other_episodes,
-            sweeps=options.sweep or (),
-            sweep_episodes=options.sweep_episodes,
-            randomization=options.randomization,
-            sensors=options.present(),
-            robot=options.robot,
-            effects=patch,
-            threads=options.threads,
-            tell=tell,
-            watch=watch,
-        )
+        own = {"env_id": options.env, "sweeps": options.sweep, "sensors": options.present(), "effects": patch}
+        card = evaluate(**handed(options, evaluate, **own, tell=tell, watch=watch))
     return card, first[0]
 
 

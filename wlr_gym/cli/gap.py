@@ -28,7 +28,17 @@ from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.text import duration
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import Count, ForceOption, JsonOption, PatchOption, RobotOption, noise_seed, refuse_given, settings_of
+from wlr_gym.cli.options import (
+    Count,
+    ForceOption,
+    JsonOption,
+    PatchOption,
+    RobotOption,
+    handed,
+    noise_seed,
+    refuse_given,
+    settings_of,
+)
 from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.robot import Robot, load_robot
 
@@ -99,17 +109,8 @@ def run(options: GapOptions) -> int:
     refuse_existing(options.out / RESULT_FILE, options.force)
     check_results(options.out)
     with progress(console) as tell:
-        analysis = analyse(
-            options.data,
-            options.out,
-            known=known,
-            rig=options.rig,
-            robot=options.robot,
-            backend=options.backend,
-            heldout=options.heldout,
-            threads=options.threads or os.cpu_count() or 1,
-            tell=partial(tell, ""),
-        )
+        threads = options.threads or os.cpu_count() or 1
+        analysis = analyse(**handed(options, analyse, known=known, threads=threads, tell=partial(tell, "")))
     record_provenance(options.out, settings_of(options) | {"effects": known.content()["effects"]})
     if options.json:
         print_json(json.loads((options.out / RESULT_FILE).read_text(encoding="utf-8")))
@@ -130,17 +131,10 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     budget = Budget(options.budget_runs, math.inf if options.budget_seconds is None else options.budget_seconds)
     robot = robot_of(read_dataset(options.data).runs[0], options.robot)
     with progress(console) as tell:
-        decision = decide(
-            options.data,
-            options.out,
-            recorder_of(options, robot, options.backend, options.out, console),
-            budget,
-            known=known,
-            robot=options.robot,
-            backend=options.backend,
-            threads=options.threads or os.cpu_count() or 1,
-            tell=partial(tell, ""),
-        )
+        record = recorder_of(options, robot, options.backend, options.out, console)
+        threads = options.threads or os.cpu_count() or 1
+        own = {"record": record, "budget": budget, "known": known, "threads": threads, "tell": partial(tell, "")}
+        decision = decide(**handed(options, decide, **own))
     print_rounds(decision, console)
     if decision.result is None:
         return FAILED

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -96,6 +97,11 @@ class SensorsOption:
         if self.sensors and len(self.sensors) > 1 and "none" in self.sensors:
             raise InputError(f"--sensors {' '.join(self.sensors)}: expected none alone, or camera, flow or both")
         return None if self.sensors is None else tuple(name for name in self.sensors if name != "none")
+
+
+def handed(options: Any, function: Callable[..., Any], **others: Any) -> dict[str, Any]:
+    """Return the options that a function takes, by the names of its parameters; ``others`` stand for, or beside, those."""
+    return {name: getattr(options, name) for name in inspect.signature(function).parameters if hasattr(options, name)} | others
 
 
 def refuse_given(options: Any, names: Iterable[str], why: str) -> None:
