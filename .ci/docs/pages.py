@@ -173,7 +173,7 @@ def help_of(*words: str) -> str:
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
         main([*words, "--help"])
-    return re.sub(r"\x1b\[[0-9;]*m", "", text.getvalue()).rstrip()
+    return re.sub(r"\x1b\[[0-9;]*m| +$", "", text.getvalue(), flags=re.MULTILINE).rstrip()
 
 
 def _block(text: str) -> str:

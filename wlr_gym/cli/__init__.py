@@ -88,7 +88,9 @@ def _answered(dispatch: Callable[[list[str]], int], words: list[str]) -> int:
         with interruptible():
             return dispatch(words)
     except SystemExit as end:  # of the parser: after help, or a mistake that it has told
-        return int(end.code or OK)
+        if isinstance(end.code, str):
+            raise
+        return end.code or OK
     except (InputError, MissingPackageError) as error:
         _say(str(error), "red")
         return BAD_INPUT
