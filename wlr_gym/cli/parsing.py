@@ -91,9 +91,9 @@ def _fields_shown(info: Any) -> Any:
     import tyro
     from tyro.constructors import StructConstructorSpec, StructFieldSpec
 
-    kind = info.type
-    if not dataclasses.is_dataclass(kind) or kind.__module__.startswith("tyro."):  # it wraps some types in one
+    if not dataclasses.is_dataclass(info.type) or info.type.__module__.startswith("tyro."):  # it wraps some types in one
         return None
+    kind: Any = info.type
     texts: dict[str, str] = {}
     for one in reversed(kind.__mro__[:-1]):
         params = docstring_parser.parse_from_object(one).params
@@ -106,7 +106,7 @@ def _fields_shown(info: Any) -> Any:
         missing = default is dataclasses.MISSING
         shown: list[Any] = [tyro.conf.arg(help_behavior_hint="")] if default in (None, False, ()) else []
         shown += [tyro.conf.FlagCreatePairsOff] if default is False else []
-        hint = Annotated[(hints[name], *shown)] if shown else hints[name]
+        hint: Any = Annotated[(hints[name], *shown)] if shown else hints[name]
         text = _plain(texts.get(name, ""))
         found.append(StructFieldSpec(name, hint, tyro.constructors.MISSING if missing else default, text))
     return StructConstructorSpec(kind, tuple(found))
