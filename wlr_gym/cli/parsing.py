@@ -104,7 +104,8 @@ def _fields_shown(info: Any) -> Any:
     for name in own_first:
         default = fields[name].default
         missing = default is dataclasses.MISSING
-        shown: list[Any] = [tyro.conf.arg(help_behavior_hint="")] if default in (None, False, ()) else []
+        silent = default is None or default is False or default == ()
+        shown: list[Any] = [tyro.conf.arg(help_behavior_hint="")] if silent else []
         shown += [tyro.conf.FlagCreatePairsOff] if default is False else []
         hint: Any = Annotated[(hints[name], *shown)] if shown else hints[name]
         text = _plain(texts.get(name, ""))
