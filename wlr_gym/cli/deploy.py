@@ -11,7 +11,7 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import DrivingPad, Keys
     from wlr_gym.hardware.safety.rules import RobotStatus
+    from wlr_gym.physics.plants.base import RobotOptions
 
 #: How a stop begins that an emulated robot in real time owes to a busy computer.
 _LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
@@ -119,16 +120,21 @@ def run(options: DeployOptions) -> int:
     command = checked_command(options)
     environment = environment_of(options.env, options.policy)
     note_untrained([options.policy])
-    robot = driven_robot(options)
-    policy = _make_policy(options, environment, robot, command)
+    settings = robot_options(options)
+    keywords = {
+        "backend": "dynamixel",
+        "hardware": settings,
+        "robot": driven_robot(options),
+        "episode_length": options.seconds,
+    }
+    policy = _make_policy(options.policy, environment, keywords, command)
     console = Console()
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
-        ports = port_pairs(options.port)
         if options.emulated and not options.stepped:
-            ports |= stack.enter_context(_emulator(options, console, robot))
-        poses = ports.pop(_POSES, None)
-        keywords = {"backend": "dynamixel", "hardware": _robot(options, ports, poses), "episode_length": options.seconds}
-        core = make_core(environment, 1, environment_for(options.policy, keywords | {"robot": robot}))
+            ports = stack.enter_context(_emulator(options, console, keywords["robot"]))
+            poses = ports.pop(_POSES, None)
+            keywords["hardware"] = replace(settings, ports=ports, poses=None if poses is None else Path(poses))
+        core = make_core(environment, 1, environment_for(options.policy, keywords))
         stack.callback(core.close)
         _say_what_is_not_known(core, options.policy, console)
         loop = loop_of(core)
@@ -245,7 +251,24 @@ def driven_robot(options: DeployOptions) -> Any:
     return made_for if options.hardware == DeployOptions.hardware and not is_same else wired
 
 
-def _make_policy(options: DeployOptions, environment: str, robot: Any, command: Mapping[str, float]) -> Policy:
+def robot_options(options: DeployOptions) -> RobotOptions:
+    """Return which robot is driven, and how it is connected; an emulated one in real time gets its ports once it runs."""
+    from wlr_gym.physics.plants.base import RobotOptions
+
+    return RobotOptions(
+        hardware=options.hardware,
+        ports=port_pairs(options.port),
+        emulated=options.emulated and options.stepped,
+        dry_run=options.dry_run,
+        log=options.out,
+        deadman=_PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
+        effects=options.patch() if options.stepped else None,
+        camera=options.camera,
+        seed=options.seed,
+    )
+
+
+def _make_policy(source: str, environment: str, keywords: Mapping[str, Any], command: Mapping[str, float]) -> Policy:
     """Return the policy; it needs no robot, so names and what does not fit are told before one is started.
 
     Raises:
@@ -256,13 +279,7 @@ def _make_policy(options: DeployOptions, environment: str, robot: Any, command: 
     from wlr_gym.envs.tasks import contract
     from wlr_gym.envs.tasks.terms import COMMANDS
 
-    keywords = {
-        "backend": "dynamixel",
-        "hardware": {"hardware": options.hardware},
-        "robot": robot,
-        "episode_length": options.seconds,
-    }
-    task = make_task(task_source_of(environment), read_settings(environment_for(options.policy, keywords)))
+    task = make_task(task_source_of(environment), read_settings(environment_for(source, keywords)))
     for name, value in command.items():
         if name not in task.commands:
             raise unknown_name("command", name, task.commands, "--command")
@@ -271,31 +288,15 @@ def _make_policy(options: DeployOptions, environment: str, robot: Any, command: 
             raise InputError(
                 f"--command {name}={value:g}: expected {low:g} to {high:g} ({COMMANDS[name].unit}), the range of the task"
             )
-    return make_policy(options.policy, contract(task, {}))
-
-
-def _robot(options: DeployOptions, ports: dict[str, str], poses: str | None) -> dict[str, Any]:
-    """Return which robot is driven, and how it is connected."""
-    return {
-        "hardware": options.hardware,
-        "ports": ports,
-        "emulated": options.emulated and options.stepped,
-        "effects": options.patch() if options.stepped else None,
-        "camera": options.camera,
-        "poses": None if poses is None else Path(poses),
-        "dry_run": options.dry_run,
-        "log": options.out,
-        "seed": options.seed,
-        "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
-    }
+    return make_policy(source, contract(task, {}))
 
 
 def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Console) -> list[DrivingPad]:
     """Return the gamepad that steers, or none; refuse one whose sticks steer none of the task's commands."""
-    from wlr_gym.hardware.operator import DrivingPad
-
     if options.gamepad is None:
         return []
+    from wlr_gym.hardware.operator import DrivingPad
+
     terms, buttons = core.task.config.commands.terms, loop.hardware.gamepad
     ranges = {name: (float(terms[name][0]), float(terms[name][1])) for name in core.task.commands}
     text = f"gamepad: hold button {buttons.deadman} to drive; {buttons.stop}: stop; {buttons.motors_off}: motors off at once"
@@ -305,10 +306,10 @@ def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Co
 
 def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -> McapStream | None:
     """Return what writes the run into an MCAP file while it goes on, or None."""
-    from wlr_gym.data.logs.write import McapStream
-
     if path is None:
         return None
+    from wlr_gym.data.logs.write import McapStream
+
     loop.recorder.stream = stack.enter_context(McapStream(path, loop.recorder.columns[1:], loop.recorder.meta, loop.robot))
     return loop.recorder.stream
 

@@ -175,6 +175,18 @@ class WiredRobotOption:
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
     emulated = False  # an option of RobotOption
+    camera = None  # an option of CameraOption
+
+    def ports(self) -> dict[str, str]:
+        """Return the ports of ``--port``: name -> device.
+
+        Raises:
+            InputError: a port that is not name=value, or ports of a robot that has none.
+        """
+        ports = port_pairs(self.port)
+        if ports and self.emulated:
+            raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
+        return ports
 
     def load_hardware(self) -> Hardware:
         """Return the hardware, with the ports of ``--port``.
@@ -184,10 +196,7 @@ class WiredRobotOption:
         """
         from wlr_gym.hardware.config import load_hardware, with_ports
 
-        ports = port_pairs(self.port)
-        if ports and self.emulated:
-            raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
-        return with_ports(load_hardware(self.hardware), ports)
+        return with_ports(load_hardware(self.hardware), self.ports())
 
     def robot_name(self) -> str:
         """Return the robot file that is asked for, else the one that the hardware file names, else ``nominal``."""
@@ -219,44 +228,62 @@ class WiredRobotOption:
         link.servos.set_patience(CALM_PATIENCE)
         return link
 
-    def link_to(self, robot: Robot, hardware: Hardware, patch: Patch | None = None, seed: int = 0) -> Link:
-        """Return connections to a robot, closed.
-
-        Args:
-            robot, hardware: of the robot.
-            patch: what an emulated one has that the nominal one lacks.
-            seed: of an emulated one's noise.
-
-        Raises:
-            InputError: a patch for a real robot.
-        """
+    def link_to(self, robot: Robot, hardware: Hardware) -> Link:
+        """Return connections to a robot, closed."""
         camera = self.camera_file()
         if self.emulated:
-            from wlr_gym.hardware.emulator import Machine, MachineOptions
-            from wlr_gym.hardware.emulator.link import emulated_link, emulated_robot, with_flow_port
+            from wlr_gym.hardware.emulator import Machine
+            from wlr_gym.hardware.emulator.link import emulated_link, with_flow_port
 
-            hardware = with_flow_port(robot, hardware)
-            if patch is None:
-                return emulated_link(Machine(robot, hardware, MachineOptions(seed=seed)), camera)
-            return emulated_robot(robot, hardware, patch, camera=camera, seed=seed)
+            return emulated_link(Machine(robot, with_flow_port(robot, hardware)), camera)
         from wlr_gym.hardware.link import serial_link
 
-        if patch is not None and patch.effects:
-            raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
         return serial_link(robot, hardware, camera)
 
     def camera_file(self) -> CameraFile | None:
-        """Return the camera above the floor; None = the command has none."""
-        return None
+        """Return the camera of ``--camera``; None = there is none.
+
+        Raises:
+            InputError: unknown or broken file, or an emulated camera for a real robot.
+        """
+        from wlr_gym.hardware.camera.reading import load_camera_file
+
+        if self.camera == "emulated" and not self.emulated:
+            raise InputError(
+                "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
+            )
+        return None if self.camera is None else load_camera_file(self.camera)
+
+    def refuse_effects(self, patch: Patch) -> None:
+        """Refuse effects for a real robot.
+
+        Raises:
+            InputError: there are some.
+        """
+        if patch.effects and not self.emulated:
+            raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
 
     def plant_of(self, robot: Robot, log: Path, meta: RunMeta, patch: Patch, seed: int = 0) -> RobotPlant:
-        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``. ``seed``: :meth:`link_to`."""
-        from wlr_gym.hardware.plant import RobotPlant
-        from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
+        """Return the robot as a plant, torque off; every start is logged in a new run of ``log``.
 
-        options = RobotOptions(hardware=self.hardware, ports=port_pairs(self.port), log=log)
-        link = self.link_to(robot, self.load_hardware(), patch, seed)
-        return RobotPlant(robot, 1, PlantOptions(), options, link=link, meta=meta)
+        Args:
+            robot: the robot.
+            log: folder of the runs.
+            meta: of the runs.
+            patch: what an emulated robot has that its file does not say.
+            seed: of an emulated robot's noise.
+
+        Raises:
+            InputError: options that make no sense, files that cannot be read.
+        """
+        from wlr_gym.hardware.plant import RobotPlant
+        from wlr_gym.physics.plants.base import RobotOptions
+
+        self.refuse_effects(patch)
+        self.camera_file()
+        ports = self.ports()
+        options = RobotOptions(self.hardware, ports, self.emulated, log=log, effects=patch, camera=self.camera, seed=seed)
+        return RobotPlant(robot, 1, hardware=options, meta=meta)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,20 +304,6 @@ class CameraOption(RobotOption):
 
     camera: str | None = None
     """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
-
-    def camera_file(self) -> CameraFile | None:
-        """Return the camera of ``--camera``; None = there is none.
-
-        Raises:
-            InputError: unknown or broken file, or an emulated camera for a real robot.
-        """
-        from wlr_gym.hardware.camera.reading import load_camera_file
-
-        if self.camera == "emulated" and not self.emulated:
-            raise InputError(
-                "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
-            )
-        return None if self.camera is None else load_camera_file(self.camera)
 
 
 def port_pairs(words: Sequence[str]) -> dict[str, str]:
