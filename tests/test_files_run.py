@@ -1,6 +1,6 @@
 """How many files of the package a newcomer meets: those in which a function runs, counted by a trace.
 
-``python tests/test_files_run.py make`` (or ``train``, ``deploy``) prints their names.
+``python tests/test_files_run.py make traced`` (or ``train``, ``deploy``) prints their names.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ COMMANDS = {
 }
 
 
-def files_run(what: str) -> set[str]:
-    """Do it in this process, which has not imported the package, and return the files in which functions ran."""
+def files_run(what: str, *, traced: bool) -> set[str]:
+    """Do it in this process, which has not imported the package, and return the files in which functions ran, if traced."""
     package, found = str(ROOT / "wlr_gym") + "/", set[str]()
 
     def note(frame: FrameType, event: str, _: object) -> None:
@@ -31,8 +31,9 @@ def files_run(what: str) -> set[str]:
         if place.startswith(package) and frame.f_code.co_flags & 1:  # bodies of modules and classes are no functions
             found.add(place.removeprefix(package))
 
-    sys.settrace(note)
-    threading.settrace(note)
+    if traced:
+        sys.settrace(note)
+        threading.settrace(note)
     if what == "make":
         import gymnasium
 
@@ -51,12 +52,14 @@ def files_run(what: str) -> set[str]:
     "what", ["make", pytest.param("train", marks=pytest.mark.slow), pytest.param("deploy", marks=pytest.mark.slow)]
 )
 def test_files_run(what, tmp_path):
-    for _ in range(2):  # the first time it may have to compile
-        ran = subprocess.run([sys.executable, __file__, what], cwd=tmp_path, capture_output=True, text=True)
+    for how in ("plain", "traced"):  # the first compiles what has to be compiled
+        (tmp_path / how).mkdir()
+        words = [sys.executable, __file__, what, how]
+        ran = subprocess.run(words, cwd=tmp_path / how, capture_output=True, text=True)
         assert ran.returncode == 0, ran.stderr
     files = [line for line in ran.stdout.splitlines() if line.endswith(".py")]
     assert 20 < len(files) <= MOST[what], "\n".join(files)
 
 
 if __name__ == "__main__":
-    print(*sorted(files_run(sys.argv[1])), sep="\n")
+    print(*sorted(files_run(sys.argv[1], traced=sys.argv[2] == "traced")), sep="\n")

@@ -13,11 +13,10 @@ import hashlib
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import njit
-from numba.core import types
-from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
+
+from wlr_gym.base.compiled import bits_of, number_of_bits
 
 _LOW = np.uint64(0xFFFFFFFF)
 _HALF_WORD = np.uint64(32)
@@ -32,26 +31,6 @@ _LN_2 = 0.6931471805599453
 _SQRT_2 = 1.4142135623730951
 _WORD = 2.0**-32
 _QUARTER_TURN = 1.5707963267948966 * 2.0**-30
-
-
-@intrinsic
-def _to_bits(typing_context: Any, value: Any) -> Any:
-    """Reinterpret a float64 as int64."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.IntType(64))
-
-    return types.int64(types.float64), generate
-
-
-@intrinsic
-def _from_bits(typing_context: Any, value: Any) -> Any:
-    """Reinterpret an int64 as float64."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.DoubleType())
-
-    return types.float64(types.int64), generate
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -76,9 +55,9 @@ def words4(seed: Any, stream: Any, counter: Any, block: Any) -> Any:
 @njit(cache=True, nogil=True, inline="always")
 def _minus_log(u: float) -> float:
     """-ln(u) for a normal float in (0, 1], error below 2e-16 relative to max(1, -ln u)."""
-    bits = _to_bits(u)  # pyright: ignore[reportCallIssue]
+    bits = bits_of(u)  # pyright: ignore[reportCallIssue]
     exponent = float((bits >> _EXPONENT_SHIFT) - np.int64(1023))
-    mantissa = _from_bits((bits & _MANTISSA) | _ONE_BITS)  # pyright: ignore[reportCallIssue]
+    mantissa = number_of_bits((bits & _MANTISSA) | _ONE_BITS)  # pyright: ignore[reportCallIssue]
     high = mantissa > _SQRT_2
     mantissa = 0.5 * mantissa if high else mantissa
     exponent = exponent + 1.0 if high else exponent

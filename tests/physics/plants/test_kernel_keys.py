@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import wlr_gym
+from wlr_gym.base import compiled
 from wlr_gym.physics.codegen import compilation
 from wlr_gym.physics.plants.gibbs_appell import kernel as engine
 from wlr_gym.physics.plants.mujoco import kernel as mujoco
@@ -39,10 +40,11 @@ def test_the_key_holds_every_module_of_the_trace(kernel, source):
     assert called_files(source) <= held
 
 
-def test_kernels_are_compiled_anew_with_other_intrinsics(monkeypatch):
+@pytest.mark.parametrize("changed", [compiled, compilation])
+def test_kernels_are_compiled_anew_with_other_intrinsics(monkeypatch, changed):
     def name():
         return compilation.load_module("test_key", "ONE = 1\n").__name__
 
     before = name()
-    monkeypatch.setattr(compilation, "source_of", lambda *modules: "other" if compilation in modules else "")
+    monkeypatch.setattr(compilation, "source_of", lambda *modules: "other" if changed in modules else "")
     assert before != name()

@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numba import njit
-from numba.core.errors import NumbaError
+from numba import NumbaError, njit
 from numpy.typing import NDArray
 
 from wlr_gym.base.checks import check_folder, check_name, check_number
