@@ -11,8 +11,7 @@ import gymnasium as gym
 
 import wlr_gym  # noqa: F401
 from wlr_gym.envs.tasks.signals import Signals, Value, mean
-from wlr_gym.envs.tasks.terms import POSITIVE, REWARDS, registered
-from wlr_gym.envs.tasks.terms import observations as computed
+from wlr_gym.envs.tasks.terms import POSITIVE, REWARDS, computed, registered
 
 
 @registered(REWARDS, speed=POSITIVE)

@@ -3,8 +3,7 @@
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs.tasks.terms import COMPUTED, POLICY_TERMS, POSITIVE, REWARDS, registered
-from wlr_gym.envs.tasks.terms import observations as computed
+from wlr_gym.envs.tasks.terms import COMPUTED, POLICY_TERMS, POSITIVE, REWARDS, computed, registered
 
 
 @pytest.mark.parametrize(
