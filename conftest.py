@@ -5,7 +5,7 @@ import pytest
 def shared_kernels():
     """Give robots with any effect the engine's kernel for all effects, so that the suite compiles a few kernels and not dozens.
 
-    A family that a robot does not use changes none of its bits: tests/physics/test_effect_bits_engine.py, on the product's own
+    A family that a robot does not use changes none of its bits: tests/physics/test_engine_effects.py, on the product's own
     choice (``own_kernels``).
     """
     from shared_kernels import OWN, GibbsAppellPlant, choose_shared

@@ -11,7 +11,8 @@ import gymnasium as gym
 
 import wlr_gym  # noqa: F401
 from wlr_gym.envs.tasks.signals import Signals, Value, mean
-from wlr_gym.envs.tasks.terms import POSITIVE, REWARDS, computed, registered
+from wlr_gym.envs.tasks.terms import POSITIVE, REWARDS, registered
+from wlr_gym.envs.tasks.terms import observations as computed
 
 
 @registered(REWARDS, speed=POSITIVE)

@@ -58,7 +58,7 @@ def compiled(function: Callable[..., Any], *signatures: Any) -> Any:
 
 # numba's own analysis takes four fifths of a large kernel's compile time. The source is what ``emit`` of
 # wlr_gym.physics.codegen prints. Each operation becomes the one instruction that numba would choose: strict IEEE, ``fma`` with
-# one rounding. The results are numba's own, to the bit (``tests/physics/codegen/test_straight_line.py``).
+# one rounding. The results are numba's own, to the bit (``tests/physics/codegen/test_codegen.py``).
 
 
 _NUMBERS = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "fdiv"}
