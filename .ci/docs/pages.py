@@ -39,7 +39,6 @@ API = {
     "Runs": "wlr_gym.data",
     "Logs of other programs": "wlr_gym.data.logs",
     "Motions": "wlr_gym.data.excitations",
-    "Plants to compare": "wlr_gym.data.comparison",
     "Plants compared": "wlr_gym.data.comparison",
     "Policies": "wlr_gym.policy",
     "Evaluation": "wlr_gym.learning.evaluation",

@@ -267,6 +267,7 @@ def test_a_log_of_other_words_units_axes_and_clocks_with_answers_comes_in_right(
         "clocks": {"imu": {"offset": JSON_EPOCH - UPTIME}, "optitrack": {"offset": 0.08}},
         **NO_PROFILE,
     }
+    assert {"frames.cam", "frames.imu", "clocks.imu", "clocks.optitrack", "joints.leg_rf.zero"} <= set(suggest_map(log).open)
     found = suggest_map(log, answers)
     assert found.open == ["channels.gyro.unit", "channels.acc.unit", "channels.cam.unit"]
     channels = copy.deepcopy(found.content["channels"])
