@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -316,43 +316,13 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between:
         NoRowsError: no two rows have all that a row needs.
     """
     check_sources(log.name, resolved)
-    lost = _lost(log, found, resolved)
-    series: dict[str, tuple[Times, Array]] = {}
-    odd = [*_odd_times(log, found, resolved, between), *_said_lost(lost, found, between)]
-    for column, source in resolved.items():
-        at, values = _series(log, found, resolved, column, lost)
-        if len(at) < 2:
-            text = f"topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2"
-            if between is None or column in REQUIRED:
-                raise NoRowsError(f"{log.name}: channel '{column}': {text}")
-            odd.append(f"'{column}' is left out: {text}")
-            continue
-        series[column] = (_known(at, series.values()), values)
-    for joint in JOINTS:
-        angles, said = without_wraps(series, joint)
-        series[f"pos_{joint}"] = (series[f"pos_{joint}"][0], angles)
-        odd += [said] if said else []
-    resolved = {column: source for column, source in resolved.items() if column in series}
-    times, notes = _row_times(log, found, resolved, series, between)
-    times, more = _complete(times, series, resolved, log)
-    origin = int(times[0])
-    period = float(np.median(np.diff(times))) * 1e-9
-    table: dict[str, Array] = {"t": _seconds(times, origin)}
-    facts, samples = [], {}
-    seconds = {id(at): _seconds(at, origin) for at, _ in series.values()}
-    for column, source in resolved.items():
-        at, values = series[column]
-        values = np.unwrap(values) if column == "cam_yaw" else values
-        table[column], fact = _taken(times, at, values, source, period)
-        samples[column] = Samples(seconds[id(at)], values)
-        facts.append(fact)
-    for wheel in (f"pos_{wheel}" for wheel in WHEELS):
-        start = table[wheel][0]
-        table[wheel] = table[wheel] - start
-        samples[wheel] = Samples(samples[wheel].t, samples[wheel].values - start)
-    notes = [*odd, *notes, *more, *_silent(times, series, resolved), *_off(table)]
-    table = {name: table[name] for name in COLUMNS if name in table}
-    return MadeRun(table, samples, tuple(facts), origin, tuple(notes))
+    return _Making(log, found, dict(resolved), between).run()
+
+
+_MISSING = {
+    "cmd": "the setpoints that drove the robot, which every replay needs; without them no simulator can be compared",
+    "pos": "the joints' angles, which every replay is compared with",
+}
 
 
 def check_sources(log: str, resolved: Mapping[str, Resolved]) -> None:
@@ -366,197 +336,218 @@ def check_sources(log: str, resolved: Mapping[str, Resolved]) -> None:
         raise InputError(f"{log}: no source for {', '.join(missing)}: {_MISSING[missing[0].partition('_')[0]]}")
 
 
-def _known(at: Times, series: Iterable[tuple[Times, Array]]) -> Times:
-    """Return the same times of another channel, where there are such: a topic's channels share them."""
-    return next((other for other, _ in series if len(other) == len(at) and np.array_equal(other, at)), at)
+def rows_topic(found: LogMap, resolved: Mapping[str, Resolved]) -> str:
+    """Return the topic whose messages make the rows."""
+    return found.rows or resolved[f"pos_{JOINTS[0]}"].topic
+
+
+@dataclass(eq=False)
+class _Making:
+    """A run that is being made: each channel's samples (ns on the common clock, SI units), and what is to be said of it."""
+
+    log: Log
+    map: LogMap
+    sources: dict[str, Resolved]
+    between: tuple[int, int] | None
+    series: dict[str, tuple[Times, Array]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def run(self) -> MadeRun:
+        self._say_odd_times()
+        self._read(self._lost_frames())
+        times = self._without_holes(self._complete(self._row_times()))
+        origin, period = int(times[0]), float(np.median(np.diff(times))) * 1e-9
+        table: dict[str, Array] = {"t": _seconds(times, origin)}
+        facts, samples = [], {}
+        seconds = {id(at): _seconds(at, origin) for at, _ in self.series.values()}
+        for column, source in self.sources.items():
+            at, values = self.series[column]
+            values = np.unwrap(values) if column == "cam_yaw" else values
+            table[column], fact = _taken(times, at, values, source, period)
+            samples[column] = Samples(seconds[id(at)], values)
+            facts.append(fact)
+        for wheel in (f"pos_{wheel}" for wheel in WHEELS):
+            start = table[wheel][0]
+            table[wheel] = table[wheel] - start
+            samples[wheel] = Samples(samples[wheel].t, samples[wheel].values - start)
+        self._say_silent(times)
+        off = np.isnan([table[name] for name in COMMANDS])
+        if off.any():
+            column = COMMANDS[int(np.argmax(off.any(axis=1)))]
+            self.notes.append(f"{off.any(axis=0).sum()} rows have no setpoint, '{column}' among them: torque off")
+        return MadeRun(
+            {name: table[name] for name in COLUMNS if name in table}, samples, tuple(facts), origin, tuple(self.notes)
+        )
+
+    # ---- samples ----------------------------------------------------------------------------------------------------
+
+    def _say_odd_times(self) -> None:
+        """Say of which topics messages have the time of the one before, of which only the later counts, or go back in time."""
+        for name in dict.fromkeys(source.topic for source in self.sources.values()):
+            topic, use = self.log.topic(name), self.map.use(name).use
+            times = self._within(topic.clock(use), name)
+            count = _repetitions(times)
+            received = _repetitions(topic.received) if self.between is None else 0
+            hint = f": in the map, clocks: {{{name}: {{use: log}}}}" if use != LOG and received < count else ""
+            if count:
+                self.notes.append(f"topic '{name}': {count} of {len(times)} messages repeat a time and are left out{hint}")
+            back = np.diff(times)
+            if (back < 0).any():
+                much = f"{(back < 0).sum()} times, by up to {-back.min() * 1e-9:.3g} s"
+                anew = "; a clock that began anew mixes two recordings: 'use: log'" if back.min() < -1e9 and use != LOG else ""
+                self.notes.append(f"topic '{name}': its times go back {much}: sorted by time{anew}")
+
+    def _within(self, at: Times, topic: str) -> Times:
+        """Return those of a topic's times (ns, its own clock) that are in the span of rows."""
+        if self.between is None:
+            return at
+        moved = at + round(self.map.use(topic).offset * 1e9)
+        return at[(moved >= self.between[0]) & (moved < self.between[1])]
+
+    def _lost_frames(self) -> dict[str, Times]:
+        """Return topic -> times (ns) of frames without a rotation, where there are any."""
+        yaw = self.sources.get("cam_yaw")
+        if yaw is None:
+            return {}
+        where = f"{self.log.name}: channel 'cam_yaw'"
+        at = lost_frames(self.log.topic(yaw.topic), yaw.field, self.map.use(yaw.topic).use, where)
+        if count := len(self._within(at, yaw.topic)):
+            self.notes.append(f"topic '{yaw.topic}': {count} lost frame{'s are' if count > 1 else ' is'} left out")
+        return {yaw.topic: at}
+
+    def _read(self, lost: Mapping[str, Times]) -> None:
+        for column, source in list(self.sources.items()):
+            at, values = self._series(column, lost)
+            if len(at) < 2:
+                text = f"topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2"
+                if self.between is None or column in REQUIRED:
+                    raise NoRowsError(f"{self.log.name}: channel '{column}': {text}")
+                self.notes.append(f"'{column}' is left out: {text}")
+                del self.sources[column]
+                continue
+            same = (other for other, _ in self.series.values() if np.array_equal(other, at))
+            self.series[column] = (next(same, at), values)  # a topic's channels share their times
+        for joint in JOINTS:
+            angles, said = without_wraps(self.series, joint)
+            self.series[f"pos_{joint}"] = (self.series[f"pos_{joint}"][0], angles)
+            self.notes += [said] if said else []
+
+    def _series(self, column: str, lost: Mapping[str, Times]) -> tuple[Times, Array]:
+        """Return a channel's samples in SI units on the common clock, in the order of time; times once only."""
+        source = self.sources[column]
+        topic, clock = self.log.topic(source.topic), self.map.use(source.topic)
+        if column in COMMANDS and (angle := self.sources[column.replace("cmd", "pos")]).topic == source.topic:
+            topic = with_torque_off(topic, source.field, angle.field)
+        where = f"{self.log.name}: channel '{column}'"
+        if source.field in topic.fields or source.field.rpartition(".")[2] not in ANGLES:
+            at, raw = topic.series(source.field, clock.use, where)
+        else:
+            at, raw = pose_angle(topic, source.field, clock.use, self.map.frames.get("cam"), where)
+        if column in CAMERA and source.topic in lost:
+            seen = ~np.isin(at, lost[source.topic])
+            at, raw = at[seen], raw[seen]
+        at = at + round(clock.offset * 1e9)
+        keep = np.concatenate([np.diff(at) > 0, [True]])  # of two at one time, the later message
+        if column not in COMMANDS:
+            keep &= np.isfinite(raw)
+        if not keep.all():
+            at, raw = at[keep], raw[keep]
+        return at, source.sign * (source.factor * raw - source.zero)
+
+    # ---- times of rows ----------------------------------------------------------------------------------------------
+
+    def _row_times(self) -> Times:
+        rows = rows_topic(self.map, self.sources)
+        of_rows = [self.series[column][0] for column, source in self.sources.items() if source.topic == rows]
+        if not of_rows:
+            raise InputError(f"{self.log.name}: rows = '{rows}': no channel comes from that topic")
+        times = max(of_rows, key=len)
+        if self.between is not None:
+            times = times[(times >= self.between[0]) & (times < self.between[1])]
+        times = times[:: self.map.every]
+        if len(times) < 2:
+            raise NoRowsError(f"{self.log.name}: topic '{rows}': {len(times)} messages; a run has at least 2")
+        rate = 1e9 / float(np.median(np.diff(times)))
+        if rate > _QUICK:
+            hint = f"'every: {round(rate / 50)}' takes 50"
+            self.notes.append(f"rows come {rate:.0f} times a second, from topic '{rows}': {hint}")
+        return times
+
+    def _complete(self, times: Times) -> Times:
+        """Return the rows that have all required channels, less up to a second at the ends where others begin later.
+
+        The last setpoint holds to the end of the rows: some robots are sent one only when it changes.
+        """
+        half = int(np.median(np.diff(times)) / 2)
+        begins = {name: int(self.series[name][0][0]) - half for name in REQUIRED if name in self.series}
+        ends = {
+            name: int(at[-1]) + half
+            for name, (at, _) in self.series.items()
+            if name in REQUIRED and self.sources[name].take != "hold"
+        }
+        first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
+        for name, (at, _) in self.series.items():
+            if self.sources[name].take in ("interpolate", "nearest"):
+                reach = int(np.median(np.diff(at)) / 2)
+                if at[0] - reach < first + _END:
+                    begins[name] = int(at[0]) - reach
+                if at[-1] + reach > last - _END:
+                    ends[name] = int(at[-1]) + reach
+        first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
+        kept = times[(times >= first) & (times <= last)]
+        if len(kept) < 2:
+            spans = [
+                f"{name} from {self.series[name][0][0] * 1e-9:.3f} to {self.series[name][0][-1] * 1e-9:.3f} s"
+                for name in REQUIRED[1::8]
+            ]
+            together = f"setpoints and positions are never known together ({'; '.join(spans)}): check 'clocks'"
+            raise NoRowsError(f"{self.log.name}: {together}")
+        sides = (
+            (times[times < first], "beginning", max(begins, key=lambda name: begins[name])),
+            (times[times > last], "end", min(ends, key=lambda name: ends[name], default="")),
+        )
+        for rows, side, name in sides:
+            if len(rows):
+                text = f"'{name}' (topic '{self.sources[name].topic}') is not known there"
+                self.notes.append(f"{len(rows)} rows ({len(rows) * 2e-9 * half:.1f} s) at the {side} are left out: {text}")
+        return kept
+
+    def _without_holes(self, times: Times) -> Times:
+        """Return the rows at which all angles are known: where another topic than the rows' is silent, some are not."""
+        said, keep, step = [], np.ones(len(times), bool), float(np.median(np.diff(times))) * 1e-9
+        for name in (one for one in REQUIRED if one in self.series and self.sources[one].take == "interpolate"):
+            missing = keep & ~bridged(times, self.series[name][0])
+            keep &= ~missing
+            if missing.any():
+                text = f"'{name}' (topic '{self.sources[name].topic}') has a hole there"
+                said.append(f"{missing.sum()} rows ({missing.sum() * step:.1f} s) are left out: {text}")
+        if keep.sum() < 2:
+            raise NoRowsError(f"{self.log.name}: no two rows have all that a row needs: {'; '.join(said)}")
+        self.notes += said
+        return times[keep]
+
+    def _say_silent(self, times: Times) -> None:
+        """Say where a setpoint is held for longer than usual: nothing came, or nothing changed."""
+        said = set()
+        step = float(np.median(np.diff(times)))
+        for name, (at, _) in self.series.items():
+            topic = self.sources[name].topic
+            if self.sources[name].take != "hold" or topic in said:
+                continue
+            age = times - at[np.clip(np.searchsorted(at, times + round(0.5 * step), side="right") - 1, 0, len(at) - 1)]
+            held = age > hole(at)
+            if held.any():
+                said.add(topic)
+                text = f"its last message is held over {held.sum()} rows ({held.sum() * step * 1e-9:.1f} s)"
+                self.notes.append(f"topic '{topic}': silent for up to {age.max() * 1e-9:.1f} s: {text}")
 
 
 def _seconds(times: Times, origin: int) -> Array:
     return np.asarray((times - origin) * 1e-9, np.float64)
 
 
-_MISSING = {
-    "cmd": "the setpoints that drove the robot, which every replay needs; without them no simulator can be compared",
-    "pos": "the joints' angles, which every replay is compared with",
-}
-
-
-def _lost(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> dict[str, Times]:
-    """Return topic -> times (ns) of frames without a rotation, where there are any."""
-    yaw = resolved.get("cam_yaw")
-    if yaw is None:
-        return {}
-    at = lost_frames(log.topic(yaw.topic), yaw.field, found.use(yaw.topic).use, f"{log.name}: channel 'cam_yaw'")
-    return {yaw.topic: at} if len(at) else {}
-
-
-def _said_lost(lost: Mapping[str, Times], found: LogMap, between: tuple[int, int] | None) -> Iterator[str]:
-    for name, at in lost.items():
-        count = len(_within(at, found, name, between))
-        if count:
-            yield f"topic '{name}': {count} lost frame{'s are' if count > 1 else ' is'} left out"
-
-
-def _within(at: Times, found: LogMap, topic: str, between: tuple[int, int] | None) -> Times:
-    """Return those of a topic's times (ns, its own clock) that are in a span of the common clock."""
-    if between is None:
-        return at
-    moved = at + round(found.use(topic).offset * 1e9)
-    return at[(moved >= between[0]) & (moved < between[1])]
-
-
-def _odd_times(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between: tuple[int, int] | None) -> Iterator[str]:
-    """Say of which topics messages have the time of the one before, of which only the later counts, or go back in time."""
-    for name in dict.fromkeys(source.topic for source in resolved.values()):
-        topic = log.topic(name)
-        use = found.use(name).use
-        times = _within(topic.clock(use), found, name, between)
-        count = _repetitions(times)
-        received = _repetitions(topic.received) if between is None else 0
-        hint = f": in the map, clocks: {{{name}: {{use: log}}}}" if use != LOG and received < count else ""
-        if count:
-            yield f"topic '{name}': {count} of {len(times)} messages repeat a time and are left out{hint}"
-        back = np.diff(times)
-        if (back < 0).any():
-            much = f"{(back < 0).sum()} times, by up to {-back.min() * 1e-9:.3g} s"
-            restarted = "; a clock that began anew mixes two recordings: 'use: log'" if back.min() < -1e9 and use != LOG else ""
-            yield f"topic '{name}': its times go back {much}: sorted by time{restarted}"
-
-
 def _repetitions(times: Times) -> int:
     return len(times) - len(np.unique(times))
-
-
-def _series(
-    log: Log, found: LogMap, resolved: Mapping[str, Resolved], column: str, lost: Mapping[str, Times]
-) -> tuple[Times, Array]:
-    """Return a channel's samples in SI units on the common clock, in the order of time; times once only."""
-    source = resolved[column]
-    topic, clock = log.topic(source.topic), found.use(source.topic)
-    if column in COMMANDS and (angle := resolved[column.replace("cmd", "pos")]).topic == source.topic:
-        topic = with_torque_off(topic, source.field, angle.field)
-    where = f"{log.name}: channel '{source.column}'"
-    if source.field in topic.fields or source.field.rpartition(".")[2] not in ANGLES:
-        at, raw = topic.series(source.field, clock.use, where)
-    else:
-        at, raw = pose_angle(topic, source.field, clock.use, found.frames.get("cam"), where)
-    if source.column in CAMERA and source.topic in lost:
-        seen = ~np.isin(at, lost[source.topic])
-        at, raw = at[seen], raw[seen]
-    at = at + round(clock.offset * 1e9)
-    keep = np.concatenate([np.diff(at) > 0, [True]])  # of two at one time, the later message
-    if source.column not in COMMANDS:
-        keep &= np.isfinite(raw)
-    if not keep.all():
-        at, raw = at[keep], raw[keep]
-    return at, source.sign * (source.factor * raw - source.zero)
-
-
-def rows_topic(found: LogMap, resolved: Mapping[str, Resolved]) -> str:
-    """Return the topic whose messages make the rows."""
-    return found.rows or resolved[f"pos_{JOINTS[0]}"].topic
-
-
-def _row_times(
-    log: Log,
-    found: LogMap,
-    resolved: Mapping[str, Resolved],
-    series: Mapping[str, tuple[Times, Array]],
-    between: tuple[int, int] | None,
-) -> tuple[Times, list[str]]:
-    rows = rows_topic(found, resolved)
-    of_rows = [series[column][0] for column, source in resolved.items() if source.topic == rows]
-    if not of_rows:
-        raise InputError(f"{log.name}: rows = '{rows}': no channel comes from that topic")
-    times = max(of_rows, key=len)
-    if between is not None:
-        times = times[(times >= between[0]) & (times < between[1])]
-    times = times[:: found.every]
-    if len(times) < 2:
-        raise NoRowsError(f"{log.name}: topic '{rows}': {len(times)} messages; a run has at least 2")
-    rate = 1e9 / float(np.median(np.diff(times)))
-    if rate > _QUICK:
-        return times, [f"rows come {rate:.0f} times a second, from topic '{rows}': 'every: {round(rate / 50)}' takes 50"]
-    return times, []
-
-
-def _complete(
-    times: Times, series: Mapping[str, tuple[Times, Array]], resolved: Mapping[str, Resolved], log: Log
-) -> tuple[Times, list[str]]:
-    """Return the rows that have all required channels, less up to a second at the ends where others begin later.
-
-    The last setpoint holds to the end of the rows: some robots are sent one only when it changes.
-    """
-    half = int(np.median(np.diff(times)) / 2)
-    begins = {name: int(series[name][0][0]) - half for name in REQUIRED if name in series}
-    ends = {name: int(at[-1]) + half for name, (at, _) in series.items() if name in REQUIRED and resolved[name].take != "hold"}
-    first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
-    for name, (at, _) in series.items():
-        if resolved[name].take in ("interpolate", "nearest"):
-            reach = int(np.median(np.diff(at)) / 2)
-            if at[0] - reach < first + _END:
-                begins[name] = int(at[0]) - reach
-            if at[-1] + reach > last - _END:
-                ends[name] = int(at[-1]) + reach
-    first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
-    kept = times[(times >= first) & (times <= last)]
-    if len(kept) < 2:
-        spans = [
-            f"{name} from {series[name][0][0] * 1e-9:.3f} to {series[name][0][-1] * 1e-9:.3f} s" for name in REQUIRED[1::8]
-        ]
-        raise NoRowsError(f"{log.name}: setpoints and positions are never known together ({'; '.join(spans)}): check 'clocks'")
-    notes = [
-        *_cut(times[times < first], "beginning", max(begins, key=lambda name: begins[name]), resolved, half),
-        *_cut(times[times > last], "end", min(ends, key=lambda name: ends[name], default=""), resolved, half),
-    ]
-    kept, more = _without_holes(kept, series, resolved, log, half)
-    return kept, [*notes, *more]
-
-
-def _cut(rows: Times, side: str, name: str, resolved: Mapping[str, Resolved], half: int) -> Iterator[str]:
-    if len(rows):
-        text = f"'{name}' (topic '{resolved[name].topic}') is not known there"
-        yield f"{len(rows)} rows ({len(rows) * 2e-9 * half:.1f} s) at the {side} are left out: {text}"
-
-
-def _without_holes(
-    times: Times, series: Mapping[str, tuple[Times, Array]], resolved: Mapping[str, Resolved], log: Log, half: int
-) -> tuple[Times, list[str]]:
-    """Return the rows at which all angles are known: where another topic than the rows' is silent, some are not."""
-    notes, keep = [], np.ones(len(times), bool)
-    for name in (one for one in REQUIRED if one in series and resolved[one].take == "interpolate"):
-        missing = keep & ~bridged(times, series[name][0])
-        keep &= ~missing
-        if missing.any():
-            text = f"'{name}' (topic '{resolved[name].topic}') has a hole there"
-            notes.append(f"{missing.sum()} rows ({missing.sum() * 2e-9 * half:.1f} s) are left out: {text}")
-    if keep.sum() < 2:
-        raise NoRowsError(f"{log.name}: no two rows have all that a row needs: {'; '.join(notes)}")
-    return times[keep], notes
-
-
-def _silent(times: Times, series: Mapping[str, tuple[Times, Array]], resolved: Mapping[str, Resolved]) -> Iterator[str]:
-    """Say where a setpoint is held for longer than usual: nothing came, or nothing changed."""
-    said = set()
-    step = float(np.median(np.diff(times)))
-    for name in (one for one in series if resolved[one].take == "hold" and resolved[one].topic not in said):
-        at = series[name][0]
-        age = times - at[np.clip(np.searchsorted(at, times + round(0.5 * step), side="right") - 1, 0, len(at) - 1)]
-        held = age > hole(at)
-        if held.any():
-            said.add(resolved[name].topic)
-            text = f"its last message is held over {held.sum()} rows ({held.sum() * step * 1e-9:.1f} s)"
-            yield f"topic '{resolved[name].topic}': silent for up to {age.max() * 1e-9:.1f} s: {text}"
-
-
-def _off(table: Mapping[str, Array]) -> Iterator[str]:
-    off = np.isnan([table[name] for name in COMMANDS])
-    if off.any():
-        column = COMMANDS[int(np.argmax(off.any(axis=1)))]
-        yield f"{off.any(axis=0).sum()} rows have no setpoint, '{column}' among them: torque off"
-
-
-# ---- its values ------------------------------------------------------------------------------------------------------
 
 
 def _taken(times: Times, at: Times, values: Array, source: Resolved, period: float) -> tuple[Array, ChannelFact]:
