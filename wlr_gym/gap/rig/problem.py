@@ -283,18 +283,18 @@ def _effect(
     if not isinstance(entry, Mapping) or not isinstance(entry.get("parameters", {}), Mapping):
         raise InputError(f"{place}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}")
     name, given = str(entry.get("name")), dict(entry.get("parameters", {}))
-    is_formula = name == UNKNOWN_EFFECT and check_formula is not None
-    if not is_formula:
+    check = check_formula if name == UNKNOWN_EFFECT else None
+    if check is None:
         check_name("effect of the test rig", name, laws, place)
     named = f"{place} ({name})"
     if entry.get("where", joint) not in (joint, [joint], (joint,)):
         raise InputError(f"{named}: where = {entry['where']!r}: the rig has one joint, {joint}")
-    if is_formula:
+    if check is not None:
         formula = entry.get("formula")
         if not isinstance(formula, str):
             raise InputError(f"{named}: formula = {formula!r}: expected a formula of the torque, such as '-b * rate'")
         effect = PatchEffect(name, (joint,), given, formula, _mapping(entry, "units", named), named)
-        check_formula(effect)
+        check(effect)
         return effect
     known = laws[name].parameters
     for key in given:

@@ -224,7 +224,8 @@ def _falls(runs: Sequence[tuple[Array, Array]], order: int) -> Array:
     in_time = []  # over the same turning at one speed, a clock's
     for residual, angle in runs:
         rows = np.arange(len(angle))
-        in_time.append(_predicted(residual, np.polyval(np.polyfit(rows, angle, 1), rows), order))
+        steady = np.asarray(np.polyval(np.polyfit(rows, angle, 1), rows), np.float64)
+        in_time.append(_predicted(residual, steady, order))
     return np.array([*falls, in_time, [float(residual @ residual) for residual, _ in runs]])
 
 
