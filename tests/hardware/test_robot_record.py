@@ -12,7 +12,7 @@ from rich.console import Console
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
-from wlr_gym.cli import record, replay
+from wlr_gym.cli import record, replay, run_command
 from wlr_gym.cli.options import RobotOption
 from wlr_gym.data import read_dataset, read_run, simulate_again
 from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
@@ -252,7 +252,6 @@ def test_list_shows_every_excitation(capsys):
         ({}, "nothing to drive"),
         ({"excitation": ("strait",)}, "did you mean 'straight'"),
         ({"excitation": ("straight", "steps")}, "straight and steps are driven with different servo profiles"),
-        ({"excitation": ("straight",), "seconds": -1.0}, "--seconds -1"),
         ({"excitation": ("straight",), "backend": "mujoco"}, "leave --backend mujoco out"),
         ({"excitation": ("straight",), "backend": "mujocoo", "emulated": False}, "did you mean 'mujoco'"),
         ({"excitation": ("straight",), "out": None}, "--out: expected a folder"),
@@ -265,6 +264,11 @@ def test_refusals(tmp_path, options, words):
     with pytest.raises(InputError, match=words):
         recorded(**options)
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_drive_of_no_time_is_refused(tmp_path):
+    with pytest.raises(InputError, match="--seconds -1"):
+        run_command("record", ["--excitation", "straight", "--emulated", "--seconds", "-1", "--out", str(tmp_path)])
 
 
 #: Ports that are there.
