@@ -10,19 +10,18 @@ import argparse
 import gymnasium as gym
 
 import wlr_gym  # noqa: F401
+from wlr_gym.envs.tasks import terms
 from wlr_gym.envs.tasks.signals import Signals, Value, mean
-from wlr_gym.envs.tasks.terms import POSITIVE, REWARDS, registered
-from wlr_gym.envs.tasks.terms import observations as computed
 
 
-@registered(REWARDS, speed=POSITIVE)
+@terms.registered(terms.REWARDS, speed=terms.POSITIVE)
 def leg_rate(signals: Signals, *, speed: Value = 1.0) -> Value:
     """Mean squared leg rate over ``speed`` (rad/s)."""
     rates = [rate / speed for rate in signals.truth("joint_velocity")[:4]]
     return mean([rate * rate for rate in rates])
 
 
-@computed("left", "right", unit="rad/s", frame="joint", limit=20.0, estimated=True)
+@terms.computed("left", "right", unit="rad/s", frame="joint", limit=20.0, estimated=True)
 def side_speed(signals: Signals) -> list[Value]:
     """Mean wheel speed of each side, as the servos read it."""
     left_front, right_front, left_rear, right_rear = signals.sensors("joint_velocity")[4:]
