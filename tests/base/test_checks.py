@@ -1,8 +1,11 @@
 """Every refusal names place, value and what was expected."""
 
+from dataclasses import dataclass
+from typing import Annotated
+
 import pytest
 
-from wlr_gym.base.checks import check_file, check_folder, check_name, check_number
+from wlr_gym.base.checks import Interval, check_file, check_folder, check_name, check_number, check_ranges
 from wlr_gym.base.errors import InputError
 
 
@@ -41,3 +44,20 @@ def test_names_and_places(tmp_path):
         check_file(tmp_path)
     with pytest.raises(InputError, match="no such folder; expected a folder"):
         check_folder(tmp_path / "none")
+    with pytest.raises(InputError, match="no such folder; expected a folder of runs"):
+        check_folder(tmp_path / "none", of="runs")
+
+
+@dataclass
+class Options:
+    most_runs: Annotated[int, Interval(least=1)] = 1
+    seconds: Annotated[float, Interval("s", above=0.0)] | None = None
+
+
+def test_ranges_that_fields_declare():
+    check_ranges(Options())
+    check_ranges(Options(3, 0.5))
+    with pytest.raises(InputError, match=r"^--most-runs 0: expected 1 or more$"):
+        check_ranges(Options(0))
+    with pytest.raises(InputError, match=r"^run: seconds = 0: expected more than 0 s$"):
+        check_ranges(Options(seconds=0.0), "run: ")
