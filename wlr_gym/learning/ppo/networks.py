@@ -30,6 +30,11 @@ from wlr_gym.robot import JOINTS
 GROUPS = ("policy", "privileged")
 
 
+def grouped(observation: Any) -> dict[str, NDArray[np.float32]]:
+    """Return observations by group; plain ones are those of ``policy``."""
+    return dict(observation) if isinstance(observation, dict) else {"policy": observation}
+
+
 class SideBySide(BaseFeaturesExtractor):
     """Both groups of the observation in one row, the policy's first."""
 

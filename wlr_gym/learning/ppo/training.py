@@ -38,11 +38,12 @@ from wlr_gym.learning.curves import METRICS, CurveFile, best_of, is_better, read
 from wlr_gym.learning.evaluation.metrics import summarise
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.learning.ppo import sb3
-from wlr_gym.learning.ppo.networks import MirroredBuffer, MirroredDictBuffer, set_mirror
+from wlr_gym.learning.ppo.networks import MirroredBuffer, MirroredDictBuffer, grouped, normalisers, set_mirror
 from wlr_gym.learning.ppo.policy import MODEL_FILE, PpoConfig, PpoPolicy, network_kind, parse_settings, with_network_of
-from wlr_gym.learning.ppo.warm_start import gather_scales, imitate, start_from
 from wlr_gym.policy import Training, TrainingProgress, fed_environment, read_contract, write_contract
 
+#: Control steps over which observations are gathered for their scales.
+GATHERED = 100
 #: Factor by which an adapting learning rate changes after an update, and where it stays.
 RATE_STEP, LOWEST_RATE, HIGHEST_RATE = 1.5, 1e-5, 1e-2
 
@@ -87,13 +88,30 @@ def _begin(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) ->
     if config.normalise and training.init is None:
         gather_scales(model, env)
         begin_episodes(model, env, config.seed)
+    if training.init is None and config.teacher is None:
+        return
+    from wlr_gym.learning.ppo.warm_start import imitate, start_from
+
     if training.init is not None:
         start_from(model, env, config, training.init)
-    elif config.teacher is not None:
-        imitate(model, env, config)
     else:
-        return
+        imitate(model, env, config)
     begin_episodes(model, env, config.seed)
+
+
+def gather_scales(model: PPO, env: Sb3VecEnv) -> None:
+    """Let the untrained policy drive, and normalise observations by their mean and deviation there; the steps count."""
+    groups = []
+    for _ in range(GATHERED):
+        seen = sb3.last_observations(model)
+        groups.append(grouped(seen))
+        actions, _ = model.predict(seen, deterministic=False)
+        sb3.go_on_from(model, env.step(np.clip(actions, -1.0, 1.0))[0])
+    rows = {name: torch.as_tensor(np.concatenate([one[name] for one in groups])) for name in groups[0]}
+    for normaliser in normalisers(model.policy):
+        wide = normaliser.mean.shape[0] > rows["policy"].shape[1]
+        normaliser.take(torch.cat(list(rows.values()), dim=1) if wide else rows["policy"])
+    model.num_timesteps += GATHERED * env.num_envs
 
 
 def _record(training: Training, config: PpoConfig) -> None:

@@ -18,7 +18,7 @@ from torch import nn
 
 from wlr_gym.base.errors import require_package
 from wlr_gym.envs import Sb3VecEnv
-from wlr_gym.learning.ppo.networks import normalisers, scale_residual
+from wlr_gym.learning.ppo.networks import grouped, scale_residual
 from wlr_gym.learning.ppo.policy import (
     ACTOR,
     LEARNER,
@@ -29,7 +29,6 @@ from wlr_gym.learning.ppo.policy import (
     parse_settings,
     saved_weights,
 )
-from wlr_gym.learning.ppo.sb3 import go_on_from, last_observations
 from wlr_gym.policy import Policy, check_contract, find_policy, load_policy, make_policy
 
 #: 1 sigma of the noise on the controller's actions.
@@ -42,25 +41,8 @@ EPOCHS = 80
 BATCH_SIZE = 512
 #: At the start; it falls to zero: actions are met within 2 % of their range.
 LEARNING_RATE = 2e-3
-#: Control steps over which observations are gathered for their scales.
-GATHERED = 100
 
 Observations = dict[str, NDArray[np.float32]]
-
-
-def gather_scales(model: PPO, env: Sb3VecEnv) -> None:
-    """Let the untrained policy drive, and normalise observations by their mean and deviation there; the steps count."""
-    groups = []
-    for _ in range(GATHERED):
-        seen = last_observations(model)
-        groups.append(_groups(seen))
-        actions, _ = model.predict(seen, deterministic=False)
-        go_on_from(model, env.step(np.clip(actions, -1.0, 1.0))[0])
-    rows = {name: torch.as_tensor(np.concatenate([one[name] for one in groups])) for name in groups[0]}
-    for normaliser in normalisers(model.policy):
-        wide = normaliser.mean.shape[0] > rows["policy"].shape[1]
-        normaliser.take(torch.cat(list(rows.values()), dim=1) if wide else rows["policy"])
-    model.num_timesteps += GATHERED * env.num_envs
 
 
 def imitate(model: PPO, env: Sb3VecEnv, config: PpoConfig) -> None:
@@ -125,7 +107,7 @@ def _demonstrate(
     """Return observations {group: (M, ...)}, the teacher's actions (M, 8), and discounted rewards (M,) from there on."""
     noise = np.random.default_rng(config.seed)
     seen, actions, rewards, dones = [], [], [], []
-    observation = _groups(env.reset())
+    observation = grouped(env.reset())
     teacher.reset(np.ones(env.num_envs, bool))
     for _ in range(ticks):
         action = teacher.act(observation["policy"])
@@ -133,7 +115,7 @@ def _demonstrate(
         actions.append(action)
         tried = np.clip(action + NOISE * noise.standard_normal(action.shape), -1.0, 1.0)
         new, reward, done, _ = env.step(tried.astype(np.float32))
-        observation = _groups(new)
+        observation = grouped(new)
         teacher.reset(done)
         rewards.append(reward)
         dones.append(done)
@@ -142,10 +124,6 @@ def _demonstrate(
     kept = range(0, len(seen) - horizon, STRIDE)
     groups = {name: np.concatenate([seen[tick][name] for tick in kept]) for name in observation}
     return groups, np.concatenate([actions[tick] for tick in kept]), np.concatenate([returns[tick] for tick in kept])
-
-
-def _groups(observation: Any) -> Observations:
-    return dict(observation) if isinstance(observation, dict) else {"policy": observation}
 
 
 def _discounted(rewards: NDArray[np.float32], dones: NDArray[np.bool_], gamma: float) -> NDArray[np.float32]:
