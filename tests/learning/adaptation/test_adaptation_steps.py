@@ -381,7 +381,7 @@ def test_measured_runs_alone_drive_nothing(tmp_path, monkeypatch):
         (out / HISTORY_FILE).write_text(history.model_dump_json())
         return Decided(history, None, out)
 
-    monkeypatch.setattr("wlr_gym.learning.adaptation.adapt.decide", decide)
+    monkeypatch.setattr(steps, "decide", decide)
     first, found = (wlr_gym.adapt("velocity_slip_aware", tmp_path / "out", robot_runs=tmp_path / "data") for _ in range(2))
     assert (first.policy, first.is_new) == ("velocity_slip_aware", False)
     assert found == first  # from its files
