@@ -22,8 +22,7 @@ from wlr_gym.envs.tasks.describe import column_name, task_sections
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.envs.tasks.scaling import QUANTITIES, check_rule, ratio
 from wlr_gym.envs.tasks.task import bounds, read_task
-from wlr_gym.envs.tasks.terms import COMPUTED, POLICY_TERMS, POSITIVE, REWARDS, TERMINATIONS, registered
-from wlr_gym.envs.tasks.terms import observations as computed
+from wlr_gym.envs.tasks.terms import COMPUTED, POLICY_TERMS, POSITIVE, REWARDS, TERMINATIONS, computed, registered
 from wlr_gym.robot import load_robot, robot_content
 
 

@@ -281,6 +281,14 @@ def _require_keys(data: Mapping[str, Any], valid: Sequence[str] | Mapping[str, A
 
 # ---- unknown effects: a formula for a generalised force --------------------------------------------------------------
 
+# As the gap workflow reports what no named effect explains:
+#
+#   - name: unknown_effect
+#     where: [leg_lr]
+#     formula: "-k * (leg_angle - a0)"
+#     parameters: {k: 0.8, a0: 1.2}
+#     units: {k: N m/rad, a0: rad}
+
 
 def parse_formula(entry: Mapping[str, Any], where: tuple[str, ...], place: str) -> PatchEffect:
     """Return the checked unknown effect of a patch file.

@@ -26,6 +26,16 @@ from wlr_gym.robot import FIRST_WHEEL, JOINTS, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameter_table import SPECS, XYZ
 from wlr_gym.robot.parameters import Parameters
 
+# ---- optical flow under the body: counts of image shift, as the reading at a control tick ----------------------------
+
+# The sensor looks along body -z and measures how fast the floor turns about it, rad/s along its own x and y (nominally the
+# body's): flow_x = v_x/h - w_y, flow_y = v_y/h + w_x, with the velocity v of its lens over the floor, the body's angular
+# velocity w, and the distance h from the lens to the floor along its axis. The floor is the plane z = 0 of the floor frame, on a
+# slope too. Frames come at a rate of their own. A reading is what was counted between the last frame before the tick and the last
+# before the tick before, over the time between these two frames: drivers that poll faster than the frames know it
+# (wlr_gym.hardware.flow). Both are linear in the pose between two ticks.
+
+
 #: Parameters that a robot's sensor remembers, in the order of the first columns of its state.
 FLOW_ERRORS = ("flow.present", "flow.scale", "flow.mount_yaw", "flow.dropout", "flow.poor_floor")
 _PRESENT, _FLOW_SCALE, _FLOW_MOUNT_YAW, _DROPOUT, _POOR_FLOOR = range(len(FLOW_ERRORS))
@@ -219,6 +229,9 @@ def _counted(flow: float, interval: float, frames: int, normal: float, settings:
     counts = flow * interval / count
     spread = math.sqrt(frames) * math.hypot(settings[_NOISE], settings[_SPEED_NOISE] * counts / frames)
     return (np.rint(counts + spread * normal) + 0.0) * count / interval
+
+
+# ---- all sensors -----------------------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]

@@ -52,6 +52,9 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
+# ---- the parameter table as numbers that the kernel reads: once per change, float64, before any cast -----------------
+
+
 _CORNER_LANES = (
     *ASSEMBLY,
     "length",
@@ -128,6 +131,9 @@ def damper_look_ahead(parameters: Parameters, step: float) -> Array:
     mass = parameters["body.mass"][:, None] / 12.0
     stiffness_ratio = step * parameters["ground.normal_damping"] / mass
     return 0.5 * np.clip(2.0 - stiffness_ratio / 0.3, 0.0, 1.0)
+
+
+# ---- tracing ---------------------------------------------------------------------------------------------------------
 
 
 WIDTH = {"float64": 8, "float32": 16}

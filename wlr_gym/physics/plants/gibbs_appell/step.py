@@ -17,8 +17,8 @@ second order. Normal forces come from the contact spring at the middle position 
 solved, so that the friction problem is convex and has one solution. Back-EMF and viscous friction are implicit with an
 exponentially fitted weight: a free motor follows its closed form exactly at any step.
 
-Here: the drifts, the end of the kick, and what is shown of the state. The kick's problem is set up in ``gauss.py`` and solved
-in ``friction.py``; ``kinematics.py`` has the geometry, ``lanes.py`` the names.
+Here: the drifts, the end of the kick, and what is shown of the state. The kick's problem is set up and
+solved in ``gauss.py``; ``kinematics.py`` has the geometry and the names.
 """
 
 from __future__ import annotations

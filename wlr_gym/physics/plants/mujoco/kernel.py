@@ -27,6 +27,9 @@ from wlr_gym.physics.plants.sensors import RAW_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
 from wlr_gym.robot.parameters import Parameters
 
+# ---- the parameter table as numbers that the kernel reads: once per change -------------------------------------------
+
+
 _CORNER_LANES = (
     "hip_x", "hip_y", "hip_z", "length", "radius", "zero_offset", "stiffness", "damping", "rolling", "wheel_spin",
     "contact_lightness_x", "contact_lightness_y",
@@ -107,6 +110,9 @@ def contact_lightness(parameters: Parameters) -> tuple[Array, Array]:
     along = 1.0 / mass + height**2 / inertia[:, 1] + hip[:, 1] ** 2 * turn
     across = 1.0 / mass + height**2 / inertia[:, 0] + hip[:, 0] ** 2 * turn
     return along, across
+
+
+# ---- tracing ---------------------------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]

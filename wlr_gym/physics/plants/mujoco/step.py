@@ -14,7 +14,7 @@ the motors' torques and this step's model fields, after it :func:`after` reads w
   sphere is placed so that MuJoCo's contact point, which lies halfway into the overlap, is exactly the disc's lowest point.
 - Rolling resistance is a torque of our own: MuJoCo's (``condim`` 6) shares one cone with sliding friction, so a wheel that
   rolls would lose its grip. Tyre creep is a force of our own: MuJoCo's friction knows no such curve. Both depend on a rate,
-  steeply; see ``own_forces.py``.
+  steeply; they are at the end of this file.
 - MuJoCo's velocities: of the body origin in the floor frame, angular in the body frame, joint rates relative to the parent.
 """
 
