@@ -30,9 +30,9 @@ from wlr_gym.robot.parameters import Parameters
 
 # The sensor looks along body -z and measures how fast the floor turns about it, rad/s along its own x and y (nominally the
 # body's): flow_x = v_x/h - w_y, flow_y = v_y/h + w_x, with the velocity v of its lens over the floor, the body's angular
-# velocity w, and the distance h from the lens to the floor along its axis. The floor is the plane z = 0 of the floor frame, on a
-# slope too. Frames come at a rate of their own. A reading is what was counted between the last frame before the tick and the last
-# before the tick before, over the time between these two frames: drivers that poll faster than the frames know it
+# velocity w, and the distance h from the lens to the floor along its axis. The floor is the plane z = 0 of the floor frame,
+# on a slope too. Frames come at a rate of their own. A reading is what was counted between the last frame before the tick and
+# the last before the tick before, over the time between these two frames: drivers that poll faster than the frames know it
 # (wlr_gym.hardware.flow). Both are linear in the pose between two ticks.
 
 
