@@ -45,6 +45,10 @@ COMMANDS = {
     "no thread": (["evaluate", "pid", "--threads", "0"], "--threads 0: expected 1 or more"),
     "no episodes elsewhere": (["evaluate", "pid", "--other-episodes", "0"], "--other-episodes 0: expected 1 or more"),
     "no step": (["compare", "--out", "x", "--physics-step", "0"], "--physics-step 0: expected more than 0 s"),
+    "no time to drive": (
+        ["record", "--excitation", "straight", "--seconds", "-1", "--out", "x"],
+        "--seconds -1: expected more than 0 s",
+    ),
     "no workers": (["sweep", "WLR-Velocity-v0", "--workers", "0"], "--workers 0: expected 1 or more"),
     "no time to cut at": (["import", ".", "--split", "-3", "--out", "x"], "--split -3: expected more than 0 s"),
     "no columns of a board": (
