@@ -267,7 +267,8 @@ def test_refusals(tmp_path, options, words):
 
 
 def test_a_drive_of_no_time_is_refused(tmp_path):
-    run_command("record", ["--excitation", "straight", "--emulated", "--seconds", "-1", "--out", str(tmp_path)])
+    with pytest.raises(InputError, match="--seconds -1"):
+        run_command("record", ["--excitation", "straight", "--emulated", "--seconds", "-1", "--out", str(tmp_path)])
 
 
 #: Ports that are there.

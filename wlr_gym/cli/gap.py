@@ -109,8 +109,17 @@ def run(options: GapOptions) -> int:
     refuse_existing(options.out / RESULT_FILE, options.force)
     check_results(options.out)
     with progress(console) as tell:
-        threads = options.threads or os.cpu_count() or 1
-        analysis = analyse(**handed(options, analyse, known=known, threads=threads, tell=partial(tell, "")))
+        analysis = analyse(
+            options.data,
+            options.out,
+            known=known,
+            rig=options.rig,
+            robot=options.robot,
+            backend=options.backend,
+            heldout=options.heldout,
+            threads=options.threads or os.cpu_count() or 1,
+            tell=partial(tell, ""),
+        )
     record_provenance(options.out, settings_of(options) | {"effects": known.content()["effects"]})
     if options.json:
         print_json(json.loads((options.out / RESULT_FILE).read_text(encoding="utf-8")))
