@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.paths import find_config
 
 #: id -> task: name in ``configs/task/`` or path.
 ENVIRONMENTS: dict[str, str] = {}
@@ -104,6 +103,7 @@ def register_task(path: str | Path) -> str:
     """
     if not isinstance(path, str | Path):
         raise InputError(f"register_task({path!r}): expected the path of a task file")
+    from wlr_gym.base.paths import find_config
     from wlr_gym.envs.tasks.task import read_task
 
     source = str(find_config("task", path).resolve())
