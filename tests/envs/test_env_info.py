@@ -152,7 +152,7 @@ def test_only_simulators_know_the_truth() -> None:
         gym.make(ID, truth_info=1)  # type: ignore[arg-type]
 
 
-# --- what randomisation sampled shows in ``info``, at reset and whenever it changes, in every face; and at the contacts
+# --- randomisation in info, and at the contacts -----------------------------------------------------------------------
 
 
 PUSH = {

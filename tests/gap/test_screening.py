@@ -166,7 +166,7 @@ def test_all_probes_are_one_batch():
     assert problem.calls - before == len(probes)
 
 
-# --- scores under the alternative: what lasts counts, a kink does not hide an effect, and tolerances are no effect ----
+# --- scores under the alternative -------------------------------------------------------------------------------------
 
 
 #: As between two simulators of one robot.
@@ -299,7 +299,7 @@ def test_a_misfit_of_one_held_out_run_is_not_passed_over(error, verdict):
     assert (said in sentence(done)) == sentence(done).endswith("; in held-out runs torque is worst.") == (verdict == UNKNOWN)
 
 
-# --- by how much an effect must improve the fit: what chance gives on the same data, whatever the effect that they hold
+# --- the least improvement that counts --------------------------------------------------------------------------------
 
 
 #: Rows of a run: 20 s.

@@ -744,10 +744,8 @@ def test_formula_drag_on_the_body_slows_it_exponentially():
     np.testing.assert_allclose(np.linalg.norm(truth.linear_velocity_in_body, axis=1), np.exp(-2.0 * 0.5 / mass), rtol=2e-2)
 
 
-# --- a robot without an effect has the same bits in every kernel; one with effects has the same bits alone and in a bat
+# --- bits of kernels for families of effects --------------------------------------------------------------------------
 
-
-pytestmark = pytest.mark.usefixtures("own_kernels")
 
 ONE_OF_EACH = {
     "rolling_resistance": ("ground.rolling_resistance", 0.01),
@@ -794,6 +792,7 @@ def with_effects(parameters, families, robots=slice(None)):
     return changed
 
 
+@pytest.mark.usefixtures("own_kernels")
 @pytest.mark.slow  # a kernel for every family
 @pytest.mark.parametrize("family", ONE_OF_EACH)
 def test_neutral_robot_keeps_its_bits(family):
@@ -811,6 +810,7 @@ def test_neutral_robot_keeps_its_bits(family):
     np.testing.assert_array_equal(beside[:, 3:6], changed[:, 3:6])
 
 
+@pytest.mark.usefixtures("own_kernels")
 @pytest.mark.parametrize(
     ("count", "precision"), [(1, "float64"), pytest.param(9, "float64", marks=pytest.mark.slow), (17, "float32")]
 )

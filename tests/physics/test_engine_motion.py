@@ -446,7 +446,7 @@ def test_robot_turns_towards_its_smaller_wheels():
     np.testing.assert_allclose(yaw[1], -yaw[0], rtol=1e-6)
 
 
-# --- the error falls with the step at the method's order, the solver's sweeps suffice, and nothing explodes up to 4 ms
+# --- convergence with the step ----------------------------------------------------------------------------------------
 
 
 DRIVEN = 32
@@ -515,7 +515,7 @@ def test_stable_after_a_drop_and_under_random_commands(step):
     np.testing.assert_allclose(np.linalg.norm(plant.truth().quaternion, axis=1), 1.0, atol=1e-12)
 
 
-# --- tyres that flatten, in both simulators: they roll on their radius less a share of what a load presses them deeper
+# --- tyres that flatten, in both simulators ---------------------------------------------------------------------------
 
 
 BACKENDS = ["gibbs_appell", "mujoco"]

@@ -124,7 +124,7 @@ def test_it_tips_over_on_the_slope_that_is_said():
     assert (upright[3:] < 0.9).all()
 
 
-# --- every bad robot file of a list is refused or warned about, with the number that is odd; robots that are fine are n
+# --- bad robot files are refused, fine ones are not -------------------------------------------------------------------
 
 
 REFUSED, FAULT, WARNING = "refused", "fault", "warning"

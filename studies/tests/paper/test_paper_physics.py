@@ -10,9 +10,9 @@ sp = pytest.importorskip("sympy")
 
 from paper_symbols import constants, same, state  # noqa: E402
 
+from studies import derivation  # noqa: E402
 from studies.paper import corrected, printed, reduced, verdicts  # noqa: E402
 from studies.paper.quantities import WHEELS, Forces, PaperConstants, State, lever, wheelbase  # noqa: E402
-from wlr_gym.physics.model import derivation  # noqa: E402
 
 C, S = constants(), state()
 #: u11' in the order of the reduced model, wheels lf, rf, lr, rr.

@@ -211,7 +211,7 @@ def test_the_same_function_may_come_again():
     assert registered(REWARDS)(REWARDS["alive"].function) is REWARDS["alive"].function
 
 
-# --- numbers of a task follow the robot by the rules of its file; for the robot it is written for they stay as they are
+# --- scaling of a task's numbers to the robot -------------------------------------------------------------------------
 
 
 TASKS = tuple(ENVIRONMENTS.values())

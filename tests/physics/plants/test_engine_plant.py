@@ -186,7 +186,7 @@ def test_an_hour_of_driving() -> None:
     assert np.abs(single["yaw"] - double["yaw"]).max() < 0.06
 
 
-# --- the same robot gives the same bits alone, anywhere in a batch, on any number of threads, and again; and a golden r
+# --- the same bits alone, in a batch, on any threads, and again -------------------------------------------------------
 
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "engine_rollout.json"

@@ -356,7 +356,7 @@ def _expected(centre: Any, rotation: Any, radius: Any, camera: Any, ellipse: Any
     return True
 
 
-# --- say why a target is not found among the markers of a picture: wrong sheets, swapped ones, too few ----------------
+# --- why a target is not found ----------------------------------------------------------------------------------------
 
 
 def sheet_fault(detections: Sequence[Detection], target: Target, camera: Camera) -> str:

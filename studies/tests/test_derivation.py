@@ -6,7 +6,7 @@ import pytest
 
 sp = pytest.importorskip("sympy")
 
-from wlr_gym.physics.model import derivation as d  # noqa: E402
+from studies import derivation as d  # noqa: E402
 from wlr_gym.physics.model import equations  # noqa: E402
 
 
