@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from wlr_gym import cli
-from wlr_gym.cli.parsing import SHELLS
+from wlr_gym.cli.options import SHELLS
 
 WORDS = [[name] for name in cli.COMMANDS]
 WORDS += [[name, word] for name in ("robot", "calibrate", "vision") for word in cli.options_of(name) if word]

@@ -10,7 +10,7 @@ from blocks import PAGES, ROOT, Block, blocks, program_of
 from studies.bench.__main__ import BenchOptions
 from studies.paper.__main__ import PaperOptions
 from wlr_gym.cli import COMMANDS, parse_command
-from wlr_gym.cli.parsing import parse
+from wlr_gym.cli.options import parse
 
 STUDIES = {"python -m studies.bench": BenchOptions, "python -m studies.paper": PaperOptions}
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]+)?\)")

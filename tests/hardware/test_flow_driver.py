@@ -5,7 +5,7 @@ import struct
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -254,7 +254,7 @@ def test_noise_costs_no_more_than_the_frames_it_hits(noise, cut, bit, sizes):
 
 def stream_and_pipe():
     clock, pipe = HandClock(100.0), HandDevice()
-    stream = FlowStream(STREAM, SENSOR, clock, lambda *port: pipe)
+    stream = FlowStream(STREAM, SENSOR, clock, cast(Any, lambda *port: pipe))
     stream.open()
     return clock, pipe, stream
 

@@ -301,7 +301,9 @@ class Operator:
 def emulated_as_real(monkeypatch):
     """What is connected is an emulated robot that the commands take for a real one."""
     monkeypatch.setattr("wlr_gym.hardware.safety.preflight.require_ports", lambda hardware: None)
-    monkeypatch.setattr(plant, "link_of", lambda *given: link_of(*given[:2], replace(given[2], emulated=True)))
+    monkeypatch.setattr(
+        plant, "link_of", lambda robot, hardware, options, *rest: link_of(robot, hardware, replace(options, emulated=True))
+    )
 
 
 def test_every_motion_of_a_real_robot_is_asked_for(tmp_path, monkeypatch, capsys, emulated_as_real):

@@ -1,9 +1,18 @@
-"""Errors a user can act on: what was wrong, where, what was expected, and the nearest valid name."""
+"""Errors a user can act on (what was wrong, where, what was expected, and the nearest valid name), and checks that raise them.
+
+The sentence of a refusal is written here, once. Settings of a file declare their ranges with their fields
+(:mod:`wlr_gym.base.settings`); the checks are for arguments, options, and numbers that are read otherwise. A ``place`` is how
+the user calls the value: ``"--segment"``, ``"robot.yaml: body.mass"``.
+"""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 
 class InputError(ValueError):
@@ -37,3 +46,142 @@ def require_package(package: str, extra: str) -> None:
 
     if importlib.util.find_spec(package) is None:
         raise MissingPackageError(f"this needs the package '{package}': pip install 'wlr-gym[{extra}]'")
+
+
+# --- checks of single values -----------------------------------------------------------------------------------------
+
+
+#: Largest seed of commands and trainings: NumPy's older generator, which libraries seed too, takes no larger one.
+LARGEST_SEED = 2**32 - 1
+#: Largest seed of a simulator's noise, whose keys have 64 bits.
+LARGEST_NOISE_SEED = 2**64 - 1
+
+
+def check_number(
+    place: str,
+    value: Any,
+    unit: str = "",
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    most: float | None = None,
+    below: float | None = None,
+    whole: bool = False,
+    what: str = "",
+) -> None:
+    """Refuse a value that is no finite number, or not in its range.
+
+    Args:
+        place: how messages call it; an option begins with ``--``.
+        value: what was given.
+        unit: of the value and the bounds.
+        above, least, most, below: the range, with its ends (``least``, ``most``) or without; None = open.
+        whole: only whole numbers.
+        what: added to the message: why the range is as it is, or what to do.
+
+    Raises:
+        InputError: naming the value and what was expected.
+    """
+    is_number = isinstance(value, int) if whole else isinstance(value, int | float)
+    if is_number and not isinstance(value, bool) and math.isfinite(value):
+        inside = (
+            (above is None or value > above)
+            and (least is None or value >= least)
+            and (most is None or value <= most)
+            and (below is None or value < below)
+        )
+        if inside:
+            return
+    shown = f"{value:g}" if isinstance(value, float) else repr(value)
+    wanted = " ".join(filter(None, (_range(above, least, most, below, whole), unit)))
+    raise InputError(f"{stated(place, shown)}: expected {wanted}{what and '; '}{what}")
+
+
+def stated(place: str, shown: str) -> str:
+    """Return a value at its place, as messages write it: ``--seed -1``, ``robot.yaml: body.mass = -1``."""
+    return f"{place} {shown}" if place.rpartition(" ")[2].startswith("--") else f"{place} = {shown}"
+
+
+def _range(above: float | None, least: float | None, most: float | None, below: float | None, whole: bool) -> str:
+    def bound(number: float) -> str:
+        return str(number) if isinstance(number, int) else f"{number:g}"
+
+    kind = "a whole number" if whole else ""
+    if least is not None and most is not None:
+        return f"{kind or 'a number'} from {bound(least)} to {bound(most)}"
+    upper = f"{bound(most)} at most" if most is not None else f"less than {bound(below)}" if below is not None else ""
+    lower = f"more than {bound(above)}" if above is not None else f"{bound(least)} or more" if least is not None else ""
+    bounds = " and ".join(filter(None, (lower, upper)))
+    return ", ".join(filter(None, (kind, bounds))) or "a finite number"
+
+
+def require_seed(name: str, seed: int, largest: int = LARGEST_SEED) -> None:
+    """Raise :class:`InputError` for a seed out of range; the message begins with ``name``."""
+    if not 0 <= seed <= largest:
+        raise InputError(f"{name} {seed}: expected 0 to {largest}")
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Which numbers a field of a dataclass takes: ``Annotated[float, Interval("s", above=0.0)]``; see :func:`check_number`."""
+
+    unit: str = ""
+    above: float | None = None
+    least: float | None = None
+    most: float | None = None
+    below: float | None = None
+
+
+def check_ranges(options: Any, prefix: str = "--") -> None:
+    """Refuse the first number of a dataclass that is out of the range that its field declares; None = left open.
+
+    Args:
+        options: instance of the dataclass.
+        prefix: of the names of fields in messages; behind ``--`` a name has hyphens.
+
+    Raises:
+        InputError: naming field, value and range.
+    """
+    for name, hint in get_type_hints(type(options), include_extras=True).items():
+        value = getattr(options, name)
+        place = prefix + (name.replace("_", "-") if prefix == "--" else name)
+        for one in _ranges(hint) if value is not None else ():
+            check_number(place, value, **vars(one))
+
+
+def _ranges(hint: Any) -> Iterator[Interval]:
+    yield from (one for one in getattr(hint, "__metadata__", ()) if isinstance(one, Interval))
+    for part in get_args(hint):
+        yield from _ranges(part)
+
+
+def check_name(kind: str, name: Any, valid: Iterable[str], place: str = "") -> None:
+    """Refuse a name that is not among the valid ones.
+
+    Raises:
+        InputError: listing them and naming the nearest; see :func:`wlr_gym.base.errors.unknown_name`.
+    """
+    if name not in (options := list(valid)):
+        raise unknown_name(kind, str(name), options, place)
+
+
+def check_file(path: Path, place: str = "") -> None:
+    """Refuse a path at which there is no file.
+
+    Raises:
+        InputError: naming it, and what is there instead.
+    """
+    if not path.is_file():
+        found = "is a folder" if path.is_dir() else "no such file"
+        raise InputError(f"{place and place + ' '}{path}: {found}; expected a file")
+
+
+def check_folder(path: Path, place: str = "", of: str = "") -> None:
+    """Refuse a path at which there is no folder; ``of`` says what it is to hold.
+
+    Raises:
+        InputError: naming it, and what is there instead.
+    """
+    if not path.is_dir():
+        found = "is a file" if path.is_file() else "no such folder"
+        raise InputError(f"{place and place + ' '}{path}: {found}; expected a folder{of and ' of '}{of}")

@@ -126,7 +126,7 @@ def _dispatch(words: list[str]) -> int:
 
 def _completion(words: list[str]) -> int:
     """Print the script that completes commands and options in a shell."""
-    from wlr_gym.cli.parsing import SHELLS, one_of, parse
+    from wlr_gym.cli.options import SHELLS, one_of, parse
 
     if len(words) != 1 or words[0] not in SHELLS:
         raise InputError(f"--completion: expected one of {', '.join(SHELLS)}, such as: wlr --completion bash")
@@ -174,7 +174,7 @@ def run_program(program: str, kind: type, run: Callable[[Any], int], description
 
 def run_words(program: str, kind: type, run: Callable[[Any], int], description: str, words: Sequence[str]) -> int:
     """Parse the words of a program of one command and run it."""
-    from wlr_gym.cli.parsing import parse
+    from wlr_gym.cli.options import parse
 
     return run_options(parse(kind, program, words, description), run)
 
@@ -183,9 +183,9 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
     """Return the options of one command.
 
     Raises:
-        InputError, SystemExit: see :func:`wlr_gym.cli.parsing.parse`.
+        InputError, SystemExit: see :func:`wlr_gym.cli.options.parse`.
     """
-    from wlr_gym.cli.parsing import one_of, parse
+    from wlr_gym.cli.options import one_of, parse
 
     program, kind, description = f"wlr {name}", options_of(name), _module(name).__doc__ or ""
     if isinstance(kind, Mapping):

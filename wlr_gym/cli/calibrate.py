@@ -17,8 +17,7 @@ import numpy as np
 from rich.console import Console
 from tyro.conf import Positional
 
-from wlr_gym.base.checks import Interval, check_name
-from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.errors import InputError, Interval, check_name, require_package
 from wlr_gym.base.files import check_new_file, make_output_folder, refuse_existing
 from wlr_gym.base.paths import find_config
 from wlr_gym.base.progress import progress

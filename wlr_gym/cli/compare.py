@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 
-from wlr_gym.base.checks import Interval
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.base.files import output_folder, write_json, write_text
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from wlr_gym.base.checks import Interval
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import PatchOption, Seconds, Seed
 from wlr_gym.robot import load_robot

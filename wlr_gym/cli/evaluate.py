@@ -11,8 +11,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from wlr_gym.base.checks import Interval, check_name
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, Interval, check_name
 from wlr_gym.base.files import output_folder, refuse_existing
 from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from rich.console import Console
 from tyro.conf import Positional
 
-from wlr_gym.base.checks import Interval, check_folder, check_name
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, Interval, check_folder, check_name, unknown_name
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance

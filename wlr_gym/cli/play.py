@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from wlr_gym.base.checks import Interval, check_name
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, Interval, check_name
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import tracked
 from wlr_gym.cli import OK

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from tyro.conf import Positional
 
-from wlr_gym.base.checks import check_number
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.files import make_output_folder, refuse_existing, write_json
 from wlr_gym.base.progress import tracked
 from wlr_gym.base.provenance import record_provenance

@@ -10,8 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from wlr_gym.base.checks import Interval
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK

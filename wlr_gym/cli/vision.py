@@ -19,8 +19,7 @@ import numpy as np
 from rich.console import Console
 from tyro.conf import Positional
 
-from wlr_gym.base.checks import Interval
-from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.errors import InputError, Interval, require_package
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
@@ -32,7 +31,7 @@ from wlr_gym.perception.markers.targets import Target
 if TYPE_CHECKING:
     from wlr_gym.data import Run
     from wlr_gym.perception.markers.camera import Camera
-    from wlr_gym.perception.vision import VideoAnalysis
+    from wlr_gym.perception.vision.analysis import VideoAnalysis
     from wlr_gym.perception.vision.sheets import SheetCheck
     from wlr_gym.perception.vision.tracking import Sample, VideoFrame
 
@@ -94,7 +93,9 @@ def run(options: VisionOptions) -> int:
     require_package("cv2", "vision")
 
     from wlr_gym.data import read_run
-    from wlr_gym.perception.vision import load_camera, load_target, save_video_analysis
+    from wlr_gym.perception.markers.camera import load_camera
+    from wlr_gym.perception.markers.targets import load_target
+    from wlr_gym.perception.vision.analysis import save_video_analysis
 
     if Path(options.video).is_dir() and options.rate is None and options.times is None:
         raise InputError(f"{options.video}: images do not say when they were taken: give --rate (Hz) or --times")
@@ -143,8 +144,8 @@ def _analyse(
     options: VisionOptions, measured: Run, camera: Camera, body: Target, floor: Target, console: Console
 ) -> VideoAnalysis:
 
-    from wlr_gym.perception.vision import Frames, analyse
-    from wlr_gym.perception.vision.video import AnnotatedVideo
+    from wlr_gym.perception.vision.analysis import analyse
+    from wlr_gym.perception.vision.video import AnnotatedVideo, Frames
 
     began: float | None = None
     frames = Frames(options.video, options.rate, options.times, options.seconds)
@@ -198,7 +199,8 @@ def check_photo(options: VisionCheckOptions) -> int:
     """
     require_package("cv2", "vision")
 
-    from wlr_gym.perception.vision import load_camera, load_target
+    from wlr_gym.perception.markers.camera import load_camera
+    from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import check_sheets
     from wlr_gym.perception.vision.video import read_image
 

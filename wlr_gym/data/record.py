@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import LARGEST_NOISE_SEED, require_seed
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import LARGEST_NOISE_SEED, InputError, require_seed
 from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.base.text import row_words
 from wlr_gym.data.comparison import SETTLE

@@ -12,8 +12,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.errors import InputError, check_name, nearest
 from wlr_gym.base.paths import find_config, named_by, named_in
 from wlr_gym.base.settings import SettingsModel, expected, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, ControlTable, load_table

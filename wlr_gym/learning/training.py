@@ -7,8 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.checks import check_number
-from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.errors import InputError, check_number, nearest
 from wlr_gym.base.files import require_empty
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml

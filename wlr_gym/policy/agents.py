@@ -14,8 +14,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name, unknown_name
 from wlr_gym.base.paths import config_names, data_directory, named_in
 from wlr_gym.base.settings import merge_changes, parse_yaml, read_layers
 from wlr_gym.base.text import pairs

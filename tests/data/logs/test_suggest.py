@@ -53,7 +53,7 @@ def said(proposal, place):
     return line.why
 
 
-def start_of(imported, epoch=EPOCH):
+def start_of(imported, epoch: float = EPOCH):
     return imported.origin * 1e-9 - epoch
 
 

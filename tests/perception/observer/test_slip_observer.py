@@ -261,7 +261,7 @@ def test_the_filter_is_the_textbooks():
     transition = np.eye(4)
     transition[0, 1:3], transition[1, 2] = (step, -0.5 * step**2), -step
     p = start.copy()
-    kalman.predict(p, step, 0.3, 0.7)
+    kalman.predict_direction(p, step, 0.3, 0.7)
     np.testing.assert_allclose(p, transition @ start @ transition.T + np.diag([0, 0.3, 0.7, 0]), rtol=1e-12, atol=1e-12)
 
     age, flow, column = 0.1, 0.4, np.empty(4)
@@ -275,7 +275,7 @@ def test_the_filter_is_the_textbooks():
         assert spread == pytest.approx(row @ p @ row)
     change, total = np.zeros(4), float(h @ p @ h) + 0.5
     corrected = p.copy()
-    kalman.correct(corrected, column.copy(), 2.0, total, change)
+    kalman.correct_direction(corrected, column.copy(), 2.0, total, change)
     np.testing.assert_allclose(change, 2.0 * (p @ h) / total, rtol=1e-12)
     np.testing.assert_allclose(corrected, p - np.outer(p @ h, p @ h) / total, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(corrected, corrected.T)

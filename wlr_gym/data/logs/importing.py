@@ -15,8 +15,7 @@ from typing import Any
 
 import yaml
 
-from wlr_gym.base.checks import check_number
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.data.check import Finding, check_table

@@ -18,8 +18,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name, unknown_name
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
 from wlr_gym.data.runs import names_file

@@ -24,8 +24,7 @@ import pandas as pd
 from numba import NumbaError, njit
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_folder, check_name, check_number
-from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.errors import InputError, check_folder, check_name, check_number, nearest
 from wlr_gym.base.random import generator
 from wlr_gym.base.text import row_words
 from wlr_gym.gap.analysis import IntakeFinding

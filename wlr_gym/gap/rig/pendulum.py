@@ -24,8 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.random import generator
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import MeasuredSignal, Quantity, Range, Setting, Unknown, since_reversal

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_folder
-from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.errors import InputError, check_folder, nearest
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.rig.problem import smoothed_state
 

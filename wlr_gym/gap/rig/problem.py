@@ -17,8 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.paths import find_config
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.gap.analysis import IntakeFinding

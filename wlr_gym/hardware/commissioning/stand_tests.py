@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.hardware.calibration import find_sign
 from wlr_gym.hardware.commissioning.stand import LARGEST_LEAN, LOW_PWM, PERIOD, Person, SlippedError, Stand, TroubleError
 from wlr_gym.hardware.dynamixel.bus import Block

@@ -17,8 +17,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.tables import (
     CURRENT_MODE,

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.hardware.camera.reading import CAMERA_FAULTS
 
 

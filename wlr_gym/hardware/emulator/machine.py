@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wlr_gym.base.checks import check_name
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name, unknown_name
 from wlr_gym.hardware.config import FlowPort, Hardware, check_fit
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, error_names, load_table
 from wlr_gym.hardware.emulator.coupling import PlantCoupling

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.checks import check_folder
-from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.errors import InputError, check_folder, require_package
 from wlr_gym.base.files import alone_in
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.settings import parse_config, parse_options, read_yaml

@@ -14,8 +14,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from wlr_gym.base.checks import LARGEST_SEED
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import LARGEST_SEED, InputError
 from wlr_gym.base.files import check_same_request, make_output_folder, resumes, write_json, write_text
 from wlr_gym.base.html import commands, document, section, table
 from wlr_gym.base.settings import SettingsModel, parse_config

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wlr_gym.base.checks import check_name, check_number
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_name, check_number
 from wlr_gym.learning.evaluation.metrics import Played, summarise
 from wlr_gym.learning.evaluation.rollout import Rollout, roll_out
 from wlr_gym.learning.evaluation.subjects import Subject, make_player

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import check_number
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.envs.tasks.signals import yaw_of
 from wlr_gym.robot import Robot
 

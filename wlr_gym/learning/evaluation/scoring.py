@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.checks import check_name, require_seed
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_name, require_seed
 from wlr_gym.base.files import write_json
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of

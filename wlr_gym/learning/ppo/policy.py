@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt, model_validator
 
-from wlr_gym.base.checks import LARGEST_SEED
-from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.errors import LARGEST_SEED, InputError, require_package
 from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.policy import contract_of
 from wlr_gym.robot import LEGS, WHEELS

@@ -15,8 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from wlr_gym.base.checks import LARGEST_SEED
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import LARGEST_SEED, InputError
 from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml, require_keys
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.learning.training import check_environment_settings, settings_of, with_robot

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base.checks import check_number
-from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.errors import InputError, check_number, require_package
 from wlr_gym.base.files import locked, make_output_folder, require_empty
 from wlr_gym.base.jobs import PATIENCE, Ended, Job, spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml

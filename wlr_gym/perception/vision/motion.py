@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.data.run_states import rest_pose
 from wlr_gym.data.runs import Run
+from wlr_gym.perception.observer.observer import constants
 from wlr_gym.perception.observer.slip_filter import leak_noise, rate_noise, shaking
-from wlr_gym.perception.observer.state import constants
 from wlr_gym.perception.vision.alignment import repeated
 from wlr_gym.perception.vision.smoothing import Smoothed, smooth
 from wlr_gym.perception.vision.tracking import Sample

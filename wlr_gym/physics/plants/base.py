@@ -16,8 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.checks import LARGEST_NOISE_SEED, require_seed
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import LARGEST_NOISE_SEED, InputError, require_seed, unknown_name
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.robot import JOINTS, LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameter_table import XYZ

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import pytest
 
-from wlr_gym.base.checks import Interval, check_file, check_folder, check_name, check_number, check_ranges
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, Interval, check_file, check_folder, check_name, check_number, check_ranges
 
 
 @pytest.mark.parametrize(
