@@ -277,7 +277,7 @@ def test_broken_model_file_is_refused(run, tmp_path):
         (["train", "--set", "hidden_layers=[64,-3]"], "hidden_layers.1 = -3: expected more than 0"),
         (["train", "--set", "environment.precison=float32"], "did you mean 'precision'"),
         (["train", "--resume", "/nowhere"], "not a run folder"),
-        (["train", "--resume", ".", "--seed", "1"], "leave out"),
+        (["train", "--resume", ".", "--seed", "1"], "--seed: --resume uses the settings of the run folder: leave it out"),
     ],
 )
 def test_bad_input_exits_with_2(arguments, message, capsys, tmp_path, monkeypatch):
