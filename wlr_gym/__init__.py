@@ -29,7 +29,7 @@ HOMES = {
     "TrainingProgress": "wlr_gym.policy.agents",
     "Card": "wlr_gym.learning.evaluation.card",
     "Policy": "wlr_gym.policy.agents",
-    "load_policy": "wlr_gym.policy.sources",
+    "load_policy": "wlr_gym.policy.agents",
     "Robot": "wlr_gym.robot.description",
     "load_robot": "wlr_gym.robot.description",
     "Parameters": "wlr_gym.robot.parameters",

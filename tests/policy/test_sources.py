@@ -13,6 +13,7 @@ from wlr_gym.envs.settings import Settings
 from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.learning.evaluation import make_core
+from wlr_gym.policy import agents as sources
 from wlr_gym.policy import (
     contract_of,
     environment_for,
@@ -22,7 +23,6 @@ from wlr_gym.policy import (
     make_policy,
     policy_environment,
     shipped_names,
-    sources,
     trained_environment,
     write_contract,
 )

@@ -115,7 +115,7 @@ def run(options: DeployOptions) -> int:
     from wlr_gym.hardware.operator import HELP, Keys, stop_on_signals
     from wlr_gym.hardware.safety.preflight import require_ports
     from wlr_gym.hardware.timing import real_time
-    from wlr_gym.learning.evaluation import make_core
+    from wlr_gym.learning.evaluation.rollout import make_core
 
     command = checked_command(options)
     environment = environment_of(options.env, options.policy)

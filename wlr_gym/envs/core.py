@@ -30,7 +30,7 @@ from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics import plants
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, Sensors
-from wlr_gym.policy.sources import FED_AS
+from wlr_gym.policy.agents import FED_AS
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from wlr_gym.envs.core import Core
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.learning.evaluation.rollout import seen_observations
 from wlr_gym.learning.ppo.policy import ModulePolicy, acting_net
+from wlr_gym.policy.agents import FED_AS
 from wlr_gym.policy.export import Parity, write_policy_file
 from wlr_gym.policy.file import policy_content
-from wlr_gym.policy.sources import FED_AS
 
 require_package("torch", "train")
 require_package("stable_baselines3", "train")

@@ -1,14 +1,18 @@
 """Policies and agents: how they are called, loaded by name, saved with their contract, and refused where they do not fit."""
 
-from wlr_gym.policy.agents import Agent, Policy, Training, TrainingProgress, agent_names, load_agent, load_agent_config
-from wlr_gym.policy.export import Parity, export_policy, exportable, reseal, write_model_card
-from wlr_gym.policy.file import camera_share, check_contract, misses_camera, needs_camera, read_contract, write_contract
-from wlr_gym.policy.sources import (
+from wlr_gym.policy.agents import (
+    Agent,
+    Policy,
+    Training,
+    TrainingProgress,
+    agent_names,
     contract_of,
     environment_for,
     fed_environment,
     find_policy,
     is_policy,
+    load_agent,
+    load_agent_config,
     load_policy,
     make_policy,
     policy_environment,
@@ -16,6 +20,8 @@ from wlr_gym.policy.sources import (
     trained_environment,
     untrained,
 )
+from wlr_gym.policy.export import Parity, export_policy, exportable, reseal, write_model_card
+from wlr_gym.policy.file import camera_share, check_contract, misses_camera, needs_camera, read_contract, write_contract
 
 __all__ = [
     "Agent",

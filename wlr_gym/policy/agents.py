@@ -1,4 +1,8 @@
-"""Agents by name. An agent is a folder ``agents/<name>/`` whose ``agent.py`` offers the functions of :class:`Agent`."""
+"""Agents by name, and what names a policy.
+
+An agent is a folder ``agents/<name>/`` whose ``agent.py`` offers the functions of :class:`Agent`. A policy is named by an
+agent, a policy or run folder, a policy file (``.onnx``), or one shipped in ``agents/shipped/``.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +12,18 @@ import types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, check_name, unknown_name
+from wlr_gym.base.errors import InputError, check_name, nearest, unknown_name
 from wlr_gym.base.paths import config_names, data_directory, named_in
 from wlr_gym.base.settings import merge_changes, parse_yaml, read_layers
 from wlr_gym.base.text import pairs
-
-Contract = Mapping[str, Any]
-Config = Mapping[str, Any]
+from wlr_gym.policy.file import CONTRACT_FILE, Config, Contract, check_contract, read_contract
+from wlr_gym.policy.onnx_file import SUFFIX, open_policy
 
 
 class Policy(Protocol):
@@ -211,3 +214,219 @@ def _settings(value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, Mapping | None):
         raise InputError(f"{where} = {value!r}: expected a mapping")
     return {str(key): entry for key, entry in (value or {}).items()}
+
+
+# --- what names a policy -----------------------------------------------------------------------------------------------
+
+
+#: Of a task's settings, what decides which numbers a policy is fed and what its own mean. The others are conditions.
+FED = ("observations", "observer", "controller", "action", "control_period")
+#: Key of an environment's ``task``: the task file that these are taken from; the environment reads it, for its robot.
+FED_AS = "fed_as"
+
+
+@runtime_checkable
+class HasContract(Protocol):
+    """An environment of this library."""
+
+    def contract(self) -> dict[str, Any]:
+        """Return what a policy must be fed and what its output means."""
+        ...
+
+
+def shipped_directory() -> Path:
+    """Return the folder of the shipped policies, in a clone or a wheel."""
+    return data_directory("agents") / "shipped"
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the shipped policies, such as ``velocity_slip_aware``."""
+    return sorted(path.stem for path in shipped_directory().glob(f"*{SUFFIX}"))
+
+
+def _policy_place(source: str | Path) -> Path | None:
+    """Return the policy folder or file of a trained policy.
+
+    Args:
+        source: policy folder, run folder with a ``policy`` in it, policy file, or name of a shipped policy.
+
+    Returns:
+        None where it is none of these.
+    """
+    path = Path(source)
+    if path.suffix == SUFFIX and path.is_file():
+        return path
+    for folder in (path, path / "policy"):
+        if (folder / CONTRACT_FILE).is_file():
+            return folder
+    return shipped_directory() / f"{source}{SUFFIX}" if str(source) in shipped_names() else None
+
+
+def is_policy(source: str | Path) -> bool:
+    """Whether there is an agent or a trained policy of this name or at this path."""
+    return str(source) in agent_names() or _policy_place(source) is not None
+
+
+def untrained(source: str | Path) -> str:
+    """Return what to say of the name of an agent whose training begins with a random policy; empty = it is none."""
+    if str(source) not in agent_names() or not hasattr(load_agent(str(source)), "settings_to_start_from"):
+        return ""
+    return f"'{source}' is the agent before any training; trained ones: {', '.join(shipped_names())}"
+
+
+def find_policy(source: str | Path, or_agent: bool = False) -> Path:
+    """Return the policy folder or file of a trained policy.
+
+    Args:
+        source: as of :func:`load_policy`.
+        or_agent: an agent's name would have done, too; the message lists them.
+
+    Raises:
+        InputError: there is none; the message lists the names there are.
+    """
+    place = _policy_place(source)
+    if place is not None:
+        return place
+    if Path(source).is_dir():
+        raise InputError(f"'{source}': no policy there (looked for {CONTRACT_FILE} in it and in its folder 'policy')")
+    if Path(source).exists():
+        raise InputError(f"'{source}': not a policy: expected a folder, or a file {SUFFIX}")
+    if str(source) in agent_names():
+        raise InputError(f"'{source}' is an agent: expected a trained policy (folder, file {SUFFIX} or shipped policy)")
+    agents = agent_names() if or_agent else []
+    kinds, listed = (", an agent", f"agents: {', '.join(agents)}; ") if agents else ("", "")
+    raise InputError(
+        f"'{source}' is no policy: neither a folder, a file {SUFFIX}{kinds} nor a shipped policy"
+        f"{nearest(str(source), [*agents, *shipped_names()])}; {listed}shipped: {', '.join(shipped_names()) or 'none'}"
+    )
+
+
+def contract_of(source: str | Path) -> dict[str, Any]:
+    """Return the contract of a trained policy: what ``contract.json`` says, or the metadata of a policy file.
+
+    Raises:
+        InputError: no policy there, or broken.
+    """
+    place = find_policy(source)
+    return open_policy(place)[1] if place.is_file() else read_contract(place)
+
+
+def load_policy(source: str | Path, environment: Contract | HasContract) -> Policy:
+    """Load a trained policy for an environment.
+
+    Args:
+        source: policy folder, run folder with a ``policy`` in it, policy file, or name of a shipped policy.
+        environment: single, vector or Stable-Baselines3 environment, wrapped or not, or what its ``contract()`` returns.
+
+    Raises:
+        InputError: no policy there, broken, or a contract that does not fit, naming the first difference.
+    """
+    place = find_policy(source)
+    if not isinstance(environment, Mapping):
+        bare = getattr(environment, "unwrapped", environment)
+        if not isinstance(bare, HasContract):
+            raise InputError(f"environment = {environment!r}: expected one that was made, or what its contract() returns")
+        environment = bare.contract()
+    if place.is_file():
+        policy, contract = open_policy(place)
+        check_contract(contract["environment"], environment, str(place))
+        return policy
+    contract = read_contract(place)
+    check_contract(contract["environment"], environment, str(place))
+    return agent_function(contract["agent"], "load_policy")(place, contract)
+
+
+def make_policy(source: str | Path, environment: Contract) -> Policy:
+    """Return the policy of an agent's name (with its shipped settings), or a trained one; see :func:`load_policy`.
+
+    Raises:
+        InputError: neither an agent nor a policy, or a policy that does not fit the environment.
+    """
+    if str(source) in agent_names():
+        return agent_function(str(source), "make_policy")(environment, load_agent_config(source))
+    find_policy(source, or_agent=True)
+    return load_policy(source, environment)
+
+
+def policy_environment(source: str | Path) -> dict[str, Any]:
+    """Return the keywords that an environment must be made with so that a policy is fed what it was made for.
+
+    They are those of its training that decide what its inputs and outputs mean (see :data:`FED`), and its robot, by content.
+    Conditions, such as backend, randomisation, commands or precision, are not among them: a policy may be tried under others.
+
+    Args:
+        source: as of :func:`make_policy`.
+
+    Returns:
+        ``{"task": ..., "robot": ...}``; without the task where it is the one that ships, without the robot where it is the
+        nominal one.
+
+    Raises:
+        InputError: neither an agent nor a policy, both, or a broken one.
+    """
+    if str(source) in agent_names():
+        if _policy_place(source) is not None:
+            raise InputError(f"'{source}' is an agent, and a policy in this folder: give ./{source}, or rename the policy")
+        return fed_environment(load_agent_config(source).get("environment") or {})
+    contract = contract_of(find_policy(source, or_agent=True))
+    robot = robot_of_contract(contract)
+    own = fed_environment(contract["config"].get("environment") or {})
+    if FED_AS in own.get("task", {}):
+        own["task"]["observer"] = contract["environment"].get("observer")  # for those who ask whether it has a camera
+    return own | ({} if robot is None else {"robot": robot})
+
+
+def robot_of_contract(content: Mapping[str, Any]) -> Any:
+    """Return the robot that a policy was made for, by content (of older policies: by name or path); None = the nominal one.
+
+    A sensor that the policy did without at times is left out: it is a condition, and fits the robot with and without it.
+    """
+    environment = content["environment"]
+    stated = (environment.get("robot") or {}).get("description")
+    if stated is None:
+        return (content["config"].get("environment") or {}).get("robot")
+    if (environment.get("sensors") or {}).get("flow", 1.0) >= 1.0:
+        return stated
+    return {**stated, "sensors": {name: sensor for name, sensor in stated["sensors"].items() if name != "flow"}}
+
+
+def environment_for(source: str | Path, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keywords of an environment that feeds a policy what it was made for, under the conditions of ``given``.
+
+    A robot that is given holds: a policy that was made for another one is then refused by its contract. Without one it is that
+    of the policy.
+
+    Args:
+        source: as of :func:`make_policy`.
+        given: keywords of the environment, such as ``{"randomization": "ice", "robot": None}``.
+
+    Raises:
+        InputError: neither an agent nor a policy, or a broken one.
+    """
+    own = policy_environment(source)
+    if isinstance(own.get("task"), Mapping) and isinstance(given.get("task"), Mapping):
+        own["task"] = merge_changes(given["task"], own["task"])
+    if given.get("robot") is not None:
+        own.pop("robot", None)
+    return {**given, **own}
+
+
+def fed_environment(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of an environment's keywords that decide what a policy's inputs and outputs mean."""
+    task = environment.get("task")
+    if isinstance(task, Mapping):
+        task = {key: task[key] for key in (FED_AS, *FED) if key in task}
+    elif task is not None:
+        task = {FED_AS: str(task)}
+    return {"task": task} if task else {}
+
+
+def trained_environment(source: str | Path) -> str | None:
+    """Return the id of the environment that a policy was trained in; None for agents, which nobody trained.
+
+    Raises:
+        InputError: neither an agent nor a policy, or a broken one.
+    """
+    if str(source) in agent_names():
+        return None
+    return contract_of(find_policy(source, or_agent=True)).get("training", {}).get("environment")

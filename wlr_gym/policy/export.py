@@ -21,10 +21,9 @@ from wlr_gym.base.files import replace_file, write_json, write_text
 from wlr_gym.base.provenance import versions
 from wlr_gym.base.settings import overlay, read_layers
 from wlr_gym.base.text import tally
-from wlr_gym.policy.agents import Contract, Policy, agent_function
+from wlr_gym.policy.agents import Contract, Policy, agent_function, contract_of, find_policy, robot_of_contract
 from wlr_gym.policy.file import CONTRACT_FILE, differences, needs_camera, read_contract, with_defaults
 from wlr_gym.policy.onnx_file import SUFFIX, open_policy, seal
-from wlr_gym.policy.sources import contract_of, find_policy, robot_of_contract
 from wlr_gym.robot import Robot, load_robot, robot_hash, servo_hash
 
 #: Random observations that are compared.

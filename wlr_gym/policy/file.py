@@ -11,9 +11,11 @@ from typing import Any
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import versions
-from wlr_gym.policy.agents import Config, Contract
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.description import HASH_FORM
+
+Contract = Mapping[str, Any]
+Config = Mapping[str, Any]
 
 FORMAT = 1
 CONTRACT_FILE = "contract.json"

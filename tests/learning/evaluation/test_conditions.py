@@ -7,7 +7,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.learning.evaluation import Condition, Subject, identity, play, read_subjects, work
 from wlr_gym.learning.evaluation.conditions import BLOCK, SWEEPS, read_sweep, sweeps_for
 from wlr_gym.learning.evaluation.subjects import make_player
-from wlr_gym.policy import sources as sources_module
+from wlr_gym.policy import agents as sources_module
 
 ID = "WLR-Velocity-v0"
 SHORT = {"episode_length": 0.2}

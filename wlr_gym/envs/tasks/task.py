@@ -23,8 +23,8 @@ from wlr_gym.envs.tasks.scaling import check_rule, scaled
 from wlr_gym.envs.tasks.signals import signals_of
 from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, POLICY_TERMS, PRIVILEGED_TERMS, SCALARS, ObservationTerm
 from wlr_gym.envs.tasks.terms.observations import limit_for
+from wlr_gym.policy.agents import FED
 from wlr_gym.policy.control import SlipGains
-from wlr_gym.policy.sources import FED
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, RobotSource, load_robot
 
 #: Group of a task's data -> its terms.

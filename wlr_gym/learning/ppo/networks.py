@@ -21,7 +21,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtr
 from torch import nn
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs import Sb3VecEnv
+from wlr_gym.envs.sb3 import Sb3VecEnv
 from wlr_gym.envs.tasks.describe import column_name
 from wlr_gym.envs.tasks.terms import CONTROLLER
 from wlr_gym.learning.ppo.sb3 import EditedSamples, OpenPolicy

@@ -32,8 +32,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
-from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.envs.core import Core
+from wlr_gym.envs.sb3 import Sb3VecEnv
 from wlr_gym.learning.curves import METRICS, CurveFile, best_of, is_better, read_curve
 from wlr_gym.learning.evaluation.metrics import summarise
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out

@@ -17,7 +17,7 @@ from stable_baselines3 import PPO
 from torch import nn
 
 from wlr_gym.base.errors import require_package
-from wlr_gym.envs import Sb3VecEnv
+from wlr_gym.envs.sb3 import Sb3VecEnv
 from wlr_gym.learning.ppo.networks import grouped, scale_residual
 from wlr_gym.learning.ppo.policy import (
     ACTOR,
