@@ -30,7 +30,7 @@ from wlr_gym.physics.plants import make_plant as make_plant
 from wlr_gym.physics.plants.base import PlantOptions as PlantOptions
 from wlr_gym.policy.agents import Policy as Policy
 from wlr_gym.policy.agents import TrainingProgress as TrainingProgress
-from wlr_gym.policy.sources import load_policy as load_policy
+from wlr_gym.policy.agents import load_policy as load_policy
 from wlr_gym.robot.description import Robot as Robot
 from wlr_gym.robot.description import load_robot as load_robot
 from wlr_gym.robot.parameters import Parameters as Parameters
