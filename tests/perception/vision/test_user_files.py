@@ -155,4 +155,5 @@ def test_command_writes_the_readout_into_the_camera_file(tmp_path, capsys):
     assert main([*words, "--readout", "0", "--force"]) == 0
     assert load_camera(tmp_path / "camera.yaml").readout == 0.0
     assert main([*words, "--readout", "18", "--force"]) == 2
-    assert "--readout 18: expected more than -0.1 and less than 0.1 s (20 ms = 0.02)" in capsys.readouterr().err.replace("\n", "")
+    refusal = "--readout 18: expected more than -0.1 and less than 0.1 s (20 ms = 0.02)"
+    assert refusal in capsys.readouterr().err.replace("\n", "")
