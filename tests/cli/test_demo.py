@@ -20,8 +20,10 @@ from wlr_gym.demo import diagnosis, policies, retraining, workers
 from wlr_gym.demo.page import TERMS
 from wlr_gym.demo.page import page as page_of
 from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Demo, Section
+from wlr_gym.envs.tasks import load_task
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
 from wlr_gym.learning.evaluation import Estimate
+from wlr_gym.learning.evaluation.metrics import metrics_of
 from wlr_gym.physics.effects import load_patch, save_patch
 
 COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]
@@ -157,13 +159,14 @@ def test_terms_are_those_of_the_glossary():
 
 def card(**better):
     """A card whose policies score alike; ``better``: intervals by which the slip-aware one beats the blind one."""
-    even = {column.key: Estimate(90.0, 80.0, 99.0) for column in policies._COLUMNS}
-    won = {column.key: Estimate(9.0, 5.0, 12.0) for column in policies._COLUMNS}
+    metrics = [metric for metric in metrics_of(load_task("velocity").measures) if metric.key in policies.SHOWN_METRICS]
+    even = {metric.key: Estimate(90.0, 80.0, 99.0) for metric in metrics}
+    won = {metric.key: Estimate(9.0, 5.0, 12.0) for metric in metrics}
     scores = {policies.OURS: even | {"excess_slip": Estimate(0.0043, 0.004, 0.005)}, policies.BLIND: even}
     labels = list(policies.FLOORS)
     compared = {key: {policies.BLIND: won} for key in labels}
     compared[labels[0]] = {policies.BLIND: won | better}
-    return SimpleNamespace(scores=dict.fromkeys(labels, scores), comparison=compared)
+    return SimpleNamespace(metrics=metrics, scores=dict.fromkeys(labels, scores), comparison=compared)
 
 
 def test_where_the_slip_aware_policy_is_no_better_is_said():
@@ -172,10 +175,10 @@ def test_where_the_slip_aware_policy_is_no_better_is_said():
 
     assert short() == []
     assert short(excess_slip=Estimate(-8.0, -12.0, -5.0)) == [
-        "on ice, velocity_blind has the better excess slip (90000.0 against 4.3 mm/s)"
+        "on ice, velocity_blind has the better excess slip (90.0000 against 0.0043 m/s)"
     ]
     assert short(excess_slip=Estimate(-3.0, -8.0, 2.0)) == [
-        "on ice, velocity_slip_aware is not measurably better than velocity_blind in excess slip (4.3 against 90000.0 mm/s)"
+        "on ice, velocity_slip_aware is not measurably better than velocity_blind in excess slip (0.0043 against 90.0000 m/s)"
     ]
     assert short(success=Estimate(1.0, -2.0, 5.0)) == [
         "on ice, velocity_slip_aware is not measurably better than velocity_blind in success (90 against 90 %)"

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from wlr_gym.data.replay import ChannelError
-from wlr_gym.demo.diagnosis import hide, judge, left_over, patch_alone_lacks, worse_channels
+from wlr_gym.demo.diagnosis import hide, judge, left_over
 from wlr_gym.gap.analysis import Analysis, ChannelGap, FoundEffect, GapFigures
 from wlr_gym.gap.report.result import EffectEntry, ParameterEntry
 from wlr_gym.physics.effects import load_patch
@@ -67,28 +66,6 @@ def test_what_is_named_besides_is_not_right():
     assert not answer.right
     assert answer.extra == ("payload",)
     assert "payload was named, too, but is not there" in answer.sentence
-
-
-def errors(**values):
-    return {channel: ChannelError(value, value, "rad", 0.5) for channel, value in values.items()}
-
-
-BEFORE = [errors(pos_leg_lf=1.0, gyro_z=0.5), errors(pos_leg_lf=1.0, gyro_z=0.5)]
-
-
-def test_a_channel_that_got_worse_is_named():
-    assert worse_channels(BEFORE, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.54)]) == []
-    assert worse_channels(BEFORE, [errors(pos_leg_lf=0.6, gyro_z=0.5), errors(pos_leg_lf=0.6, gyro_z=0.9)]) == ["gyro_z"]
-
-
-def test_what_the_patch_alone_leaves_is_said():
-    assert patch_alone_lacks(BEFORE, [errors(pos_leg_lf=0.6, gyro_z=0.5)] * 2, []) == []
-    (left,) = patch_alone_lacks(BEFORE, [errors(pos_leg_lf=0.8, gyro_z=0.5)] * 2, [])
-    assert left == "with the patch alone, pos_leg_lf (angle, left front leg) is still off by 1.60 times the sensor noise"
-    no_smaller, worse = patch_alone_lacks(BEFORE[:1], [errors(pos_leg_lf=0.74, gyro_z=0.9)], ["gyro_z"])[:2]
-    assert "no smaller" in no_smaller
-    assert worse == "with the patch alone, gyro_z got worse"
-    assert patch_alone_lacks([], [], []) == ["no run was held out to try the patch on"]
 
 
 def analysis(interval=(0.9, 0.98), after=1.02, **worse):

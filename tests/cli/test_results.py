@@ -10,7 +10,7 @@ import pytest
 
 from wlr_gym import cli
 from wlr_gym.cli import main
-from wlr_gym.cli.terminal import only_results, plain, print_json
+from wlr_gym.cli.terminal import only_results, print_json
 
 #: Commands that end in no results: they run until they are ended.
 WITHOUT_RESULTS = {"emulate", "view"}
@@ -33,8 +33,8 @@ def test_json_has_no_numbers_that_are_not_finite(capsys):
     assert json.loads(capsys.readouterr().out) == {
         "found": {"path": "a/b", "value": None}, "array": [1.0, None], "count": 3, "4": [True, None],
     }  # fmt: skip
-    with pytest.raises(TypeError, match="JSON has no such value"):
-        plain(object())
+    with pytest.raises(ValueError, match="JSON has no such value"):
+        print_json(object())
 
 
 def test_only_results_reach_the_standard_output(capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from wlr_gym.base.errors import InputError
 
@@ -54,3 +55,22 @@ def pairs(what: str, words: Iterable[str], example: str) -> dict[str, str]:
             raise InputError(f"{what}: '{name}' is given twice, {found[name]} and {value}: expected once, such as {example}")
         found[name] = value
     return found
+
+
+def json_text(content: Any) -> str:
+    """Return JSON; a number that is not finite is null, a dataclass an object of its fields, an array a list.
+
+    Raises:
+        ValueError: something that JSON has not.
+    """
+    from pydantic_core import to_json
+
+    return to_json(content, indent=2, inf_nan_mode="null", fallback=_json_value).decode()
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return dict(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__}: JSON has no such value")

@@ -66,21 +66,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return guarded(_dispatch, sys.argv[1:] if arguments is None else arguments)
 
 
-def guarded(dispatch: Callable[[list[str]], int], arguments: Sequence[str]) -> int:
+def guarded(dispatch: Callable[[list[str]], int], words: Sequence[str]) -> int:
     """Do what the words of a command line say and return the exit code; mistakes and interruption are told in one line."""
-    words = list(arguments)
     os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # numba colours messages that nobody reads
     gc.set_threshold(max(50_000, gc.get_threshold()[0]))  # and leaves much to the garbage collector while it compiles
     try:
         try:
-            return _answered(dispatch, words)
+            return _answered(dispatch, list(words))
         finally:
             print(end="", flush=True)  # here, where it can be caught; at its end Python could only complain
-    except BrokenPipeError:
-        if not _output_is_closed():
-            raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
+    except BrokenPipeError:  # nobody reads the output any more: wlr ... | head; or it is another pipe, and our error
+        try:
+            print(flush=True)  # only writing tells, where nothing is left to be flushed
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return FAILED
+        raise
 
 
 def _answered(dispatch: Callable[[list[str]], int], words: list[str]) -> int:
@@ -97,15 +98,6 @@ def _answered(dispatch: Callable[[list[str]], int], words: list[str]) -> int:
     except KeyboardInterrupt as interruption:
         _say(str(interruption) or "interrupted", "yellow")
         return INTERRUPTED
-
-
-def _output_is_closed() -> bool:
-    """Whether nobody reads the output any more: ``wlr ... | head``. Only writing tells, where nothing is left to be flushed."""
-    try:
-        print(flush=True)
-    except BrokenPipeError:
-        return True
-    return False
 
 
 def _dispatch(words: list[str]) -> int:
@@ -165,45 +157,32 @@ def run_options(options: Any, run: Callable[[Any], int]) -> int:
 
 def run_program(program: str, kind: type, run: Callable[[Any], int], description: str, arguments: Sequence[str] | None) -> int:
     """Be a program of one command, ``python -m PROGRAM``, as ``wlr`` runs its commands; return the exit code."""
-
-    def dispatch(words: list[str]) -> int:
-        return run_words(program, kind, run, description, words)
-
-    return guarded(dispatch, sys.argv[1:] if arguments is None else arguments)
-
-
-def run_words(program: str, kind: type, run: Callable[[Any], int], description: str, words: Sequence[str]) -> int:
-    """Parse the words of a program of one command and run it."""
     from wlr_gym.cli.options import parse
 
-    return run_options(parse(kind, program, words, description), run)
+    words = sys.argv[1:] if arguments is None else arguments
+    return guarded(lambda words: run_options(parse(kind, program, words, description), run), words)
 
 
 def parse_command(name: str, arguments: Sequence[str]) -> Any:
-    """Return the options of one command.
-
-    Raises:
-        InputError, SystemExit: see :func:`wlr_gym.cli.options.parse`.
-    """
+    """Return the options of one command; see :func:`wlr_gym.cli.options.parse`."""
     from wlr_gym.cli.options import one_of, parse
 
     program, kind, description = f"wlr {name}", options_of(name), _module(name).__doc__ or ""
-    if isinstance(kind, Mapping):
-        word, own = next(iter(arguments), ""), kind.get("")
-        if word and word in kind:
-            return parse(kind[word], f"{program} {word}", arguments[1:])
-        names = [one for one in kind if one]
-        if own is None and not word.startswith("-"):
-            raise (
-                unknown_name(f"command of {program}", word, names)
-                if word
-                else InputError(f"expected one of {', '.join(names)}; see: {program} --help")
-            )
-        hint = nearest(word, names)
-        if hint and not Path(word).suffix and not Path(word).exists():  # neither a file nor a command, but nearly the latter
-            raise InputError(f"unknown word '{word}'{hint}; see: {program} --help")
-        kind = own or one_of(kind)
-    return parse(kind, program, arguments, description)
+    if not isinstance(kind, Mapping):
+        return parse(kind, program, arguments, description)
+    word, names = next(iter(arguments), ""), [one for one in kind if one]
+    if word in names:
+        return parse(kind[word], f"{program} {word}", arguments[1:])
+    if "" not in kind:
+        if word and not word.startswith("-"):
+            raise unknown_name(f"command of {program}", word, names)
+        if not word:
+            raise InputError(f"expected one of {', '.join(names)}; see: {program} --help")
+        return parse(one_of(kind), program, arguments, description)
+    hint = nearest(word, names)
+    if hint and not Path(word).suffix and not Path(word).exists():  # neither a file nor a command, but nearly the latter
+        raise InputError(f"unknown word '{word}'{hint}; see: {program} --help")
+    return parse(kind[""], program, arguments, description)
 
 
 def options_of(name: str) -> Any:
@@ -223,16 +202,13 @@ def _module(name: str) -> Any:
 def usage() -> str:
     """Return the help text of ``wlr``, as wide as the terminal but 80 columns at most."""
     width = min(80, shutil.get_terminal_size().columns)
-    lines = ["usage: wlr COMMAND [OPTIONS]", ""]
-    for name, text in COMMANDS.items():
-        lines += textwrap.wrap(text, width, initial_indent=f"  {name:<12}", subsequent_indent=" " * 14)
-    lines += [
-        "",
+    listed = [textwrap.fill(f"  {name:<12}{text}", width, subsequent_indent=" " * 14) for name, text in COMMANDS.items()]
+    more = [
         "wlr COMMAND --help explains one; wlr --version",
-        *textwrap.wrap("wlr --import MODULE COMMAND first imports what adds to the library", width),
-        *textwrap.wrap("wlr --completion bash (or zsh, fish) prints what completes commands and options", width),
+        "wlr --import MODULE COMMAND first imports what adds to the library",
+        "wlr --completion bash (or zsh, fish) prints what completes commands and options",
     ]
-    return "\n".join(lines)
+    return "\n".join(["usage: wlr COMMAND [OPTIONS]", "", *listed, "", *(textwrap.fill(line, width) for line in more)])
 
 
 def _say(message: str, colour: str) -> None:

@@ -19,9 +19,9 @@ from rich.console import Console
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
-from wlr_gym.base.text import duration
+from wlr_gym.base.text import duration, pairs
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import Count, JsonOption, PatchOption, Seed, SensorsOption, handed, port_pairs, refuse_given
+from wlr_gym.cli.options import PORT, Count, JsonOption, PatchOption, Seed, SensorsOption, handed, refuse_given
 from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
 from wlr_gym.policy import policy_environment
 from wlr_gym.robot import load_robot
@@ -123,7 +123,7 @@ def _real(options: AdaptOptions, console: Console) -> RealRobot:
     from wlr_gym.hardware.safety.preflight import require_ports
     from wlr_gym.learning.adaptation import RealRobot
 
-    hardware, ports = options.hardware or "nominal", port_pairs(options.port)
+    hardware, ports = options.hardware or "nominal", pairs("--port", options.port, PORT)
 
     def ask(text: str) -> None:
         if not options.yes:

@@ -1,8 +1,8 @@
 """The whole loop in three and a half minutes: learn, drive on ice, find a hidden fault, train on with it; ends with one page.
 
 A policy learns; slip-aware and blind drive on the same ice; an emulated robot with a hidden fault is driven; the gap workflow
-names the fault; the patched simulator is tried on held-out runs; the policy trains on with it and drives the robot again,
-beside the old one. All pictures are in the page, demo.html.
+names the fault and is checked on held-out runs; the policy trains on with what was found and drives the robot again, beside the
+old one. All pictures are in the page, demo.html.
 
 Uses two cores. Parts whose packages are not installed are left out, and the page says how to install them; Ctrl-C leaves what
 was made until then.
@@ -14,7 +14,6 @@ import shutil
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -25,11 +24,8 @@ from wlr_gym.base.provenance import CONFIG_FILE, record_provenance
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.base.text import duration
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
-from wlr_gym.cli.options import Count, ForceOption, JsonOption, Seed
+from wlr_gym.cli.options import Count, ForceOption, JsonOption, ProgressOption, Seed
 from wlr_gym.cli.terminal import print_json
-
-if TYPE_CHECKING:
-    from wlr_gym.demo.stage import Demo
 
 STEPS, QUICK_STEPS = 3_000_000, 16_384
 #: Sizes with --quick.
@@ -40,7 +36,7 @@ _SHORT = {
 
 
 @dataclass(frozen=True)
-class DemoOptions(JsonOption, ForceOption):
+class DemoOptions(ProgressOption, JsonOption, ForceOption):
     out: Path = Path("out/demo")
     """Folder for the page and everything it was made from; --force replaces a demo that is in it."""
     seed: Seed = 0
@@ -49,8 +45,6 @@ class DemoOptions(JsonOption, ForceOption):
     """Environment steps to train for, all robots together; default: three million."""
     quick: bool = False
     """Everything as short as can be, to see that it works: nothing is learnt, and nothing need be found."""
-    progress: bool = True
-    """Show progress and the remaining time."""
 
 
 def run(options: DemoOptions) -> int:
@@ -63,7 +57,8 @@ def run(options: DemoOptions) -> int:
     from wlr_gym.demo.page import write_page
     from wlr_gym.demo.workers import WORKERS, run_workers
 
-    demo = _demo(options)
+    steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
+    demo = stage.Demo(options.out, options.seed, steps, **(_SHORT if options.quick else {}))
     refuse_existing(demo.page, options.force)
     _clear(demo.out)
     record_provenance(demo.out, {"seed": demo.seed, "steps": demo.steps, "quick": options.quick}, demo.seed)
@@ -85,13 +80,6 @@ def run(options: DemoOptions) -> int:
     if interrupted:
         return INTERRUPTED
     return FAILED if any(one.verdict == stage.FAILED for one in sections) else OK
-
-
-def _demo(options: DemoOptions) -> Demo:
-    from wlr_gym.demo.stage import Demo
-
-    steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
-    return Demo(options.out, options.seed, steps, **(_SHORT if options.quick else {}))
 
 
 def _clear(folder: Path) -> None:

@@ -25,6 +25,7 @@ from wlr_gym.base.files import require_ending, require_output_place
 from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import (
+    PORT,
     CameraOption,
     JsonOption,
     PatchOption,
@@ -32,7 +33,6 @@ from wlr_gym.cli.options import (
     Seed,
     environment_of,
     note_untrained,
-    port_pairs,
     refuse_given,
 )
 from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
@@ -257,7 +257,7 @@ def robot_options(options: DeployOptions) -> RobotOptions:
 
     return RobotOptions(
         hardware=options.hardware,
-        ports=port_pairs(options.port),
+        ports=pairs("--port", options.port, PORT),
         emulated=options.emulated and options.stepped,
         dry_run=options.dry_run,
         log=options.out,

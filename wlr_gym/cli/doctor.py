@@ -173,32 +173,26 @@ def _print(checks: Sequence[Check], console: Console, options: DoctorOptions) ->
     first = wrong[0]
     console.print(Text(f"Look first at {first.where}, {first.what}: its line above says what to do.", "bold"))
     if registers := mendable(checks):
-        repair = f"{counted(len(registers), 'register')} can be written, after a question: {_mend_command(options)}"
-        console.print(Text(repair, "bold"))
-
-
-def _mend_command(options: DoctorOptions) -> str:
-    """Return the command line that mends the robot that was looked at."""
-    words = ["wlr", "doctor"]
-    words += ["--robot", options.robot] if options.robot else []
-    words += ["--hardware", options.hardware] if options.hardware != "nominal" else []
-    words += ["--port", *options.port] if options.port else []
-    words += ["--emulated"] if options.emulated else []
-    words += ["--camera", options.camera] if options.camera else []
-    return shlex.join([*words, "--mend"])
+        words = ["wlr", "doctor"]
+        words += ["--robot", options.robot] if options.robot else []
+        words += ["--hardware", options.hardware] if options.hardware != "nominal" else []
+        words += ["--port", *options.port] if options.port else []
+        words += ["--emulated"] if options.emulated else []
+        words += ["--camera", options.camera] if options.camera else []
+        command = shlex.join([*words, "--mend"])
+        many = counted(len(registers), "register")
+        console.print(Text(f"{many} can be written, after a question: {command}", "bold"))
 
 
 def _lines(checks: Sequence[Check], verbose: bool) -> list[tuple[str, str]]:
     """One line per kind of check that all joints pass, one per joint that fails it, in the order they were made."""
-    lines: list[tuple[str, str]] = []
-    told: set[str] = set()
+    lines: dict[str, str] = {}
     for check in checks:
         alike = [other for other in checks if other.what == check.what]
         if verbose or not check.ok or len(alike) == 1:
-            lines.append((str(check), "" if check.ok else "red" if check.is_fatal else "yellow"))
-        elif check.what not in told:
-            told.add(check.what)
-            passed = [other for other in alike if other.ok]
-            found = list(dict.fromkeys(other.found for other in passed))
-            lines.append((f"ok      {len(passed)} of {len(alike):<5} {check.what}: {', '.join(found)}", ""))
-    return lines
+            lines[str(check)] = "" if check.ok else "red" if check.is_fatal else "yellow"
+        else:
+            found = list(dict.fromkeys(other.found for other in alike if other.ok))
+            passed = sum(other.ok for other in alike)
+            lines[f"ok      {passed} of {len(alike):<5} {check.what}: {', '.join(found)}"] = ""
+    return list(lines.items())

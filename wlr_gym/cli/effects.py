@@ -6,14 +6,14 @@ what they may depend on); with "check FILE ..." patches are read and applied to 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import tyro
 from rich.console import Console
 
-from wlr_gym.base.errors import InputError, nearest, unknown_name
+from wlr_gym.base.errors import InputError, check_name, nearest
 from wlr_gym.base.paths import config_names
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
@@ -41,7 +41,7 @@ def run(options: EffectsOptions) -> int:
             print_json([_content(effect) for effect in EFFECTS.values()])
         case ():
             rows = [(one.name, places(one), f"{one.doc}\n  {one.equation}") for one in EFFECTS.values()]
-            _show(("name", "where", "what is missing, and its law"), rows)
+            print_table(_console(), ("name", "where", "what is missing, and its law"), rows)
             print("one of them, with its numbers: wlr effects NAME; beyond the library: wlr effects unknown_effect")
         case ("check",):
             raise InputError("give the patch files to check: wlr effects check FILE ...")
@@ -53,61 +53,44 @@ def run(options: EffectsOptions) -> int:
             print_json([_formulas() if name == UNKNOWN_EFFECT else _content(_effect(name)) for name in names])
         case names:
             for name in names:
-                if name == UNKNOWN_EFFECT:
-                    _explain_formulas()
-                else:
-                    _explain(_effect(name))
+                _explain_formulas() if name == UNKNOWN_EFFECT else _explain(_effect(name))
     return OK
 
 
-def _show(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> None:
-    print_table(Console(highlight=False), headings, rows, title)
+def _console() -> Console:
+    return Console(highlight=False)
 
 
-def _range(bounds: tuple[float, float]) -> str:
-    return f"[{bounds[0]:.3g}, {bounds[1]:.3g}]"
+def _effect(name: str) -> Effect:
+    if name not in EFFECTS and (name.endswith((".yaml", ".yml")) or name in config_names("effects")):
+        raise InputError(f"'{name}' is a patch, not an effect: wlr effects check {name}")
+    check_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT])
+    return EFFECTS[name]
 
 
 def _content(effect: Effect) -> dict[str, Any]:
     """Return an effect as JSON has it."""
     fields = ("unit", "doc", "low", "high", "prior", "neutral", "severity", "optional")
     parameters = {name: {field: getattr(p, field) for field in fields} for name, p in effect.parameters.items()}
-    return {
-        "name": effect.name,
-        "what": effect.doc,
-        "equation": effect.equation,
-        "where": effect.where,
-        "parameters": parameters,
-    }
-
-
-def _effect(name: str) -> Effect:
-    if name in EFFECTS:
-        return EFFECTS[name]
-    if name.endswith((".yaml", ".yml")) or name in config_names("effects"):
-        raise InputError(f"'{name}' is a patch, not an effect: wlr effects check {name}")
-    raise unknown_name("effect", name, [*EFFECTS, UNKNOWN_EFFECT])
+    law = {"name": effect.name, "what": effect.doc, "equation": effect.equation}
+    return law | {"where": effect.where, "parameters": parameters}
 
 
 def _explain(effect: Effect) -> None:
     rows = []
     for name, p in effect.parameters.items():
-        cells = (p.doc, _range((p.low, p.high)), _range(p.prior), _neutral(p.neutral), f"{p.severity:g}")
-        rows.append((f"{name} (optional)" if p.optional else name, p.unit, *cells))
+        bounds = (f"[{low:.3g}, {high:.3g}]" for low, high in ((p.low, p.high), p.prior))
+        neutral = f"the robot's {p.neutral}" if isinstance(p.neutral, str) else f"{p.neutral:g}"
+        rows.append((f"{name} (optional)" if p.optional else name, p.unit, p.doc, *bounds, neutral, f"{p.severity:g}"))
     print(f"{effect.name}: {effect.doc}\n  {effect.equation}\n  where: {', '.join(effect.where)}\n")
-    _show(("parameter", "unit", "meaning", "bounds", "plausible range", "neutral", "typical"), rows)
-
-
-def _neutral(value: float | str) -> str:
-    return f"the robot's {value}" if isinstance(value, str) else f"{value:g}"
+    print_table(_console(), ("parameter", "unit", "meaning", "bounds", "plausible range", "neutral", "typical"), rows)
 
 
 def _explain_formulas() -> None:
-    _show(
-        ("where", "unit", "meaning"), [(", ".join(n), unit, text) for n, unit, text in coordinates()], "where a formula may act"
-    )
+    acts = [(", ".join(names), unit, text) for names, unit, text in coordinates()]
+    print_table(_console(), ("where", "unit", "meaning"), acts, "where a formula may act")
     features = [(name, one.unit, one.doc, one.scope) for name, one in FEATURES.items()]
-    _show(("name", "unit", "meaning", "of the"), features, "what it may depend on")
+    print_table(_console(), ("name", "unit", "meaning", "of the"), features, "what it may depend on")
 
 
 def _formulas() -> dict[str, Any]:
@@ -130,10 +113,11 @@ def _check(patches: Sequence[Patch], together: Patch, options: EffectsOptions) -
         print_json({"robot": robot.name, "effects": together.content()["effects"], "changes": changed})
         return
     rows = [(one.name, ", ".join(one.where), _numbers(one), patch.source) for patch in patches for one in patch.effects]
-    _show(("effect", "where", "parameters", "from"), rows)
+    print_table(_console(), ("effect", "where", "parameters", "from"), rows)
     changes = [(name, f"{one['nominal']:.6g}", f"{one['patched']:.6g}", one["unit"]) for name, one in changed.items()]
     if changes:
-        _show(("parameter", "nominal", "patched", "unit"), changes, f"what changes in robot '{robot.name}'")
+        title = f"what changes in robot '{robot.name}'"
+        print_table(_console(), ("parameter", "nominal", "patched", "unit"), changes, title)
     else:
         print("no parameter changes")
 

@@ -49,42 +49,16 @@ def run(options: EnvsOptions) -> int:
 
 def _list(options: EnvsOptions) -> None:
     tasks = {env_id: load_task(task_source_of(env_id)) for env_id in ENVIRONMENTS}
+    summaries = [_summary(env_id, task) for env_id, task in tasks.items()]
     if options.json:
-        print_json([_summary(env_id, task) for env_id, task in tasks.items()])
+        print_json(summaries)
         return
     rows = [
-        (env_id, f"Box({len(task.actions)})", f"Box({len(task.policy)})", f"{1 / task.config.control_period:g} Hz",
-         f"{task.config.episode_length:g} s", _about(task)) for env_id, task in tasks.items()
+        (one["id"], f"Box({one['action']})", f"Box({one['observation']})", f"{1 / one['control_period']:g} Hz",
+         f"{one['episode_length']:g} s", _about(tasks[one["id"]])) for one in summaries
     ]  # fmt: skip
     print_table(Console(), ("id", "action", "observation", "control", "episode", "what it asks for"), rows)
     print("one of them, with all its numbers: wlr envs ID")
-
-
-def _about(task: Task) -> str:
-    return " ".join(task.config.summary.partition("\n\n")[0].split())
-
-
-def _describe(env_id: str, options: EnvsOptions) -> None:
-    written = task_source_of(env_id)
-    task = load_task(written, options.robot)
-    randomization = load_randomization(options.randomization or task.config.randomization, task.robot)
-    if options.picture is not None:
-        _draw(options.picture, randomization, options.force)
-    if options.json:
-        print_json(_content(env_id, task, randomization))
-        return
-    sections = [DescriptionPart(env_id, _about(task)), *task_sections(task), randomization_section(randomization.config)]
-    if options.robot is not None:
-        sections += scaling_sections(read_task(written), task.robot)
-    for section in sections:
-        _print(Console(), section)
-    Console().print(Text("in a program: env.unwrapped.contract() (as data), .describe() (this text)"))
-
-
-def _print(console: Console, section: DescriptionPart) -> None:
-    console.print(Text.assemble((section.title, "bold"), ": ", section.sentence), end="\n\n")
-    if section.rows:
-        print_table(console, section.headings, [[cell.replace("``", "") for cell in row] for row in section.rows])
 
 
 def _summary(env_id: str, task: Task) -> dict[str, Any]:
@@ -100,9 +74,29 @@ def _summary(env_id: str, task: Task) -> dict[str, Any]:
     }
 
 
-def _content(env_id: str, task: Task, randomization: Randomization) -> dict[str, Any]:
-    own = {"task": task.config.model_dump(mode="json"), "randomization": randomization.config.model_dump(mode="json")}
-    return _summary(env_id, task) | {"robot": task.robot.name} | own
+def _about(task: Task) -> str:
+    return " ".join(task.config.summary.partition("\n\n")[0].split())
+
+
+def _describe(env_id: str, options: EnvsOptions) -> None:
+    written = task_source_of(env_id)
+    task = load_task(written, options.robot)
+    randomization = load_randomization(options.randomization or task.config.randomization, task.robot)
+    if options.picture is not None:
+        _draw(options.picture, randomization, options.force)
+    if options.json:
+        own = {"task": task.config.model_dump(mode="json"), "randomization": randomization.config.model_dump(mode="json")}
+        print_json(_summary(env_id, task) | {"robot": task.robot.name} | own)
+        return
+    sections = [DescriptionPart(env_id, _about(task)), *task_sections(task), randomization_section(randomization.config)]
+    if options.robot is not None:
+        sections += scaling_sections(read_task(written), task.robot)
+    console = Console()
+    for section in sections:
+        console.print(Text.assemble((section.title, "bold"), ": ", section.sentence), end="\n\n")
+        if section.rows:
+            print_table(console, section.headings, [[cell.replace("``", "") for cell in row] for row in section.rows])
+    console.print(Text("in a program: env.unwrapped.contract() (as data), .describe() (this text)"))
 
 
 def _draw(path: Path, randomization: Randomization, force: bool) -> None:

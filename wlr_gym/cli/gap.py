@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from rich.console import Console
 from tyro.conf import Positional
 
-from wlr_gym.base.errors import InputError, Interval, check_folder, check_name, unknown_name
+from wlr_gym.base.errors import InputError, Interval, check_folder, check_name
 from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
@@ -29,10 +29,11 @@ from wlr_gym.base.text import duration
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import (
     Count,
-    ForceOption,
     JsonOption,
+    OutOption,
     PatchOption,
     RobotOption,
+    RunsRobotOption,
     handed,
     noise_seed,
     refuse_given,
@@ -71,16 +72,12 @@ class DecideOptions:
 
 
 @dataclass(frozen=True)
-class GapOptions(DecideOptions, JsonOption, ForceOption, PatchOption):
+class GapOptions(DecideOptions, JsonOption, OutOption, RunsRobotOption, PatchOption):
     data: Positional[Path]
     """Folder of measured runs; with --rig, of recordings of the rig."""
-    out: Path
-    """Folder for the results; made if it is not there."""
     rig: str | None = None
     """Runs of something else than the robot: pendulum (one servo that swings a weight), or a Python file that describes a
     system of your own (docs/own_rig.md)."""
-    robot: str | None = None
-    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     backend: str = "gibbs_appell"
     """Simulator of the robot: gibbs_appell or mujoco."""
     heldout: tuple[str, ...] = ()
@@ -100,11 +97,10 @@ def run(options: GapOptions) -> int:
     from wlr_gym.gap.report.result import RESULT_FILE
     from wlr_gym.gap.workflow import analyse
 
-    _check(options)
-    known = _known(options)
+    known, threads = _checked(options), options.threads or os.cpu_count() or 1
     console = Console(soft_wrap=True, highlight=False)
     if options.until_decided:
-        return _decide(options, known, console)
+        return _decide(options, known, threads, console)
     refuse_existing(options.out / RESULT_FILE, options.force)
     check_results(options.out)
     with progress(console) as tell:
@@ -116,7 +112,7 @@ def run(options: GapOptions) -> int:
             robot=options.robot,
             backend=options.backend,
             heldout=options.heldout,
-            threads=options.threads or os.cpu_count() or 1,
+            threads=threads,
             tell=partial(tell, ""),
         )
     record_provenance(options.out, settings_of(options) | {"effects": known.content()["effects"]})
@@ -127,7 +123,7 @@ def run(options: GapOptions) -> int:
     return FAILED if analysis.verdict == BAD_DATA else OK
 
 
-def _decide(options: GapOptions, known: Patch, console: Console) -> int:
+def _decide(options: GapOptions, known: Patch, threads: int, console: Console) -> int:
     """Have runs driven until it is decided; 1 where the last analysis could not be made."""
     from wlr_gym.data.replay import robot_of
     from wlr_gym.data.runs import read_dataset
@@ -140,7 +136,6 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     robot = robot_of(read_dataset(options.data).runs[0], options.robot)
     with progress(console) as tell:
         record = recorder_of(options, robot, options.backend, options.out, console)
-        threads = options.threads or os.cpu_count() or 1
         own = {"record": record, "budget": budget, "known": known, "threads": threads, "tell": partial(tell, "")}
         decision = decide(**handed(options, decide, **own))
     print_rounds(decision, console)
@@ -153,42 +148,34 @@ def _decide(options: GapOptions, known: Patch, console: Console) -> int:
     return FAILED if decision.result.verdict == BAD_DATA else OK
 
 
-def _check(options: GapOptions) -> None:
+def _checked(options: GapOptions) -> Patch:
+    """Refuse what cannot be analysed; return the effects given as known, in the vocabulary of the robot or of the rig."""
     from wlr_gym.data.runs import run_files
     from wlr_gym.gap.rig.own import load_rig
-    from wlr_gym.gap.workflow import OWN_RIG, RIGS
+    from wlr_gym.gap.workflow import OWN_RIG, RIGS, known_patch
     from wlr_gym.physics.plants import check_simulator
 
     check_folder(options.data, of="runs")
     check_simulator(options.backend, "--backend")
-    if options.rig is not None and options.rig not in RIGS and not options.rig.endswith(OWN_RIG):
-        raise unknown_name("rig", options.rig, RIGS)
-    if options.rig is not None:
+    if options.rig is None:
+        runs = [path.stem for path in run_files(options.data)]
+        for name in options.heldout if runs else ():  # of an empty folder, the analysis says more
+            check_name("run", name, runs, "--heldout")
+    else:
         refuse_given(options, ("backend", "robot"), f"--rig {options.rig} has a simulator of its own: leave it out")
-    if options.rig is not None and options.rig.endswith(OWN_RIG):
-        load_rig(options.rig)
+        load_rig(options.rig) if options.rig.endswith(OWN_RIG) else check_name("rig", options.rig, RIGS)
     if options.robot is not None:
         load_robot(options.robot)
+    if options.until_decided:
+        why = "--until-decided drives the robot, and holds out anew in every round: leave it out"
+        refuse_given(options, ("rig", "heldout"), why)
+    else:
+        refuse_given(options, [one.name for one in fields(DecideOptions)], "it is for --until-decided")
     for name in options.effects:
         if Path(name).resolve().parent == options.out.resolve() and Path(name).is_file():
             raise InputError(f"--effects {name}: the results would replace it: give another --out")
-    if options.until_decided:
-        refuse_given(
-            options, ("rig", "heldout"), "--until-decided drives the robot, and holds out anew in every round: leave it out"
-        )
-    else:
-        refuse_given(options, [one.name for one in fields(DecideOptions)], "it is for --until-decided")
-    runs = [path.stem for path in run_files(options.data)] if options.rig is None else []
-    for name in options.heldout if runs else ():
-        check_name("run", name, runs, "--heldout")
-
-
-def _known(options: GapOptions) -> Patch:
-    """The effects given as known, in the vocabulary of the robot or of the rig."""
-    from wlr_gym.gap.workflow import known_patch
-
     try:
-        return options.patch() if options.rig is None else known_patch(list(options.effects), options.rig)
+        return known_patch(list(options.effects), options.rig)
     except InputError as error:
         raise InputError(f"--effects: {error}") from None
 
@@ -200,45 +187,35 @@ def _print(analysis: Analysis, out: Path, console: Console) -> None:
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.report.page import REPORT_FILE
     from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
-    from wlr_gym.gap.report.text import closure, made_worse, sentence, title
+    from wlr_gym.gap.report.text import title
 
     colours = {"bad_data": "red", "not_excited": "yellow", "nothing_missing": "green"}
     console.print(title(analysis), style=f"bold {colours.get(analysis.verdict, 'blue')}")
-    said = [sentence(analysis), *filter(None, [made_worse(analysis), closure(analysis)])]
-    for line in (*said, *_findings(analysis), *_numbers(analysis), *_advice(analysis)):
+    for line in _summary(analysis):
         console.print(line, markup=False)
-    files = [("report", REPORT_FILE), ("result", RESULT_FILE)]
-    if analysis.verdict != BAD_DATA:
-        files.append(("patch", PATCH_FILE))
-    for label, name in files:
-        console.print(f"{label}: {out / name}", markup=False)
+    for label, name in (("report", REPORT_FILE), ("result", RESULT_FILE), ("patch", PATCH_FILE)):
+        if name != PATCH_FILE or analysis.verdict != BAD_DATA:
+            console.print(f"{label}: {out / name}", markup=False)
 
 
-def _findings(analysis: Analysis) -> Iterator[str]:
+def _summary(analysis: Analysis) -> Iterator[str]:
+    """Yield the verdict, what was noticed about the data, the effects, the errors, and what to record next."""
+    from wlr_gym.gap.report.text import closure, error, estimate, listed, made_worse, percent, places, plain, removed, sentence
+
+    yield from filter(None, [sentence(analysis), made_worse(analysis), closure(analysis)])
     for finding in analysis.intake:
-        place = f"{finding.place}: " if finding.place else ""
-        yield f"  {'FATAL' if finding.fatal else 'data'}: {place}{finding.said}"
-
-
-def _numbers(analysis: Analysis) -> Iterator[str]:
-    from wlr_gym.gap.report.text import error, estimate, percent, places, plain, removed
-
+        said = ": ".join(filter(None, [finding.place, finding.said]))
+        yield f"  {'FATAL' if finding.fatal else 'data'}: {said}"
     for effect in analysis.effects:
         values = ", ".join(f"{name} {estimate(found)}" for name, found in effect.parameters.items())
         told = [effect.formula, values, f"selection frequency {percent(effect.confidence)}"]
         yield f"  {plain(effect.name)} at {places(effect.where)}: {'; '.join(filter(None, told))}"
-    gap = analysis.gap
-    if gap is not None:
+    if (gap := analysis.gap) is not None:
         steps = [f"{error(gap.heldout_before)} as given", f"{error(gap.heldout_calibrated)} calibrated"]
         steps += [f"{error(gap.heldout_after)} with the effects"] if analysis.added else []
         yield f"  error of the held-out runs, 1 = sensor noise: {', '.join(steps)}; noise floor {error(gap.noise_floor)}"
         if analysis.added:
             yield f"  removed of the avoidable error: {removed(analysis)}"
-
-
-def _advice(analysis: Analysis) -> Iterator[str]:
-    from wlr_gym.gap.report.text import listed, plain
-
     for group in analysis.equivalent:
         names = listed([plain(name) for name in group.names])
         yield f"  not distinguishable: {names}; discriminating experiment: {group.separating_run}"
@@ -261,8 +238,10 @@ def recorder_of(options: DecideOptions, robot: Robot, backend: str, out: Path, c
         if options.hidden:
             raise InputError("--hidden: a real robot has its own effects; they are for --record emulated and simulator")
         return partial(ask, out=out, console=console)
-    drive = {"emulated": _emulated, "simulator": _simulated}[options.record]
-    return partial(drive, robot=robot, hidden=load_patch(list(options.hidden)), backend=backend)
+    hidden = load_patch(list(options.hidden))
+    if options.record == "emulated":
+        return partial(_emulated, robot=robot, hidden=hidden)
+    return partial(_simulated, robot=robot, hidden=hidden, backend=backend)
 
 
 def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callable[[float], None] = time.sleep) -> Recorded:
@@ -274,9 +253,7 @@ def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callab
     there = set(run_files(data))
     path = write_commands(out / ASKED, motion)
     console.print(f"drive {motion.name} ({motion.duration:.0f} s): wlr record --commands {path} --out {data}", markup=False)
-    console.print(
-        "(a real robot: with --hardware FILE) waiting for its run; Ctrl-C: the same command goes on later", markup=False
-    )
+    console.print("(a real robot: with --hardware FILE) waiting for its run; Ctrl-C: the same command goes on later")
     size = -1
     while True:
         new = [path for path in run_files(data) if path not in there]
@@ -303,13 +280,12 @@ def _simulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backe
     return Recorded(record_simulation(path, motion, robot, backend, seed, hidden, read_meta(data)))
 
 
-def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
+def _emulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch) -> Recorded:
     """Drive an emulated robot in emulated time, through the command limiter as a real one; noise as in a simulator."""
     from wlr_gym.data.runs import read_meta
     from wlr_gym.gap.decision import Recorded
     from wlr_gym.hardware.deployment import drive_robot
 
-    del backend  # it has a simulator of its own
     meta = read_meta(data).model_copy(update={"profile": motion.profile})
     with closing(RobotOption(emulated=True).plant_of(robot, data, meta, hidden, noise_seed(data, 0))) as plant:
         drive = drive_robot(plant, motion)

@@ -60,10 +60,8 @@ def parse(kind: Any, program: str, words: Sequence[str], description: str = "") 
     registry = ConstructorRegistry()
     registry.struct_rule(_fields_shown)
     style = (tyro.conf.DisallowNone, tyro.conf.PositionalMetavarFromFieldName, tyro.conf.OmitSubcommandPrefixes)
-    wrapper = textwrap.TextWrapper(shutil.get_terminal_size().columns, subsequent_indent="  ")
-    text = "\n".join(
-        map(wrapper.fill, _plain(description or _summary(kind)).split("\n"))
-    )  # tyro joins lines but for indented ones
+    wrapper = textwrap.TextWrapper(shutil.get_terminal_size().columns, subsequent_indent="  ")  # tyro joins other lines
+    text = "\n".join(map(wrapper.fill, _plain(description or _summary(kind)).split("\n")))
     options = tyro.cli(kind, prog=program, description=text, args=list(words), config=style, registry=registry)
     check_ranges(options)
     return options
@@ -79,24 +77,18 @@ def one_of(commands: Mapping[str, Any]) -> Any:
     import tyro
 
     def member(name: str, kind: Any) -> Any:
-        own_commands = isinstance(kind, Mapping)
-        text = "" if own_commands else _plain(_summary(kind))
-        return Annotated[
-            _with_own_commands(name, dict(kind)) if own_commands else kind, tyro.conf.subcommand(name, description=text)
-        ]
+        if not isinstance(kind, Mapping):
+            return Annotated[kind, tyro.conf.subcommand(name, description=_plain(_summary(kind)))]
+        words = one_of({word: one for word, one in kind.items() if word})
+        if "" not in kind:
+            both = dataclasses.make_dataclass(name.capitalize(), [("command", words)])
+        else:
+            nothing = Annotated[None, tyro.conf.subcommand("--help")]  # completion offers the name of "none of them"
+            word = ("command", words | nothing, dataclasses.field(default=None, kw_only=True))
+            both = dataclasses.make_dataclass(name.capitalize(), [word], bases=(kind[""],), frozen=True)
+        return Annotated[both, tyro.conf.subcommand(name, description="")]
 
     return functools.reduce(operator.or_, (member(name, kind) for name, kind in commands.items()))
-
-
-def _with_own_commands(name: str, commands: dict[str, Any]) -> Any:
-    import tyro
-
-    own = commands.pop("", None)
-    if own is None:
-        return dataclasses.make_dataclass(name.capitalize(), [("command", one_of(commands))])
-    nothing = Annotated[None, tyro.conf.subcommand("--help")]  # no command; completion offers its name, so one that fits
-    word = ("command", one_of(commands) | nothing, dataclasses.field(default=None, kw_only=True))
-    return dataclasses.make_dataclass(name.capitalize(), [word], bases=(own,), frozen=True)
 
 
 def _fields_shown(info: Any) -> Any:
@@ -113,17 +105,14 @@ def _fields_shown(info: Any) -> Any:
         params = docstring_parser.parse_from_object(one).params
         texts |= {param.arg_name: param.description for param in params if param.description}
     hints, fields = get_type_hints(kind, include_extras=True), {field.name: field for field in dataclasses.fields(kind)}
-    own_first = dict.fromkeys(name for one in kind.__mro__ for name in inspect.get_annotations(one) if name in fields)
     found = []
-    for name in own_first:
+    for name in dict.fromkeys(name for one in kind.__mro__ for name in inspect.get_annotations(one) if name in fields):
         default = fields[name].default
-        missing = default is dataclasses.MISSING
-        silent = default is None or default is False or default == ()
-        shown: list[Any] = [tyro.conf.arg(help_behavior_hint="")] if silent else []
-        shown += [tyro.conf.FlagCreatePairsOff] if default is False else []
-        hint: Any = Annotated[(hints[name], *shown)] if shown else hints[name]
-        text = _plain(texts.get(name, ""))
-        found.append(StructFieldSpec(name, hint, tyro.constructors.MISSING if missing else default, text))
+        hidden = [tyro.conf.arg(help_behavior_hint="")] if default is None or default is False or default == () else []
+        single = [tyro.conf.FlagCreatePairsOff] if default is False else []
+        hint: Any = Annotated[(hints[name], *hidden, *single)] if hidden else hints[name]
+        value = tyro.constructors.MISSING if default is dataclasses.MISSING else default
+        found.append(StructFieldSpec(name, hint, value, _plain(texts.get(name, ""))))
     return StructConstructorSpec(kind, tuple(found))
 
 
@@ -145,6 +134,8 @@ def _plain(text: str) -> str:
 Count = Annotated[int, Interval(least=1)]
 Seconds = Annotated[float, Interval("s", above=0.0)]
 Seed = Annotated[int, Interval(least=0, most=LARGEST_SEED)]
+#: A word of ``--port``.
+PORT = "legs=/dev/ttyUSB1"
 #: Options that mean nothing to a simulator.
 _ROBOT_ONLY = ("hardware", "port", "emulated", "camera", "yes")
 
@@ -157,11 +148,7 @@ class PatchOption:
     """Patch files, or names in configs/effects/: what is added to the nominal model; see: wlr effects."""
 
     def patch(self) -> Patch:
-        """Return all given patches as one.
-
-        Raises:
-            InputError: see :func:`wlr_gym.physics.effects.load_patch`.
-        """
+        """Return all given patches as one; see :func:`wlr_gym.physics.effects.load_patch`."""
         from wlr_gym.physics.effects import load_patch
 
         return load_patch(list(self.effects))
@@ -173,6 +160,14 @@ class JsonOption:
 
     json: bool = False
     """Print the results as JSON; everything else goes to the standard error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProgressOption:
+    """``--no-progress`` of commands that take long."""
+
+    progress: bool = True
+    """Show progress and the remaining time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,6 +190,22 @@ class ForceOption:
             if (folder / name).exists() and not self.force:
                 what = f"'{name}' of another command is in it"
                 raise InputError(f"--out {folder}: {what}; choose another folder, or write into it with --force")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutOption(ForceOption):
+    """``--out`` of commands that write a folder of results."""
+
+    out: Path
+    """Folder for the results; made if it is not there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunsRobotOption:
+    """``--robot`` of commands that read measured runs."""
+
+    robot: str | None = None
+    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -261,11 +272,7 @@ def settings_of(options: Any) -> dict[str, Any]:
 
 
 def environment_of(env: str | None, policy: str | Path) -> str:
-    """Return the given environment id; else the one a policy was trained in; else ``WLR-Velocity-v0``.
-
-    Raises:
-        InputError: see :func:`wlr_gym.policy.trained_environment`.
-    """
+    """Return the given environment id; else the one a policy was trained in; else ``WLR-Velocity-v0``."""
     from wlr_gym.policy import trained_environment
 
     return env or trained_environment(policy) or "WLR-Velocity-v0"
@@ -295,22 +302,18 @@ class WiredRobotOption:
     camera = None  # an option of CameraOption
 
     def ports(self) -> dict[str, str]:
-        """Return the ports of ``--port``: name -> device.
+        """Return the ports of ``--port``: bus name, ``imu`` or ``flow`` -> device.
 
         Raises:
             InputError: a port that is not name=value, or ports of a robot that has none.
         """
-        ports = port_pairs(self.port)
+        ports = pairs("--port", self.port, PORT)
         if ports and self.emulated:
             raise InputError("--port and --emulated: one or the other; the emulated robot of this process has no ports")
         return ports
 
     def load_hardware(self) -> Hardware:
-        """Return the hardware, with the ports of ``--port``.
-
-        Raises:
-            InputError: unknown or broken file, a port that is not name=value, or a name that is no bus.
-        """
+        """Return the hardware, with the ports of ``--port``."""
         from wlr_gym.hardware.config import load_hardware, with_ports
 
         return with_ports(load_hardware(self.hardware), self.ports())
@@ -335,8 +338,7 @@ class WiredRobotOption:
     def link(self, changed: Hardware | None = None) -> Link:
         """Return connections to a robot that does not move, closed; a slow computer is no dead servo then.
 
-        Args:
-            changed: hardware instead of the one of :meth:`load`.
+        ``changed`` is hardware instead of the one of :meth:`load`.
         """
         from wlr_gym.hardware.safety.limiter import CALM_PATIENCE
 
@@ -366,17 +368,12 @@ class WiredRobotOption:
         from wlr_gym.hardware.camera.reading import load_camera_file
 
         if self.camera == "emulated" and not self.emulated:
-            raise InputError(
-                "--camera emulated: it films an emulated robot by rendering; add --emulated, or name your camera's file"
-            )
+            films = "--camera emulated: it films an emulated robot by rendering"
+            raise InputError(f"{films}; add --emulated, or name your camera's file")
         return None if self.camera is None else load_camera_file(self.camera)
 
     def refuse_effects(self, patch: Patch) -> None:
-        """Refuse effects for a real robot.
-
-        Raises:
-            InputError: there are some.
-        """
+        """Raise :class:`InputError` where a real robot is to have effects."""
         if patch.effects and not self.emulated:
             raise InputError("--effects: a real robot has its own; they are for simulators and the emulated robot")
 
@@ -389,17 +386,15 @@ class WiredRobotOption:
             meta: of the runs.
             patch: what an emulated robot has that its file does not say.
             seed: of an emulated robot's noise.
-
-        Raises:
-            InputError: options that make no sense, files that cannot be read.
         """
         from wlr_gym.hardware.plant import RobotPlant
         from wlr_gym.physics.plants.base import RobotOptions
 
         self.refuse_effects(patch)
         self.camera_file()
-        ports = self.ports()
-        options = RobotOptions(self.hardware, ports, self.emulated, log=log, effects=patch, camera=self.camera, seed=seed)
+        options = RobotOptions(
+            self.hardware, self.ports(), self.emulated, log=log, effects=patch, camera=self.camera, seed=seed
+        )
         return RobotPlant(robot, 1, hardware=options, meta=meta)
 
 
@@ -421,15 +416,6 @@ class CameraOption(RobotOption):
 
     camera: str | None = None
     """Camera above the floor: file or name in configs/camera/; over an emulated robot, its frames are rendered."""
-
-
-def port_pairs(words: Sequence[str]) -> dict[str, str]:
-    """Return bus name, ``imu`` or ``flow`` -> device of ``--port``.
-
-    Raises:
-        InputError: a word that is not ``name=value``.
-    """
-    return pairs("--port", words, "legs=/dev/ttyUSB1")
 
 
 def noise_seed(folder: Path, seed: int | None) -> int:

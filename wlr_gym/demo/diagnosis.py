@@ -1,4 +1,4 @@
-"""The stages of the second worker: a robot with a hidden fault is driven, the gap workflow names it, its patch is tried."""
+"""The stages of the second worker: a robot with a hidden fault is driven, the gap workflow names it, and is judged."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ from wlr_gym.base.html import heading, table
 from wlr_gym.base.plots import COLOURS, new_figure, tidy
 from wlr_gym.base.text import counted, number
 from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, link, paragraph, picture
-from wlr_gym.gap.report.text import UNEXPLAINED, channel, error, listed, percent, places, plain, unit_of
+from wlr_gym.gap.report.text import error, listed, percent, places, plain, unit_of
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from wlr_gym.data import Run
-    from wlr_gym.data.replay import ChannelError, ReplayResult
     from wlr_gym.gap.analysis import Analysis
-    from wlr_gym.gap.report.result import EffectEntry, GapEntry, Result, RunGapEntry
+    from wlr_gym.gap.report.result import EffectEntry, GapEntry, RunGapEntry
     from wlr_gym.physics.effects import PatchEffect
 
 DRIVE_TITLE = "3. A robot with a hidden fault"
@@ -49,6 +48,7 @@ def hide(seed: int) -> dict[str, Any]:
 def drive(demo: Demo, tell: Tell) -> Section:
     """Drive the robot and log its runs; the hidden fault is written to a file that is read at the end only."""
     from wlr_gym.data import read_dataset
+    from wlr_gym.data.excitations import EXCITATIONS
     from wlr_gym.physics.effects import load_patch, save_patch
 
     shutil.rmtree(demo.measured, ignore_errors=True)
@@ -63,10 +63,12 @@ def drive(demo: Demo, tell: Tell) -> Section:
             _excite(demo, patch, driver)
     runs = read_dataset(demo.measured).runs
     seconds = sum(float(run["t"][-1] - run["t"][0]) for run in runs)
+    motions = [f"'{name}' ({EXCITATIONS[name].doc})" for name in drivers if name in EXCITATIONS]
     html = paragraph(
         "An emulated robot, servo by servo and register by register, is driven like a real one: preflight, command limiter, "
-        f"50 Hz, a log of what was sent and read. {_told(drivers)} Something about this robot is not in its file: drawn from "
-        "the seed of this demo, and told to nobody until the end of this page."
+        f"50 Hz, a log of what was sent and read. {counted(drivers.count(POLICY), 'run')} by the shipped policy {POLICY}, and "
+        f"{len(motions)} by motions: {', '.join(motions)}. Something about this robot is not in its file: drawn from the seed "
+        "of this demo, and told to nobody until the end of this page."
     )
     html += drawn(
         _picture(runs[drivers.index(POLICY)]),
@@ -75,14 +77,6 @@ def drive(demo: Demo, tell: Tell) -> Section:
     )
     headline = f"A robot with a hidden fault was driven and logged: {len(runs)} runs, {seconds:.0f} s in all."
     return Section(DRIVE_TITLE, headline, html)
-
-
-def _told(drivers: tuple[str, ...]) -> str:
-    from wlr_gym.data.excitations import EXCITATIONS
-
-    motions = [f"'{name}' ({EXCITATIONS[name].doc})" for name in drivers if name in EXCITATIONS]
-    runs = counted(drivers.count(POLICY), "run")
-    return f"{runs} by the shipped policy {POLICY}, and {len(motions)} by motions: {', '.join(motions)}."
 
 
 def _deploy(demo: Demo, patch: Any, seed: int) -> None:
@@ -146,12 +140,6 @@ def _picture(run: Run) -> Figure:
 
 NAME_TITLE = "4. What does the simulator lack?"
 CHECK_TITLE = "5. Does it hold?"
-#: Channels in the picture of a replay.
-_SHOWN = 3
-#: A channel has got worse where its error rises by more than this; 1 = sensor noise.
-_WORSE = 0.1
-#: Channel -> error, of each of several replays.
-Errors = Sequence[Mapping[str, "ChannelError"]]
 
 
 def name(demo: Demo, tell: Tell) -> Section:
@@ -212,8 +200,8 @@ def left_over(found: Analysis) -> list[str]:
 
 
 def check(demo: Demo, tell: Tell) -> Section:
-    """Show the report's numbers of the held-out runs, replay these with the patch alone, then show the hidden fault."""
-    from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE, read_result
+    """Show the report's numbers of the held-out runs, then the hidden fault."""
+    from wlr_gym.gap.report.result import RESULT_FILE, read_result
     from wlr_gym.physics.effects import load_patch
 
     if not (demo.gap / RESULT_FILE).is_file():
@@ -222,24 +210,20 @@ def check(demo: Demo, tell: Tell) -> Section:
     hidden = load_patch(demo.hidden).effects[0]
     answer = judge(hidden, result.effects, result.equivalent)
     heldout = [one for one in result.run_gaps if one.heldout]
-    pairs = _replayed(demo, result, load_patch(demo.gap / PATCH_FILE), tell)
-    before, after = ([pair[k].errors for pair in pairs] for k in range(2))
-    worse = worse_channels(before, after) if pairs else []
-    html = _of_the_report(heldout) + (_patch_alone(demo, pairs) if pairs else "")
-    html += heading("The hidden fault") + _revealed(hidden, result.effects, answer)
-    better = bool(pairs) and not worse and fell(result.gap)
-    not_good = [*answer.outside, *_risen(heldout), *patch_alone_lacks(before, after, worse)]
-    verdict = SHOWN if answer.right and better else NOT_SHOWN
-    return Section(CHECK_TITLE, f"{answer.sentence} {_held_out(result.gap)}".strip(), html, verdict, not_good)
+    html = paragraph(
+        "The runs that no fit has seen: error of the gap report (1 = sensor noise), and what the effects remove of what is "
+        "above the noise floor."
+    )
+    html += _held_out_runs(heldout) + heading("The hidden fault") + _revealed(hidden, result.effects, answer)
+    worse = [one.run for one in heldout if _number(one.after) > _number(one.calibrated)]
+    not_good = [*answer.outside, *([f"the effects make the error of {listed(worse)} larger"] if worse else [])]
+    verdict = SHOWN if answer.right and fell(result.gap) else NOT_SHOWN
+    return Section(CHECK_TITLE, f"{answer.sentence} {_held_out(result.gap)}", html, verdict, not_good)
 
 
 def fell(gap: GapEntry | None) -> bool:
     """Whether the effects make the error of the held-out runs smaller."""
     return gap is not None and _number(gap.heldout_after) < _number(gap.heldout_calibrated)
-
-
-def _number(value: float | None) -> float:
-    return np.nan if value is None else value
 
 
 def _held_out(gap: GapEntry | None) -> str:
@@ -249,114 +233,16 @@ def _held_out(gap: GapEntry | None) -> str:
     return f"Error of the held-out runs: {calibrated} calibrated, {after} with what was found; noise floor {floor}."
 
 
-def _of_the_report(heldout: Sequence[RunGapEntry]) -> str:
+def _held_out_runs(heldout: Sequence[RunGapEntry]) -> str:
     rows = []
     for one in heldout:
         errors = [error(_number(value)) for value in (one.before, one.calibrated, one.after)]
         rows.append((one.run, *errors, percent(_number(one.reduction))))
-    said = "The runs that no fit has seen: error of the gap report (1 = sensor noise), and what the effects remove of what is "
-    said += "above the noise floor."
-    return paragraph(said) + table(("held-out run", "as given", "calibrated", "with effects", "removed"), rows, range(1, 5))
+    return table(("held-out run", "as given", "calibrated", "with effects", "removed"), rows, range(1, 5))
 
 
-def _risen(heldout: Sequence[RunGapEntry]) -> list[str]:
-    worse = [one.run for one in heldout if _number(one.after) > _number(one.calibrated)]
-    return [f"the effects make the error of {listed(worse)} larger"] if worse else []
-
-
-# ---- the patch alone -------------------------------------------------------------------------------------------------
-
-
-def _replayed(demo: Demo, result: Result, patch: Any, tell: Tell) -> list[tuple[ReplayResult, ReplayResult]]:
-    """Replay the held-out runs without the patch and with it."""
-    from wlr_gym.data import read_dataset
-    from wlr_gym.data.replay import replay
-
-    runs = [run for run in read_dataset(demo.measured).runs if run.name in result.runs.heldout]
-    pairs = []
-    for index, run in enumerate(runs):
-        tell(f"replaying {run.name}, held out", index / len(runs))
-        pairs.append((replay(run), replay(run, effects=patch)))
-    return pairs
-
-
-def _patch_alone(demo: Demo, pairs: Sequence[tuple[ReplayResult, ReplayResult]]) -> str:
-    """Return what the patch does in the simulator as its file has it; the picture is of the run that it leaves worst."""
-    rows = [(one.run.name, *(error(_over_all([replayed.errors])) for replayed in (one, other))) for one, other in pairs]
-    html = heading("The patch alone") + paragraph(
-        "The simulator as its file has it, not calibrated, replays the same runs in pieces of one second, each begun where the "
-        "robot was: with nothing added, and with patch.yaml, as any command takes it (--effects). This one-second replay error "
-        "is not the error above: the numbers that calibration moved are not in the patch, and no reading is limited, so that "
-        "more is left."
-    )
-    html += table(("held-out run", "one-second replay error, as given", "with the patch"), rows, (1, 2))
-    worst = max(pairs, key=lambda pair: _over_all([pair[1].errors]))
-    caption = f"{worst[0].run.name}, of the held-out runs the one with the largest one-second replay error with the patch: the "
-    return html + drawn(
-        _replay_picture(*worst), demo.out / "replay.png", f"{caption}channels that were furthest off without it."
-    )
-
-
-def _over_all(runs: Errors, channels: Sequence[str] = ()) -> float:
-    """Return the rms over runs and channels (none = all), in units of sensor noise."""
-    from wlr_gym.data.replay import pooled
-
-    chosen = [run[name] for run in runs for name in channels or run]
-    return pooled(chosen, lambda one: one.segment_rms / one.noise)
-
-
-def worse_channels(before: Errors, after: Errors) -> list[str]:
-    """Return the channels whose error the patch makes larger, by more than a tenth of the sensor noise, over all runs.
-
-    Args:
-        before, after: channel -> error of each run, without the patch and with it.
-    """
-    return [one for one in before[0] if _over_all(after, [one]) > _over_all(before, [one]) + _WORSE]
-
-
-def patch_alone_lacks(before: Errors, after: Errors, worse: Sequence[str]) -> list[str]:
-    """Return what is not good about the patch alone: that nothing got better, what got worse, and what is left most.
-
-    Args:
-        before, after: channel -> error of each run, without the patch and with it.
-        worse: channels that got worse.
-    """
-    if not after:
-        return ["no run was held out to try the patch on"]
-    said = [] if _over_all(after) < _over_all(before) else ["the patch alone makes the one-second replay error no smaller"]
-    if worse:
-        said.append(f"with the patch alone, {listed(worse)} got worse")
-    most = max(after[0], key=lambda name: _over_all(after, [name]))
-    left = _over_all(after, [most])
-    if left > UNEXPLAINED:
-        said.append(f"with the patch alone, {most} ({channel(most)}) is still off by {error(left)} times the sensor noise")
-    return said
-
-
-def _replay_picture(before: ReplayResult, after: ReplayResult) -> Figure:
-    from wlr_gym.gap.report.plots import AFTER, CALIBRATED, MEASURED
-
-    run = before.run
-    seen = [name for name in before.errors if not name.startswith("pos_wheel")]  # in turns of a wheel no error is seen
-    worst = sorted(seen, key=lambda name: -before.errors[name].segment_rms / before.errors[name].noise)[:_SHOWN]
-    figure = new_figure(10.0, 2.3 * len(worst) + 0.5)
-    rows = np.atleast_1d(figure.subplots(len(worst), 1, sharex=True))
-    t = run["t"] - run["t"][0]
-    for axes, name in zip(rows, worst, strict=True):
-        axes.plot(t, run[name], color=MEASURED, linewidth=2.4, label="measured")
-        for replayed, colour, label in ((before, CALIBRATED, "simulator as given"), (after, AFTER, "with the patch")):
-            values = replayed.segments[name].copy()
-            values[list(replayed.starts)] = np.nan  # lift the pen between pieces
-            axes.plot(t, values, color=colour, linewidth=1.0, label=label)
-        was, now = (one.errors[name] for one in (before, after))
-        before_text, after_text = (f"{one.segment_rms:.2g}{unit_of(one.unit)}" for one in (was, now))
-        axes.set_title(f"{name}: rms error {before_text}, with the patch {after_text}", fontsize=9, loc="left")
-        axes.set_ylabel(was.unit)
-        tidy(axes)
-        axes.margins(x=0.01)
-    rows[-1].set_xlabel("time (s)")
-    figure.legend(*rows[0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=9, frameon=False)
-    return figure
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
 
 
 # ---- the hidden fault ------------------------------------------------------------------------------------------------
@@ -394,17 +280,14 @@ class Diagnosis:
     def sentence(self) -> str:
         """Return the verdict in words."""
         if not self.named:
-            return (
-                "The name was not found, but the report gave it as an alternative." if self.near else "The name was not found."
-            )
+            return f"The name was not found{', but the report gave it as an alternative' if self.near else ''}."
         place = "the place were right" if self.placed else "but not the place was right"
         text = f"The name {'and ' if self.placed else ''}{place}"
         if self.sizes:
             off = max(abs(found / hidden - 1.0) for hidden, found, _, _ in self.sizes.values())
             text += f", the size off by {100.0 * off:.0f} %"
-        return text + (
-            f"; {listed([plain(name) for name in self.extra])} was named, too, but is not there." if self.extra else "."
-        )
+        extra = f"; {listed([plain(name) for name in self.extra])} was named, too, but is not there" if self.extra else ""
+        return f"{text}{extra}."
 
 
 def judge(hidden: PatchEffect, found: Sequence[EffectEntry], equivalent: Sequence[Sequence[str]] = ()) -> Diagnosis:

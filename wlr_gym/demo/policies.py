@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +14,13 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import heading, table
 from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, filmed, paragraph
 from wlr_gym.envs.tasks.task import having
-from wlr_gym.gap.report.text import listed, unit_of
-from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Estimate, Subject, play, work
+from wlr_gym.gap.report.text import listed, plain, unit_of
+from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Subject, play, work
+from wlr_gym.learning.evaluation.card import rows
 
 if TYPE_CHECKING:
     from wlr_gym.learning.evaluation import Rollout
+    from wlr_gym.learning.evaluation.metrics import Metric
 
 LEARN_TITLE = "1. A policy learns"
 REFERENCES = ("do_nothing", "pid")
@@ -108,7 +109,7 @@ def _watched(demo: Demo, tell: Tell) -> Iterator[None]:
 
 
 def _play_alone(source: str | Path, demo: Demo) -> Rollout:
-    from wlr_gym.learning.evaluation import FIRST_SEED, make_player, roll_out
+    from wlr_gym.learning.evaluation import make_player, roll_out
 
     core, policy = make_player(ENVIRONMENT, source, demo.episodes, {"precision": "float32"})
     with closing(core):
@@ -121,8 +122,8 @@ def _reward_per_second(rollout: Rollout) -> float:
 
 def _liveliest(rollout: Rollout) -> int:
     """Return the episode whose commands have the most driving and turning: the most to see."""
-    largest = np.maximum(np.abs(rollout.command).max(axis=(0, 1)), 1e-9)
-    effort = (np.abs(rollout.command) / largest).sum(axis=-1)
+    size = np.abs(rollout.command)
+    effort = (size / np.maximum(size.max(axis=(0, 1)), 1e-9)).sum(axis=-1)
     return int(np.argmax(np.where(rollout.active, effort, 0.0).sum(axis=0)))
 
 
@@ -136,45 +137,8 @@ NEW = "trained just now"
 #: The robot as it is deployed.
 NO_CAMERA = having(())
 SHIPPED = (OURS, BLIND, "pid")
-_WHO = {
-    OURS: "shipped; sees its slip (observer on wheels, legs and IMU)",
-    BLIND: "shipped; the same training, without the slip observer",
-    "pid": "classical controller, tuned",
-    NEW: "the policy of section 1",
-}
-
-
-@dataclass(frozen=True)
-class ScoreColumn:
-    """A column of the table: a metric of the card, in a unit of which the card's is ``scale``; ``digits`` after the point."""
-
-    key: str
-    name: str
-    unit: str = ""
-    scale: float = 1.0
-    digits: int = 3
-
-    @property
-    def heading(self) -> str:
-        """Return name and unit."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
-
-    def text(self, value: float) -> str:
-        """Return a value of the metric, without unit."""
-        return f"{self.scale * value:.{self.digits}f}"
-
-    def cell(self, estimate: Estimate) -> str:
-        """Return mean and half of the interval."""
-        return f"{self.text(estimate.mean)} ± {self.text(0.5 * (estimate.high - estimate.low))}"
-
-
-_COLUMNS = (
-    ScoreColumn("tracking_error", "tracking error"),
-    ScoreColumn("velocity_error", "velocity error", "mm/s", 1000.0, 1),
-    ScoreColumn("yaw_rate_error", "yaw rate error", "rad/s"),
-    ScoreColumn("excess_slip", "excess slip", "mm/s", 1000.0, 1),
-    ScoreColumn("success", "success", "%", digits=0),
-)
+#: Metrics of the card that are shown.
+SHOWN_METRICS = ("tracking_error", "velocity_error", "yaw_rate_error", "excess_slip", "success")
 #: A policy that fails in more episodes than this, %, is not good.
 _MANY = 10.0
 #: Label of the second kind of floor; what the kinds are, for the page and in short.
@@ -194,8 +158,10 @@ def compare(demo: Demo, tell: Tell) -> Section:
     card = _play(demo, tell)
     html = paragraph(
         f"{demo.episodes} episodes of 20 s each on each kind of floor: the same floors, robots, commands for all. No robot "
-        "has a camera, as the deployed one. A success keeps velocity and yaw rate within 5 % of the range of commands, rms "
-        "over the episode. Excess slip: mean over wheels and time. Mean ± half of the 95 % confidence interval."
+        f"has a camera, as the deployed one. {OURS} sees its slip (observer on wheels, legs and IMU); {BLIND} had the same "
+        "training without the observer; pid is a tuned classical controller. A success keeps velocity and yaw rate within 5 % "
+        "of the range of commands, rms over the episode. Excess slip: mean over wheels and time. Mean ± half of the 95 % "
+        "confidence interval."
     )
     html += "".join(heading(said) + _table(card, label) + paragraph(_against(card, label)) for label, said in FLOORS.items())
     better = all(card.comparison[label][BLIND]["tracking_error"].low > 0.0 for label in FLOORS)
@@ -220,9 +186,13 @@ def _play(demo: Demo, tell: Tell) -> Card:
     return Card(play(ENVIRONMENT, subjects, conditions, FIRST_SEED + demo.seed, on_tick))
 
 
+def _metrics(card: Card) -> list[Metric]:
+    return [metric for metric in card.metrics if metric.key in SHOWN_METRICS]
+
+
 def _table(card: Card, label: str) -> str:
-    rows = [(name, _WHO[name], *(one.cell(own[one.key]) for one in _COLUMNS)) for name, own in card.scores[label].items()]
-    return table(("policy", "", *(column.heading for column in _COLUMNS)), rows, range(2, 2 + len(_COLUMNS)))
+    headings, *body = rows(card.scores[label], _metrics(card), short=True)
+    return table(headings, body, range(2, len(headings)))
 
 
 def falls_short(card: Card) -> list[str]:
@@ -233,10 +203,10 @@ def falls_short(card: Card) -> list[str]:
     said = []
     for label, where in _WHERE.items():
         for other, own in card.comparison[label].items():
-            better = [column for column in _COLUMNS if own[column.key].high < 0.0]
+            better = [metric for metric in _metrics(card) if own[metric.key].high < 0.0]
             said += [f"{where}, {other} has the better {_listed(card, label, (other, OURS), better)}"] if better else []
         blind = card.comparison[label][BLIND]
-        if equal := [column for column in _COLUMNS if not blind[column.key].excludes_zero]:
+        if equal := [metric for metric in _metrics(card) if not blind[metric.key].excludes_zero]:
             names = _listed(card, label, (OURS, BLIND), equal)
             said.append(f"{where}, {OURS} is not measurably better than {BLIND} in {names}")
         failed = 100.0 - card.scores[label][OURS]["success"].mean
@@ -244,11 +214,16 @@ def falls_short(card: Card) -> list[str]:
     return said
 
 
-def _listed(card: Card, label: str, policies: tuple[str, str], columns: Iterable[ScoreColumn]) -> str:
-    """Return metrics with the values of two policies: ``excess slip (1.9 against 4.3 mm/s)``."""
-    scores = [card.scores[label][name] for name in policies]
-    values = {one: " against ".join(one.text(own[one.key].mean) for own in scores) for one in columns}
-    return listed([f"{one.name} ({text}{unit_of(one.unit)})" for one, text in values.items()])
+def _listed(card: Card, label: str, policies: tuple[str, str], metrics: Iterable[Metric]) -> str:
+    """Return metrics with the values of two policies: ``excess slip (0.0019 against 0.0043 m/s)``."""
+    first, second = (card.scores[label][name] for name in policies)
+    return listed(
+        [
+            f"{plain(one.key)} ({first[one.key].mean:.{one.digits}f} against {second[one.key].mean:.{one.digits}f}"
+            f"{unit_of(one.unit)})"
+            for one in metrics
+        ]
+    )
 
 
 def _against(card: Card, label: str) -> str:
@@ -258,14 +233,12 @@ def _against(card: Card, label: str) -> str:
 
 
 def _headline(card: Card) -> str:
-    said = [f"{_lower(card.comparison[label][BLIND]['tracking_error'])} {where}" for label, where in _WHERE.items()]
+    said = []
+    for label, where in _WHERE.items():
+        better = card.comparison[label][BLIND]["tracking_error"]
+        lower = f"{abs(better.mean):.0f} % {'lower' if better.mean > 0 else 'higher'}"
+        said.append(f"{lower if better.excludes_zero else 'not distinguishable'} {where}")
     return f"The tracking error of a policy that observes its slip, against the same training without: {'; '.join(said)}."
-
-
-def _lower(better: Estimate) -> str:
-    if not better.excludes_zero:
-        return "not distinguishable"
-    return f"{abs(better.mean):.0f} % {'lower' if better.mean > 0 else 'higher'}"
 
 
 def _film(demo: Demo, tell: Tell) -> str:

@@ -36,8 +36,8 @@ WORKERS: Mapping[str, tuple[DemoStage, ...]] = {
     ),
     "robot": (
         DemoStage(diagnosis.DRIVE_TITLE, diagnosis.drive, 0.15, (*_POLICIES, *_ROBOT)),
-        DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.45),
-        DemoStage(diagnosis.CHECK_TITLE, diagnosis.check, 0.05),
+        DemoStage(diagnosis.NAME_TITLE, diagnosis.name, 0.49),
+        DemoStage(diagnosis.CHECK_TITLE, diagnosis.check, 0.01),
         DemoStage(retraining.TITLE, retraining.retrain, 0.35, (*_TRAINING, *_POLICIES, *_FILE_WEIGHTS, *_ROBOT)),
     ),
 }
@@ -69,11 +69,19 @@ def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
                     tell(worker, message["text"], message["share"])
             except KeyboardInterrupt:
                 interrupted = True
-                _interrupt(running)
+                for process in running.values():
+                    process.send_signal(signal.SIGINT)
+                    killer = threading.Timer(PATIENCE, process.kill)
+                    killer.daemon = True
+                    killer.start()
     finally:
         for process in running.values():
             process.kill()
-    return [section for worker in WORKERS for section in _complete(worker, found[worker], interrupted)], interrupted
+    why, verdict = ("the demo was stopped.", SKIPPED) if interrupted else ("this worker ended early; log.txt says why.", FAILED)
+    for worker, stages in WORKERS.items():
+        missing = stages[len(found[worker]) :]
+        found[worker] += [Section(one.title, "", paragraph(f"Not reached: {why}"), verdict) for one in missing]
+    return [section for sections in found.values() for section in sections], interrupted
 
 
 def _start(worker: str, demo: Demo, inbox: queue.Queue[Any]) -> Any:
@@ -88,23 +96,6 @@ def _start(worker: str, demo: Demo, inbox: queue.Queue[Any]) -> Any:
 
     threading.Thread(target=read, daemon=True).start()
     return process
-
-
-def _interrupt(running: Mapping[str, Any]) -> None:
-    """Ask the workers to end, and see to it that they do."""
-    for process in running.values():
-        process.send_signal(signal.SIGINT)
-        killer = threading.Timer(PATIENCE, process.kill)
-        killer.daemon = True
-        killer.start()
-
-
-def _complete(worker: str, sections: list[Section], interrupted: bool) -> list[Section]:
-    """Return a section for each stage of a worker: those that were not reached say so."""
-    text = "Not reached: the demo was stopped." if interrupted else "Not reached: this worker ended early; log.txt says why."
-    verdict = SKIPPED if interrupted else FAILED
-    missing = [Section(stage.title, "", paragraph(text), verdict) for stage in WORKERS[worker][len(sections) :]]
-    return sections + missing
 
 
 # ---- a worker --------------------------------------------------------------------------------------------------------

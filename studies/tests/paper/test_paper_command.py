@@ -10,13 +10,14 @@ import pytest
 from studies.paper.__main__ import PaperOptions, run
 from studies.paper.experiments import PROFILE, TESTS
 from wlr_gym.base.errors import InputError
-from wlr_gym.cli import run_words
+from wlr_gym.cli import run_options
+from wlr_gym.cli.options import parse
 from wlr_gym.data.record import read_commands
 from wlr_gym.hardware.loop import Phase, StoppedError
 
 
 def run_paper(words):
-    return run_words("python -m studies.paper", PaperOptions, run, "", words)
+    return run_options(parse(PaperOptions, "python -m studies.paper", words), run)
 
 
 @pytest.mark.slow

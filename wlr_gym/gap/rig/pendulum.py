@@ -3,9 +3,7 @@
 The law is the simulators' drive law (:mod:`wlr_gym.physics.plants.drive`) on one joint with one link. Gear, motor and friction
 are :func:`wlr_gym.physics.plants.drive.push` itself, so an effect found on the rig is the effect of the library. Laws of the
 rig alone (torque that falls behind the current, a torque limit, friction quadratic in load, a warm winding) act through the
-strength of the motor and the ratio of load-dependent friction that the drive law reads. Formulas are those of the simulators
-(:mod:`wlr_gym.physics.plants.forces`): they may read what one joint of the robot could, ``angle`` (rad), ``rate`` (rad/s),
-``motor_torque`` (N m, of the substep before) and ``supply_voltage`` (V).
+strength of the motor and the ratio of load-dependent friction that the drive law reads.
 
 Servo: XL330-M288-T by its data sheet (ROBOTIS e-manual: stall torque 0.52 N m, no load 103 rev/min, both at 5 V). That its gear
 has dry and viscous friction is known; how much is fitted. Its recordings: :mod:`wlr_gym.gap.rig.pendulum_recordings`.
@@ -13,6 +11,7 @@ has dry and viscous friction is known; how much is fitted. Its recordings: :mod:
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
@@ -27,17 +26,15 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.random import generator
 from wlr_gym.gap.analysis import IntakeFinding
-from wlr_gym.gap.problem import MeasuredSignal, Quantity, Range, Setting, Unknown, since_reversal
+from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting, Unknown, since_reversal
 from wlr_gym.gap.rig.pendulum_recordings import DUTY_PER_GAIN, Recording, findings, read_recordings
 from wlr_gym.gap.rig.problem import RigLaw, RigProblem, few_runs, rig_patch, smoothed_state
 from wlr_gym.gap.validation.data_split import HELD_OUT_SHARE
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import Graph, emit, load_module, ops
-from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source
+from wlr_gym.physics.effects import EFFECTS, EffectParameter, Patch, PatchEffect, Source
 from wlr_gym.physics.effects.effect import Change, Guess, one_step
 from wlr_gym.physics.plants import drive
-from wlr_gym.physics.plants import drive as gears
-from wlr_gym.physics.plants.forces import Force, features_read, force_values, generalised_forces, make_force
 
 Array = NDArray[np.float64]
 Numbers = dict[str, float]
@@ -211,37 +208,11 @@ _NEUTRAL: Numbers = {
     "play": 0.0, "ripple_amplitude": 0.0, "ripple_order": 1.0, "ripple_phase": 0.0, "torque_scale": 1.0,
     "saturation": 0.0, "torque_limit": NO_TORQUE_LIMIT, "quadratic_friction": 0.0, "thermal": 0.0,
 }  # fmt: skip
-#: Joint of the robot for which the rig's joint stands in formulas: the checks and units are the same.
-_STAND_IN = "wheel_lf"
-#: Input of the force kernel of the robot -> lane of the rig.
-_LANES = {"joint_position_4": "angle", "joint_velocity_4": "rate", "motor_torque_4": "motor_torque", "supply_voltage": "supply"}
-
-
-class _Readable(dict[str, Value]):
-    """The rig's lanes under the names of the robot's: what a formula may read."""
-
-    @classmethod
-    def of(cls, lanes: Lanes) -> _Readable:
-        return cls({name: lanes[lane] for name, lane in _LANES.items()})
-
-    def __missing__(self, name: str) -> Value:
-        raise InputError(f"a formula on the test rig reads angle, rate, motor_torque and supply_voltage, not {name}")
-
-
-def rig_force(effect: PatchEffect) -> Force:
-    """Return the checked force of a formula effect.
-
-    Raises:
-        InputError: a formula that is broken, has another unit than N m, or reads what the rig has not.
-    """
-    force = make_force((_STAND_IN,), effect.formula, effect.parameters, effect.units)
-    generalised_forces([force], _Readable.of(dict.fromkeys(_LANES.values(), 0.0)))
-    return force
 
 
 def pendulum_patch(source: Source) -> Patch:
     """Load a patch of the rig, as its analyses write it; see :func:`wlr_gym.gap.rig.problem.rig_patch`."""
-    return rig_patch(source, RIG_EFFECTS, JOINT, rig_force)
+    return rig_patch(source, RIG_EFFECTS, JOINT)
 
 
 # ---- its law, one substep --------------------------------------------------------------------------------------------
@@ -265,14 +236,13 @@ STATE = ("angle", "rate", "rotor_lead", "rotor_rate")
 OUTPUTS = ("angle", "rate", "voltage", "motor_torque", "friction_torque")
 
 
-def substep(lanes: Lanes, step: Value, features: frozenset[str], force: Value = 0.0) -> dict[str, Value]:
+def substep(lanes: Lanes, step: Value, features: frozenset[str]) -> dict[str, Value]:
     """Return STATE after a substep and what OUTPUTS adds: drift half a step, kick, drift the other half.
 
     Args:
         lanes: PARAMETERS, INPUTS and STATE; scalars, or nodes of a graph.
         step: s.
         features: families of the drive law to trace.
-        force: torque (N m) on the link beside motor, gear and gravity, held over the substep.
     """
     half = 0.5 * step
     rate, rotor_rate = lanes["rate"], lanes["rotor_rate"]
@@ -290,7 +260,7 @@ def substep(lanes: Lanes, step: Value, features: frozenset[str], force: Value = 
 
     # rotor's rate without friction, and what a friction impulse on the rotor adds to it
     mass = 1.0 / (lanes["inertia"] + pushed.damping)
-    momentum = lanes["inertia"] * rate + step * (force - lanes["gravity"] * ops.sin(angle)) + pushed.impulse
+    momentum = lanes["inertia"] * rate - step * (lanes["gravity"] * ops.sin(angle)) + pushed.impulse
     free = pushed.rotor_free + pushed.share * (mass * momentum)
     mobility = pushed.rotor_gain + pushed.share * pushed.share * mass
     friction = ops.clip(-(free / mobility), -pushed.bound, pushed.bound)
@@ -329,15 +299,14 @@ def _strength_and_load_friction(lanes: Lanes, voltage: Value, motor_rate: Value)
 
 _DRIVER = '''
 @njit(cache=True, nogil=True, error_model="numpy")
-def simulate(P, V, lag, setpoints, inputs, starts, begun, step, out):
-    """See the function of this name below. P: parameters; V: constants of the formulas; inputs: supply, switch, warmth."""
+def simulate(P, lag, setpoints, inputs, starts, begun, step, out):
+    """See the function of this name below. P: parameters; inputs: supply, switch, warmth."""
     count = setpoints.shape[0]
     for m in range(P.shape[0]):
         {read_parameters}
-        {read_values}
         whole = int(math.floor(lag[m]))
         part = lag[m] - whole
-        angle = rate = rotor_lead = rotor_rate = motor_torque = 0.0
+        angle = rate = rotor_lead = rotor_rate = 0.0
         for i in range(count):
             new = min(max(i - whole, 0), count - 1)
             old = min(max(i - whole - 1, 0), count - 1)
@@ -356,27 +325,16 @@ def simulate(P, V, lag, setpoints, inputs, starts, begun, step, out):
 '''
 
 
-#: Compiled modules by what they were traced from.
-_modules: dict[tuple[Any, ...], ModuleType] = {}
-
-
-def _compiled(with_play: bool, forces: Sequence[Force]) -> ModuleType:
-    key = (with_play, *((force.formula, tuple(force.parameters)) for force in forces))
-    if key not in _modules:
-        owner = Graph()
-        lanes = {name: owner.input(name) for name in (*PARAMETERS, *INPUTS, *STATE, "motor_torque")}
-        features = frozenset({"drive", "backlash"} if with_play else {"drive"})
-        constants = [f"value_{k}" for k in range(sum(len(force.parameters) for force in forces))]
-        values = [owner.input(name) for name in constants]
-        force = generalised_forces(forces, _Readable.of(lanes), values)[_STAND_IN] if forces else 0.0
-        outputs = substep(lanes, owner.input("step"), features, force)
-        source = _DRIVER.format(
-            read_parameters="; ".join(f"{name} = P[m, {k}]" for k, name in enumerate(PARAMETERS)),
-            read_values="; ".join(f"{name} = V[m, {k}]" for k, name in enumerate(constants)) or "pass",
-            substep="\n".join(emit(outputs, str, lambda name, text: f"{name} = {text}", " " * 12)),
-        )
-        _modules[key] = load_module("rig_play" if with_play else "rig", source, "compiling the test rig (once)")
-    return _modules[key]
+@functools.cache
+def _compiled(with_play: bool) -> ModuleType:
+    owner = Graph()
+    lanes = {name: owner.input(name) for name in (*PARAMETERS, *INPUTS, *STATE)}
+    outputs = substep(lanes, owner.input("step"), frozenset({"drive", "backlash"} if with_play else {"drive"}))
+    source = _DRIVER.format(
+        read_parameters="; ".join(f"{name} = P[m, {k}]" for k, name in enumerate(PARAMETERS)),
+        substep="\n".join(emit(outputs, str, lambda name, text: f"{name} = {text}", " " * 12)),
+    )
+    return load_module("rig_play" if with_play else "rig", source, "compiling the test rig (once)")
 
 
 def simulate(
@@ -387,8 +345,6 @@ def simulate(
     starts: NDArray[np.int64],
     begun: Array,
     step: float,
-    forces: Sequence[Force] = (),
-    values: Array | None = None,
 ) -> Array:
     """Simulate models over one run.
 
@@ -400,22 +356,18 @@ def simulate(
         starts: (n,) row of ``begun`` to restart from before the substep, or -1; the first must not be -1.
         begun: (k, 2) encoder reading (rad) and rate (rad/s) where windows begin.
         step: s.
-        forces: formula forces, the same laws for all models.
-        values: (models, constants) of the forces, one after the other; None = their own.
 
     Returns:
         (models, n, 5) :data:`OUTPUTS`; angle (true: without the encoder's zero) and rate at the start of each substep, the
         others within it.
     """
-    if values is None:
-        values = np.repeat(force_values(forces)[None], len(parameters), axis=0)
     out = np.empty((len(parameters), len(setpoints), len(OUTPUTS)))
-    with_play = parameters[:, PARAMETERS.index("half_play")] > 0.0
-    for chosen, is_with_play in ((np.flatnonzero(~with_play), False), (np.flatnonzero(with_play), True)):
+    has_play = parameters[:, PARAMETERS.index("half_play")] > 0.0
+    for with_play in (False, True):
+        chosen = np.flatnonzero(has_play == with_play)
         if len(chosen):
             part = np.empty((len(chosen), *out.shape[1:]))
-            kernel = _compiled(is_with_play, forces).simulate
-            kernel(parameters[chosen], values[chosen], lag[chosen], setpoints, inputs, starts, begun, step, part)
+            _compiled(with_play).simulate(parameters[chosen], lag[chosen], setpoints, inputs, starts, begun, step, part)
             out[chosen] = part
     return out
 
@@ -423,35 +375,23 @@ def simulate(
 # ---- its model over a recording --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class RigModel:
-    """Numbers of a model by name, SI, and the formula forces on its joint."""
-
-    numbers: Numbers
-    forces: tuple[Force, ...] = ()
-
-
-def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> RigModel:
-    """Return the model of a setting: its quantities, then the effects that are known, then its own.
+def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> Numbers:
+    """Return the numbers of a setting's model by name: its quantities, then the effects that are known, then its own.
 
     Raises:
-        InputError: an effect the rig does not know, a parameter missing, or a broken formula.
+        InputError: an effect the rig does not know, or a parameter missing.
     """
     numbers = dict(_NEUTRAL)
     numbers.update({q.name: float(value) for q, value in zip(quantities, setting.quantities, strict=True)})
-    forces = []
     for effect in (*known, *setting.effects):
-        if effect.name == UNKNOWN_EFFECT:
-            forces.append(rig_force(effect))
-        else:
-            check_name("effect of the test rig", effect.name, RIG_EFFECTS)
-            RIG_EFFECTS[effect.name].apply(numbers, effect)
-    return RigModel(numbers, tuple(forces))
+        check_name("effect of the test rig", effect.name, RIG_EFFECTS)
+        RIG_EFFECTS[effect.name].apply(numbers, effect)
+    return numbers
 
 
-def pack(models: Sequence[RigModel], recording: Recording, step: float) -> Array:
+def pack(models: Sequence[Numbers], recording: Recording, step: float) -> Array:
     """Return what the compiled law reads (models, len(PARAMETERS)) for one recording's load and gain."""
-    table = {name: np.array([model.numbers[name] for model in models]) for name in models[0].numbers}
+    table = {name: np.array([model[name] for model in models]) for name in models[0]}
     arm, length = table["arm_mass"], recording.length + table["length_error"]
     armature, play = table["armature"], table["play"]
     constant, resistance = servo.motor_constants(table["stall_torque"], table["no_load_speed"], DATA_SHEET_VOLTAGE)
@@ -469,7 +409,7 @@ def pack(models: Sequence[RigModel], recording: Recording, step: float) -> Array
         "half_play": 0.5 * play,
         "rotor_inertia": armature,
         "teeth_stiffness": np.full(len(models), TEETH_STIFFNESS),
-        "teeth_damping": gears.TEETH_DAMPING * np.sqrt(TEETH_STIFFNESS * armature),
+        "teeth_damping": drive.TEETH_DAMPING * np.sqrt(TEETH_STIFFNESS * armature),
         "gain": np.full(len(models), recording.gain * DUTY_PER_GAIN),
         "gravity": GRAVITY * length * (recording.mass + arm / 2.0),
         "inertia": np.where(play > 0.0, link, with_rotor),
@@ -502,7 +442,7 @@ class Replay:
         self._below = np.clip(place.astype(np.int64), 0, count - 2)
         self._share = place - self._below
 
-    def simulate(self, models: Sequence[RigModel], length: float = math.inf) -> Array:
+    def simulate(self, models: Sequence[Numbers], length: float = math.inf) -> Array:
         """Return (models, rows, 5) :data:`OUTPUTS` at the rows of the recording.
 
         Args:
@@ -516,16 +456,8 @@ class Replay:
         starts[restarts] = np.arange(len(restarts))
         time = self.recording.t
         begun = np.stack([np.interp(self._grid[restarts], time, state) for state in (self.angle, self.rate)], axis=1)
-        found = np.empty((len(models), count, len(OUTPUTS)))
-        groups: dict[tuple[object, ...], list[int]] = {}  # by the formulas that act: each group is one compiled kernel
-        for k, model in enumerate(models):
-            groups.setdefault(tuple((force.formula, tuple(force.parameters)) for force in model.forces), []).append(k)
-        for same in groups.values():
-            part = [models[k] for k in same]
-            lag = np.array([model.numbers["delay"] for model in part]) / STEP
-            values = np.stack([force_values(model.forces) for model in part])
-            run = (self.goals, self._inputs, starts, begun, STEP)
-            found[same] = simulate(pack(part, self.recording, STEP), lag, *run, part[0].forces, values)
+        lag = np.array([model["delay"] for model in models]) / STEP
+        found = simulate(pack(models, self.recording, STEP), lag, self.goals, self._inputs, starts, begun, STEP)
         below, above = found[:, self._below], found[:, self._below + 1]
         return below + (above - below) * self._share[:, None]
 
@@ -549,32 +481,28 @@ class PendulumProblem(RigProblem):
     Args:
         recordings: of one servo.
         known: effects that are in the model from the start.
-        friction_is_known: dry and viscous friction are numbers of the model. Otherwise it has none, and they are candidates.
     """
 
     metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in units of sensor noise"
 
-    def __init__(
-        self, recordings: Sequence[Recording], known: Sequence[PatchEffect] = (), friction_is_known: bool = True
-    ) -> None:
+    def __init__(self, recordings: Sequence[Recording], known: Sequence[PatchEffect] = ()) -> None:
         if not recordings:
             raise InputError("no recordings to analyse")
         position = MeasuredSignal("position", "rad", ENCODER_NOISE, "position")
-        numbers = [one for one in QUANTITIES if friction_is_known or not one.name.endswith("friction")]
-        super().__init__(JOINT, recordings, (position,), numbers, RIG_EFFECTS, WINDOWS, known)
-        self.in_model: Set[str] = {quantity.name for quantity in numbers}
+        super().__init__(JOINT, recordings, (position,), QUANTITIES, RIG_EFFECTS, WINDOWS, known)
+        self.in_model: Set[str] = {quantity.name for quantity in QUANTITIES}
         self.recordings: tuple[Recording, ...] = tuple(recordings)
         self.held_out: tuple[str, ...] = spread_over_conditions(self.recordings)
         self.replays: list[Replay] = [Replay(recording) for recording in recordings]
 
-    def model(self, setting: Setting) -> RigModel:
-        """Return the model of a setting."""
+    def model(self, setting: Setting) -> Numbers:
+        """Return the numbers of a setting's model."""
         return model_of(setting, self.quantities, self.known)
 
     def replayed(self, settings: Sequence[Setting], run: int, length: float) -> Array:
         """Return what the encoder would have read (settings, rows, 1), begun anew after every ``length`` s, rad."""
         models = [self.model(setting) for setting in settings]
-        zero = np.array([model.numbers["zero"] for model in models])
+        zero = np.array([model["zero"] for model in models])
         return self.replays[run].simulate(models, length)[:, :, :1] + zero[:, None, None]
 
     def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
@@ -588,26 +516,15 @@ class PendulumProblem(RigProblem):
                 replace(self.recordings[run], angle=(np.round(angle / ENCODER_NOISE + shift) - shift) * ENCODER_NOISE)
                 for run, angle in zip(runs, clean, strict=True)
             ]
-            twin = PendulumProblem(made, self.known, len(self.quantities) == len(QUANTITIES))
+            twin = PendulumProblem(made, self.known)
             yield [residual[0] for residual in twin.residuals([setting], range(len(made)))]
-
-    def _outputs(self, setting: Setting, run: int) -> dict[str, Array]:
-        """Columns (rows,) of :data:`OUTPUTS` over a whole run."""
-        return dict(zip(OUTPUTS, self.replays[run].simulate([self.model(setting)])[0].T, strict=True))
-
-    def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
-        """Return over which range of each feature a formula was tried; see :meth:`wlr_gym.gap.problem.Problem.reach`."""
-        each = [self._outputs(setting, run) for run in runs]
-        columns = {name: np.concatenate([one[name] for one in each]) for name in OUTPUTS}
-        read = features_read(rig_force(effect), _Readable.of({**columns, "supply": columns["voltage"]})).items()
-        names = {name: name.removesuffix(f"_{_STAND_IN}") for name, _ in read}
-        return {names[name]: Range(float(np.nanmin(own)), float(np.nanmax(own)), unit) for name, (unit, own) in read}
 
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
         """Return what residuals are mapped over, (rows,) each, units in the names."""
         found: list[Mapping[str, Array]] = []
         for run in runs:
-            recording, columns = self.recordings[run], self._outputs(setting, run)
+            recording = self.recordings[run]
+            columns = dict(zip(OUTPUTS, self.replays[run].simulate([self.model(setting)])[0].T, strict=True))
             found.append(
                 {
                     "angle [rad]": columns["angle"],

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, check_folder, nearest
+from wlr_gym.base.errors import InputError, check_folder, check_number, nearest
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.rig.problem import smoothed_state
 
@@ -34,8 +35,8 @@ ENTRY_UNITS: Mapping[str, str] = {
     "goal_position": "rad",
     "torque_enable": "-",
 }
-#: What a file says about the whole run, apart from its entries.
-HEADER = ("mass", "length", "kp", "vin")
+#: What a file says about the whole run, apart from its entries -> unit; all above 0.
+HEADER_UNITS: Mapping[str, str] = {"mass": "kg", "length": "m", "kp": "", "vin": "V"}
 #: PWM counts at full duty of the servo's present-PWM register.
 FULL_DUTY = 885
 #: Duty per rad and unit of the Position P Gain register: counts of 2 pi/4096, /256 to PWM counts (the data confirm it).
@@ -49,6 +50,7 @@ _GAP = 3.0  # usual periods
 _CONFOUNDED = 0.8  # correlation over runs
 _LAW_SLOPE = (0.8, 1.25)  # duty over what the gain asks for
 _SPEED_SLOPE = (0.5, 2.0)  # reported speed over change of position
+_LEAST_RATE = 0.2  # rad/s, scatter of a joint whose speed can be compared
 _MOVED = 0.02  # rad: a run in which the joint moves less shows nothing
 _LEAST_COMPARED = 4  # runs, for a correlation over them
 
@@ -125,21 +127,33 @@ def read_recording(path: str | Path) -> Recording:
     path = Path(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {error}") from None
-    if not isinstance(content, dict) or not isinstance(content.get("entries"), list):
+    entries = content.get("entries") if isinstance(content, dict) else None
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{path}: expected a mapping with a list 'entries', one mapping per reading")
-    columns = _columns(path, content["entries"])
-    header = {key: _positive(path, content, key) for key in HEADER}
+    if len(entries) < LEAST_ROWS:
+        raise InputError(f"{path}: {len(entries)} entries; a run needs {LEAST_ROWS} or more")
+    header = {key: _number(content, key, f"{path}", unit, above=0.0) for key, unit in HEADER_UNITS.items()}
+    arm_mass = None if content.get("arm_mass") is None else _number(content, "arm_mass", f"{path}", "kg", above=0.0)
+    columns = {}
+    for key, unit in ENTRY_UNITS.items():
+        least = 0.0 if key == "input_volts" else None
+        values = [_number(entry, key, f"{path}: entry {row}", unit, above=least) for row, entry in enumerate(entries)]
+        columns[key] = np.array(values)
+    time = columns["timestamp"]
+    if (np.diff(time) <= 0).any():
+        row = int(np.argmax(np.diff(time) <= 0)) + 1
+        raise InputError(f"{path}: entry {row}: timestamp {time[row]:g} s is not after {time[row - 1]:g} s")
     return Recording(
         name=path.stem,
         trajectory=str(content.get("trajectory", "unknown")),
         mass=header["mass"],
         length=header["length"],
-        arm_mass=_positive(path, content, "arm_mass") if content.get("arm_mass") is not None else None,
+        arm_mass=arm_mass,
         gain=header["kp"],
         nominal_voltage=header["vin"],
-        t=columns["timestamp"],
+        t=time,
         angle=columns["position"],
         speed=columns["speed"],
         duty=decode_load(columns["load"]),
@@ -151,43 +165,11 @@ def read_recording(path: str | Path) -> Recording:
     )
 
 
-def _columns(path: Path, entries: list[Any]) -> dict[str, Array]:
-    if len(entries) < LEAST_ROWS:
-        raise InputError(f"{path}: {len(entries)} entries; a run needs {LEAST_ROWS} or more")
-    columns = {key: _column(path, entries, key) for key in ENTRY_UNITS}
-    time = columns["timestamp"]
-    if (np.diff(time) <= 0).any():
-        row = int(np.argmax(np.diff(time) <= 0)) + 1
-        raise InputError(f"{path}: entry {row}: timestamp {time[row]:g} s is not after {time[row - 1]:g} s")
-    if (columns["input_volts"] <= 0).any():
-        row = int(np.argmax(columns["input_volts"] <= 0))
-        raise InputError(f"{path}: entry {row}: input_volts {columns['input_volts'][row]:g} V; expected a supply above 0 V")
-    return columns
-
-
-def _column(path: Path, entries: list[Any], key: str) -> Array:
-    values = np.empty(len(entries))
-    for row, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise InputError(f"{path}: entry {row} is {entry!r}: expected a mapping of {', '.join(ENTRY_UNITS)}")
-        if key not in entry:
-            raise InputError(f"{path}: entry {row} has no '{key}'{nearest(key, entry)} ({ENTRY_UNITS[key]})")
-        values[row] = _number(path, f"entry {row}: {key}", entry[key], ENTRY_UNITS[key])
-    return values
-
-
-def _positive(path: Path, content: Mapping[str, Any], key: str) -> float:
-    if key not in content:
-        raise InputError(f"{path}: has no '{key}'{nearest(key, content)}")
-    value = _number(path, key, content[key], "positive")
-    if value <= 0:
-        raise InputError(f"{path}: {key} {value:g}: expected a positive number")
-    return value
-
-
-def _number(path: Path, what: str, value: Any, unit: str) -> float:
-    if not isinstance(value, int | float) or not np.isfinite(value):
-        raise InputError(f"{path}: {what} is {value!r}: expected a finite number ({unit})")
+def _number(entry: Mapping[str, Any], key: str, place: str, unit: str, above: float | None = None) -> float:
+    if key not in entry:
+        raise InputError(f"{place}: has no '{key}'{nearest(key, entry)}")
+    value = int(entry[key]) if isinstance(entry[key], bool) else entry[key]
+    check_number(f"{place}: {key}", value, unit, above=above)
     return float(value)
 
 
@@ -196,46 +178,32 @@ def _number(path: Path, what: str, value: Any, unit: str) -> float:
 
 def findings(recordings: Sequence[Recording]) -> tuple[IntakeFinding, ...]:
     """Return what is odd about each recording, then about all together."""
-    each = [finding for recording in recordings for finding in _of_one(recording)]
+    each = [finding for recording in recordings for finding in (*_units(recording), *_odd(recording))]
     return (*each, *_of_all(recordings))
 
 
 def _units(recording: Recording) -> Iterator[IntakeFinding]:
+    wrong = partial(IntakeFinding, recording.name, kind="units", fatal=True)
     for column, values in (("position", recording.angle), ("goal_position", recording.goal)):
         middle = float(np.median(np.abs(values)))
         if middle > 2.0 * np.pi:
-            text = f"{middle:.3g} in the median: degrees, not rad? Write rad and run again"
-            yield IntakeFinding(recording.name, column, "units", text, fatal=True)
+            yield wrong(column, text=f"{middle:.3g} in the median: degrees, not rad? Write rad and run again")
     period = float(np.median(np.diff(recording.t)))
     if period > _LONGEST_PERIOD:
-        text = f"{period:.3g} s between rows: milliseconds, not s? Write s and run again"
-        yield IntakeFinding(recording.name, "timestamp", "units", text, fatal=True)
+        yield wrong("timestamp", text=f"{period:.3g} s between rows: milliseconds, not s? Write s and run again")
         return
-    slope = _speed_slope(recording)
-    if slope is not None and not _SPEED_SLOPE[0] < slope < _SPEED_SLOPE[1]:
+    _, rate = smoothed_state(recording.t, recording.angle)
+    if np.std(rate) < _LEAST_RATE:
+        return
+    slope = float(rate @ recording.speed / (rate @ rate))
+    if not _SPEED_SLOPE[0] < slope < _SPEED_SLOPE[1]:
         reason = "the signs differ" if slope < 0 else "rad/s expected"
         text = f"speed is {slope:.3g} times the change of position ({reason}): mend the recording and run again"
-        yield IntakeFinding(recording.name, "speed", "units", text, fatal=True)
+        yield wrong("speed", text=text)
 
 
-def _speed_slope(recording: Recording) -> float | None:
-    """Slope of the reported speed over the change of position; None where the joint hardly moves."""
-    _, rate = smoothed_state(recording.t, recording.angle)
-    if np.std(rate) < 0.2:
-        return None
-    return float(rate @ recording.speed / (rate @ rate))
-
-
-def _of_one(recording: Recording) -> Iterator[IntakeFinding]:
-    yield from _units(recording)
-    yield from _wrap(recording)
-    yield from _supply(recording)
-    yield from _clock(recording)
-    yield from _motion(recording)
-    yield from _control_law(recording)
-
-
-def _wrap(recording: Recording) -> Iterator[IntakeFinding]:
+def _odd(recording: Recording) -> Iterator[IntakeFinding]:
+    note = partial(IntakeFinding, recording.name)
     wrapped = np.flatnonzero(recording.raw_load > 32767)
     if len(wrapped):
         first = recording.raw_load[wrapped[0]]
@@ -243,50 +211,37 @@ def _wrap(recording: Recording) -> Iterator[IntakeFinding]:
             f"{len(wrapped)} of {len(recording.t)} readings of a signed 16-bit register as an unsigned one "
             f"({first:.0f} is {first - 65536:.0f}): decoded before any interpolation"
         )
-        yield IntakeFinding(recording.name, "load", "wrap", text)
+        yield note("load", "wrap", text)
 
-
-def _supply(recording: Recording) -> Iterator[IntakeFinding]:
-    low, high = float(recording.supply.min()), float(recording.supply.max())
-    nominal = recording.nominal_voltage
+    low, high, nominal = float(recording.supply.min()), float(recording.supply.max()), recording.nominal_voltage
     if max(nominal - low, high - nominal) > _SUPPLY_SWING * nominal:
         text = f"swings from {low:.1f} to {high:.1f} V, nominally {nominal:.1f} V: the measured supply drives the simulation"
-        yield IntakeFinding(recording.name, "input_volts", "supply", text)
+        yield note("input_volts", "supply", text)
 
-
-def _clock(recording: Recording) -> Iterator[IntakeFinding]:
     periods = np.diff(recording.t)
     usual = float(np.median(periods))
-    gaps = np.flatnonzero(periods > _GAP * usual)
-    if len(gaps):
-        text = f"{len(gaps)} gaps, the longest {1e3 * periods.max():.1f} ms; rows are usually {1e3 * usual:.2f} ms apart"
-        yield IntakeFinding(recording.name, "timestamp", "gap", text)
+    if gaps := int((periods > _GAP * usual).sum()):
+        text = f"{gaps} gaps, the longest {1e3 * periods.max():.1f} ms; rows are usually {1e3 * usual:.2f} ms apart"
+        yield note("timestamp", "gap", text)
     low, high = np.percentile(periods, (1, 99))
     if high - low > _JITTER * usual:
-        text = (
-            f"rows are {1e3 * low:.2f} to {1e3 * high:.2f} ms apart (98 % of them): replayed at their own times, not resampled"
-        )
-        yield IntakeFinding(recording.name, "timestamp", "jitter", text)
+        apart = f"rows are {1e3 * low:.2f} to {1e3 * high:.2f} ms apart (98 % of them)"
+        yield note("timestamp", "jitter", f"{apart}: replayed at their own times, not resampled")
 
-
-def _motion(recording: Recording) -> Iterator[IntakeFinding]:
     if np.ptp(recording.angle) < _MOVED:
         text = f"moves by {np.ptp(recording.angle):.3g} rad in the whole run: a dead channel, or a joint that is stuck"
-        yield IntakeFinding(recording.name, "position", "dead", text)
+        yield note("position", "dead", text)
     if not recording.enabled.all():
         text = f"torque off from {recording.t[np.argmin(recording.enabled)]:.2f} s on: simulated with the winding open"
-        yield IntakeFinding(recording.name, "torque_enable", "off", text)
+        yield note("torque_enable", "off", text)
 
-
-def _control_law(recording: Recording) -> Iterator[IntakeFinding]:
     wish = recording.gain * DUTY_PER_GAIN * (recording.goal - recording.angle)
     free = recording.enabled & (np.abs(wish) < 0.9)
-    if free.sum() < 20 or np.ptp(wish[free]) < 0.02:
-        return
-    slope = float(wish[free] @ recording.duty[free] / (wish[free] @ wish[free]))
-    if not _LAW_SLOPE[0] < slope < _LAW_SLOPE[1]:
-        text = f"duty is {slope:.2f} times what the P gain {recording.gain:.0f} asks for: another gain, or another register?"
-        yield IntakeFinding(recording.name, "load", "control_law", text)
+    if free.sum() >= 20 and np.ptp(wish[free]) >= 0.02:
+        slope = float(wish[free] @ recording.duty[free] / (wish[free] @ wish[free]))
+        if not _LAW_SLOPE[0] < slope < _LAW_SLOPE[1]:
+            asked = f"what the P gain {recording.gain:.0f} asks for"
+            yield note("load", "control_law", f"duty is {slope:.2f} times {asked}: another gain, or another register?")
 
 
 def _of_all(recordings: Sequence[Recording]) -> Iterator[IntakeFinding]:
@@ -296,11 +251,8 @@ def _of_all(recordings: Sequence[Recording]) -> Iterator[IntakeFinding]:
     if silent:
         text = f"mass of the arm not recorded in {silent} of {len(recordings)} runs: fitted, within a wide tolerance"
         yield IntakeFinding("", "arm_mass", "missing", text)
-    if len(recordings) >= _LEAST_COMPARED:
-        yield from _confounding(recordings)
-
-
-def _confounding(recordings: Sequence[Recording]) -> Iterator[IntakeFinding]:
+    if len(recordings) < _LEAST_COMPARED:
+        return
     per_run: Mapping[str, Array] = {
         "P gain": np.log([recording.gain for recording in recordings]),
         "temperature": np.array([recording.temperature.mean() for recording in recordings]),

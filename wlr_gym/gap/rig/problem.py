@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -23,7 +23,7 @@ from wlr_gym.base.settings import read_yaml
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, Start, Unknown
 from wlr_gym.physics.codegen.expression import finite_number
-from wlr_gym.physics.effects import UNKNOWN_EFFECT, EffectParameter, Patch, PatchEffect, Source, compose
+from wlr_gym.physics.effects import EffectParameter, Patch, PatchEffect, Source, compose
 from wlr_gym.physics.effects.effect import Change, Guess
 from wlr_gym.robot.parameter_table import range_in_words
 
@@ -244,16 +244,13 @@ def _guess(law: RigLaw) -> Guess:
 # ---- patches ---------------------------------------------------------------------------------------------------------
 
 
-def rig_patch(
-    source: Source, laws: Mapping[str, RigLaw], joint: str, check_formula: Callable[[PatchEffect], object] | None = None
-) -> Patch:
+def rig_patch(source: Source, laws: Mapping[str, RigLaw], joint: str) -> Patch:
     """Load a patch of a rig, as its analyses write it.
 
     Args:
         source: as for :func:`wlr_gym.physics.effects.load_patch`.
         laws: what the rig knows.
         joint: the one place where they act.
-        check_formula: refuses a formula that is broken; None = the rig takes none.
 
     Raises:
         InputError: naming file, effect, key and the nearest valid name.
@@ -266,52 +263,35 @@ def rig_patch(
     elif isinstance(source, Mapping):
         content, name = {"effects": [source]} if "name" in source else source, "effects"
     elif isinstance(source, Sequence):
-        return compose(*(rig_patch(one, laws, joint, check_formula) for one in source))
+        return compose(*(rig_patch(one, laws, joint) for one in source))
     else:
         raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
     entries = content.get("effects") if isinstance(content, Mapping) else None
     if not isinstance(entries, list | tuple):
         raise InputError(f"{name}: expected a mapping with 'effects', a list of effects")
-    found = tuple(_effect(entry, f"{name}: effect {k}", laws, joint, check_formula) for k, entry in enumerate(entries, 1))
-    return Patch(found, _mapping(content, "provenance", name), name)
+    origin = content.get("provenance") or {}
+    if not isinstance(origin, Mapping):
+        raise InputError(f"{name}: provenance = {origin!r}: expected a mapping")
+    found = tuple(_effect(entry, f"{name}: effect {k}", laws, joint) for k, entry in enumerate(entries, 1))
+    return Patch(found, dict(origin), name)
 
 
-def _effect(
-    entry: Any, place: str, laws: Mapping[str, RigLaw], joint: str, check_formula: Callable[[PatchEffect], object] | None
-) -> PatchEffect:
+def _effect(entry: Any, place: str, laws: Mapping[str, RigLaw], joint: str) -> PatchEffect:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("parameters", {}), Mapping):
         raise InputError(f"{place}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}")
-    name, given = str(entry.get("name")), dict(entry.get("parameters", {}))
-    check = check_formula if name == UNKNOWN_EFFECT else None
-    if check is None:
-        check_name("effect of the test rig", name, laws, place)
-    named = f"{place} ({name})"
+    name, given = str(entry.get("name")), entry.get("parameters", {})
+    check_name("effect of the test rig", name, laws, place)
+    place = f"{place} ({name})"
     if entry.get("where", joint) not in (joint, [joint], (joint,)):
-        raise InputError(f"{named}: where = {entry['where']!r}: the rig has one joint, {joint}")
-    if check is not None:
-        formula = entry.get("formula")
-        if not isinstance(formula, str):
-            raise InputError(f"{named}: formula = {formula!r}: expected a formula of the torque, such as '-b * rate'")
-        effect = PatchEffect(name, (joint,), given, formula, _mapping(entry, "units", named), named)
-        check(effect)
-        return effect
-    known = laws[name].parameters
+        raise InputError(f"{place}: where = {entry['where']!r}: the rig has one joint, {joint}")
+    known, numbers = laws[name].parameters, {}
     for key in given:
-        check_name("parameter", key, known, named)
-    numbers = {key: _number(given.get(key), spec, f"{named}: {key}") for key, spec in known.items()}
+        check_name("parameter", key, known, place)
+    for key, spec in known.items():
+        value = given.get(key)
+        number = finite_number(spec.neutral if value is None and spec.optional else value)
+        if number is None or not spec.low <= number <= spec.high:
+            expected = f"a number in {range_in_words(spec.low, spec.high, spec.unit)}"
+            raise InputError(f"{place}: {key} = {value!r}: expected {expected}")
+        numbers[key] = number
     return PatchEffect(name, (joint,), numbers, place=place)
-
-
-def _mapping(entry: Mapping[str, Any], key: str, place: str) -> dict[str, Any]:
-    """Return a copy of a mapping that an entry may leave out."""
-    value = entry.get(key) or {}
-    if not isinstance(value, Mapping):
-        raise InputError(f"{place}: {key} = {value!r}: expected a mapping")
-    return dict(value)
-
-
-def _number(value: Any, spec: EffectParameter, place: str) -> float:
-    number = finite_number(spec.neutral if value is None and spec.optional else value)
-    if number is None or not spec.low <= number <= spec.high:
-        raise InputError(f"{place} = {value!r}: expected a number in {range_in_words(spec.low, spec.high, spec.unit)}")
-    return number
