@@ -139,7 +139,7 @@ def test_two_runs_are_too_few(tmp_path):
         (lambda table: table.assign(position=np.nan), r"column 'position' holds no number"),
         (
             lambda table: table.assign(position=table["position"].where(table.index != 7, -np.inf)),
-            r"column 'position', row 7.*: infinite",
+            r"column 'position', row 7.*: expected a finite number, got an infinite one",
         ),
         (lambda table: table[:5], r"5 rows: expected 20 or more"),
     ],

@@ -223,16 +223,16 @@ def test_a_result_of_an_earlier_version_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"verdict": "fine"}, r"verdict: Input should be 'bad_data'"),
+        ({"verdict": "fine"}, r"verdict = 'fine': expected 'bad_data'"),
         ({"effects": [{"name": "payload", "where": ["body"], "parameters": {}, "confidence": 2.0}]}, r"effects\.0\.confidence"),
-        ({"calibration": {"ground.mu": {"nominal": 0.6}}}, r"calibration\.ground\.mu\.fitted: Field required"),
-        ({"runs": None}, r"runs: "),
+        ({"calibration": {"ground.mu": {"nominal": 0.6}}}, r"'calibration\.ground\.mu\.fitted' is missing"),
+        ({"runs": None}, r"runs = None: "),
         (
             {"effects": [
                 {"name": "payload", "where": ["body"], "confidence": 0.5,
                  "parameters": {"mass": {"value": 2.0, "ci95": [0.0, 1.0], "unit": "kg"}}}
             ]},
-            r"effects\.0\.parameters\.mass: .*value 2 is not within its ci95",
+            r"effects\.0\.parameters\.mass = .*value 2 is not within its ci95",
         ),
     ],
 )  # fmt: skip

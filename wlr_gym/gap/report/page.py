@@ -27,11 +27,9 @@ from wlr_gym.gap.analysis import (
     Adequacy,
     Analysis,
     Calibrated,
-    ChannelGap,
     Evidence,
     FoundEffect,
     GapFigures,
-    RunGap,
     Statistic,
 )
 from wlr_gym.gap.report.plots import draw
@@ -97,9 +95,18 @@ def report(analysis: Analysis, pictures: Mapping[str, bytes], folder: Path) -> s
         pictures: name -> PNG, of :func:`wlr_gym.gap.report.plots.draw`.
         folder: where the results are, for the commands it shows.
     """
-    found = _header(analysis), _where(analysis, pictures), _what(analysis, pictures), _how_much(analysis, pictures)
-    more = _how_sure(analysis), _next(analysis), _calibration(analysis), _intake(analysis), _use(analysis, folder)
-    body = [*found, *more, _footer(analysis)]
+    body = [
+        _header(analysis),
+        _where(analysis, pictures),
+        _what(analysis, pictures),
+        _how_much(analysis, pictures),
+        _how_sure(analysis),
+        _next(analysis),
+        _calibration(analysis),
+        _intake(analysis),
+        _use(analysis, folder),
+        _footer(analysis),
+    ]
     return document(f"{title(analysis)}: {analysis.data}", _COLOURS[analysis.verdict], body)
 
 
@@ -109,13 +116,14 @@ def _pictures(kind: str, pictures: Mapping[str, bytes]) -> str:
 
 def _header(analysis: Analysis) -> str:
     facts = [f"Data: <code>{escape(analysis.data)}</code>"]
-    if analysis.fit_runs:
-        facts.append(f"fitted to {_runs(analysis.fit_runs)}")
-    if analysis.heldout_runs:
-        facts.append(f"validated on {_runs(analysis.heldout_runs)}, which no fit has used")
-    known = [str(effect.get("name", "")) for effect in analysis.known_effects]
-    if known:
-        facts.append(f"known from the start: {escape(listed([plain(name) for name in known]))}")
+    fitted, held = (
+        f"{counted(len(names), 'run')} ({escape(', '.join(names))})" for names in (analysis.fit_runs, analysis.heldout_runs)
+    )
+    facts += [f"fitted to {fitted}"] if analysis.fit_runs else []
+    facts += [f"validated on {held}, which no fit has used"] if analysis.heldout_runs else []
+    if analysis.known_effects:
+        known = listed([plain(str(effect.get("name", ""))) for effect in analysis.known_effects])
+        facts.append(f"known from the start: {escape(known)}")
     assumed = [f"{one.text}." for one in analysis.intake if one.kind == NO_PROFILE]
     left = "".join(f"<p>{escape(text)}</p>\n" for text in (*assumed, made_worse(analysis), closure(analysis)) if text)
     return (
@@ -124,20 +132,15 @@ def _header(analysis: Analysis) -> str:
     )
 
 
-def _runs(names: Sequence[str]) -> str:
-    return f"{len(names)} run{'s' if len(names) > 1 else ''} ({escape(', '.join(names))})"
-
-
 def _tiles(analysis: Analysis) -> str:
     gap = analysis.gap
     if gap is None:
         return ""
-    before, calibrated, after = (capped(one, gap) for one in (gap.heldout_before, gap.heldout_calibrated, gap.heldout_after))
-    tiles = [(before, "error of the model as given"), (calibrated, "after calibration")]
+    before, calibrated, after = _errors(gap.heldout_before, gap.heldout_calibrated, gap.heldout_after, gap)
+    floor = (error(gap.noise_floor), "noise floor: what a perfect model reaches")
+    tiles = [(before, "error of the model as given"), (calibrated, "after calibration"), floor]
     if analysis.added:
-        tiles.append((after, "with the effects added"))
-    tiles.append((error(gap.noise_floor), "noise floor: what a perfect model reaches"))
-    if analysis.added:
+        tiles.insert(2, (after, "with the effects added"))
         tiles.append((percent(gap.reduction), f"of the avoidable error removed; {interval(analysis)}"))
     items = "".join(f"<li><b>{escape(value)}</b>{escape(text)}</li>" for value, text in tiles)
     return (
@@ -260,14 +263,14 @@ def _how_much(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
         return ""
     headings = ("as given", "calibrated", "with effects")[: 3 if analysis.added else 2]
     of_runs = (*headings, "removed") if analysis.added else headings
-    runs = [
-        (one.run, "held out" if one.heldout else "fitted", *(*_errors(one, gap), percent(one.reduction))[: len(of_runs)])
-        for one in analysis.run_gaps
-    ]
-    channels = [
-        (one.channel, channel(one.channel), f"{number(one.noise)}{unit_of(one.unit)}", *_errors(one, gap)[: len(headings)])
-        for one in analysis.channel_gaps
-    ]
+    runs, channels = [], []
+    for one in analysis.run_gaps:
+        cells = (*_errors(one.before, one.calibrated, one.after, gap), percent(one.reduction))
+        runs.append((one.run, "held out" if one.heldout else "fitted", *cells[: len(of_runs)]))
+    for one in analysis.channel_gaps:
+        cells = _errors(one.before, one.calibrated, one.after, gap)
+        noise = f"{number(one.noise)}{unit_of(one.unit)}"
+        channels.append((one.channel, channel(one.channel), noise, *cells[: len(headings)]))
     return section(
         "How much",
         _gap_in_words(gap, analysis),
@@ -278,16 +281,17 @@ def _how_much(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     )
 
 
-def _errors(one: RunGap | ChannelGap, gap: GapFigures) -> tuple[str, str, str]:
-    return capped(one.before, gap), capped(one.calibrated, gap), capped(one.after, gap)
+def _errors(before: float, calibrated: float, after: float, gap: GapFigures) -> tuple[str, str, str]:
+    return capped(before, gap), capped(calibrated, gap), capped(after, gap)
 
 
 def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
-    added = f", {capped(gap.heldout_after, gap)} with the effects" if analysis.added else ""
+    before, calibrated, after = _errors(gap.heldout_before, gap.heldout_calibrated, gap.heldout_after, gap)
+    added = f", {after} with the effects" if analysis.added else ""
     text = (
         f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: "
         f"{capped(gap.fit_before, gap)} before, {capped(gap.fit_after, gap)} after. Held-out runs: "
-        f"{capped(gap.heldout_before, gap)} as given, {capped(gap.heldout_calibrated, gap)} calibrated{added}; "
+        f"{before} as given, {calibrated} calibrated{added}; "
         f"noise floor {error(gap.noise_floor)}. {escape(below_floor(analysis))}</p>"
     )
     if not analysis.added:
@@ -420,19 +424,22 @@ def _use(analysis: Analysis, folder: Path) -> str:
     if analysis.verdict in (BAD_DATA, NOT_EXCITED):
         return ""
     patch, result, data = (shlex.quote(str(path)) for path in (folder / PATCH_FILE, folder / RESULT_FILE, analysis.data))
-    parts, known = [], "FILES-GIVEN-AS-KNOWN " if analysis.known_effects else ""
-    if not patch_of(analysis).effects:
-        parts.append("<p>There is no effect to add: the patch is empty.</p>")
-    elif reason := _refusal(analysis):
-        parts.append(f"<p>The patch says what was found. The robot's simulators cannot load it: {escape(reason)}.</p>")
+    known, robot = "FILES-GIVEN-AS-KNOWN " if analysis.known_effects else "", _robot(analysis)
+    effects = f"--effects {known}{patch}"
+    lines = [f"wlr effects check {patch}", f"wlr replay {data} --out replayed {effects}", f"wlr train {_TASK} {effects}"]
+    found = patch_of(analysis)
+    try:
+        load_patch(found.content())
+    except InputError as error:
+        refused = f"The patch says what was found. The robot's simulators cannot load it: {escape(str(error))}."
+        parts = [f"<p>{refused}</p>"]
     else:
-        effects = f"--effects {known}{patch}"
-        lines = [f"wlr effects check {patch}", f"wlr replay {data} --out replayed {effects}"]
-        lines.append(f"wlr train WLR-Velocity-v0 {effects}")
-        parts += [_PATCH, commands([line + _robot(analysis) for line in lines])]
+        parts = [_PATCH, commands([line + robot for line in lines])]
+    if not found.effects:
+        parts = ["<p>There is no effect to add: the patch is empty.</p>"]
     if _drawable(analysis):
-        line = f"wlr train WLR-Velocity-v0 --set environment.randomization={result}"
-        parts += [_RESULT, commands([f"{line}{_robot(analysis)}{known and f' --effects {known}'.rstrip()}"])]
+        line = f"wlr train {_TASK} --set environment.randomization={result}{robot}"
+        parts += [_RESULT, commands([f"{line} --effects {known}".rstrip() if known else line])]
     return section("How to use the result", *parts)
 
 
@@ -442,20 +449,12 @@ def _robot(analysis: Analysis) -> str:
     return "" if robot == NOMINAL else f" --robot {shlex.quote(str(robot))}"
 
 
+_TASK = "WLR-Velocity-v0"
 _PATCH = """<p><code>patch.yaml</code> holds the effects, to be laid over the nominal model. Every command that simulates takes
 it: check it, replay the runs with it, train with it.</p>"""
 _RESULT = """<p>The patch does not hold the calibrated numbers. <code>result.json</code> holds these and the effects with their
 uncertainty: used as randomization (without the patch; known effects are not in it), every episode draws a robot that these data
 allow.</p>"""
-
-
-def _refusal(analysis: Analysis) -> str:
-    """Why the robot's simulators cannot load the patch; empty if they can."""
-    try:
-        load_patch(patch_of(analysis).content())
-    except InputError as error:
-        return str(error)
-    return ""
 
 
 def _drawable(analysis: Analysis) -> bool:
@@ -488,16 +487,11 @@ def check_folder(folder: Path) -> None:
     Raises:
         InputError: a file, a folder without rights, or one with contents that no earlier analysis wrote.
     """
-    if folder.is_dir():
-        _require_own(folder)
-    require_output_place(folder)
-
-
-def _require_own(folder: Path) -> None:
-    there = sorted(path.name for path in folder.iterdir())
+    there = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     strange = [name for name in there if name not in _OWN] or ([] if _is_analysis(folder) else there)
     if strange:
         raise InputError(f"--out {folder}: '{strange[0]}' in it is not of an analysis; expected a new folder or an earlier one")
+    require_output_place(folder)
 
 
 def _is_analysis(folder: Path) -> bool:

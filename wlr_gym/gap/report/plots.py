@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
 
 Array = NDArray[np.float64]
 
@@ -137,7 +136,11 @@ def _heat_map(heat_map: HeatMap) -> Figure:
     axes.grid(which="minor", color="white", linewidth=0.8)
     axes.tick_params(which="both", length=0)
     if rows * columns <= 800:
-        _write_values(axes, heat_map.values, image)
+        colours = np.asarray(image.to_rgba(heat_map.values))
+        for row, column in np.argwhere(np.isfinite(heat_map.values)):
+            value, ink = float(heat_map.values[row, column]), text_colour(colours[row, column].tolist())
+            text = f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
+            axes.text(column, row, text, ha="center", va="center", fontsize=7.5, color=ink)
     axes.set_xlabel(feature(heat_map.feature), fontsize=9)
     axes.set_title("rms error of the calibrated model", fontsize=9, loc="left")
     ticks = [tick for tick in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if tick <= hottest]
@@ -146,17 +149,6 @@ def _heat_map(heat_map: HeatMap) -> Figure:
     bar.minorticks_off()
     bar.set_label("rms error (1 = sensor noise)", fontsize=9)
     return figure
-
-
-def _write_values(axes: Axes, values: Array, image: AxesImage) -> None:
-    """Write the numbers into the cells, in the one of black and white that stands out."""
-    colours = np.asarray(image.to_rgba(values))
-    for row, column in np.ndindex(*values.shape):
-        value = float(values[row, column])
-        if np.isfinite(value):
-            colour = text_colour(colours[row, column].tolist())
-            axes.text(column, row, f"{value:.1f}" if value < 9.95 else f"{value:.0f}", ha="center", va="center", fontsize=7.5,
-                      color=colour)  # fmt: skip
 
 
 # ---- what ------------------------------------------------------------------------------------------------------------
@@ -195,8 +187,8 @@ def _strongest(evidence: Sequence[Evidence]) -> list[Evidence]:
     named = {one.name for one in fitted}
     best: dict[str, Evidence] = {}
     for one in evidence:
-        if one.name not in named and (one.name not in best or _size(one) > _size(best[one.name])):
-            best[one.name] = one
+        if one.name not in named:
+            best[one.name] = max(best.get(one.name, one), one, key=_size)
     return sorted(best.values(), key=_size)[-_OTHERS:] + sorted(fitted, key=_size)
 
 
@@ -211,21 +203,15 @@ def _draw_round(axes: Axes, members: Sequence[Evidence]) -> None:
     for row, bar, size, one in zip(rows, bars, sizes, members, strict=True):
         if one.outcome == REJECTED:
             bar.set(fill=False, edgecolor=GREY)
-        text = f"{size:.0f}  {one.outcome}"
-        weight = "bold" if one.outcome == SELECTED else "normal"
-        style = {
-            "va": "center",
-            "fontsize": 7.5,
-            "weight": weight,
-            "bbox": {"facecolor": "white", "linewidth": 0.0, "pad": 0.5},
-        }
+        weight, box = "bold" if one.outcome == SELECTED else "normal", {"facecolor": "white", "linewidth": 0.0, "pad": 0.5}
+        text, style = f"{size:.0f}  {one.outcome}", {"va": "center", "fontsize": 7.5, "weight": weight, "bbox": box}
         axes.annotate(text, (max(size, 0.0), row), (5, 0), textcoords="offset points", **style)
     labels = [f"{plain(one.name)}, {places(one.where)}" for one in members]
     axes.set_yticks(rows, [textwrap.shorten(label, 48, placeholder=" …") for label in labels])
     low, high = min(sizes.min(), 0.0), max(sizes.max(), 1.0)
     if high > _LARGE_GAIN:
         axes.set_xscale("symlog", linthresh=_LINEAR_GAIN)
-        axes.xaxis.set_major_formatter(_plain_ticks)
+        axes.xaxis.set_major_formatter("{x:g}")
         axes.set_xlim(3.0 * low, 40.0 * high)
     else:
         axes.set_xlim(low - (0.05 * (high - low) if low < 0.0 else 0.0), high + 0.25 * (high - low))
@@ -300,16 +286,12 @@ def _draw_moves(
     axes.set_yticks(rows, labels)
     axes.set_ylim(-0.6, len(gaps) - 0.4)
     axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(_plain_ticks)
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(_few_plain_ticks)
     axes.set_xlabel("error of replayed runs (1 = sensor noise)", fontsize=9)
     tidy(axes)
     axes.tick_params(which="minor", labelsize=7)
     return handles
-
-
-def _plain_ticks(value: float, position: float) -> str:
-    return f"{value:g}"
 
 
 def _few_plain_ticks(value: float, position: float) -> str:

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
-from wlr_gym.base.settings import SettingsModel
+from wlr_gym.base.settings import SettingsModel, parse_config
+from wlr_gym.base.text import json_text
 from wlr_gym.gap.analysis import (
     EQUIVALENT,
     FAILS_CROSS_VALIDATION,
@@ -33,7 +33,10 @@ from wlr_gym.gap.analysis import (
     Analysis,
     Calibrated,
     FoundEffect,
+    Recommendation,
+    Relation,
     Statistic,
+    Turning,
 )
 from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
@@ -130,15 +133,6 @@ class GapEntry(_Entry):
     cap: MaybeNumber = None
 
 
-class RelationEntry(_Entry):
-    """A relation of the model and the predicted improvement of the best law there, as a fall of minus two log posterior."""
-
-    name: str
-    law: str
-    formula: str
-    gain: Number
-
-
 class RunGapEntry(_Entry):
     """Error of one run: of the model as given, calibrated, and with all effects; ``reduction``: the share that they remove."""
 
@@ -198,17 +192,6 @@ class ConstancyEntry(StatisticEntry):
     pulled_most: PulledEntry
 
 
-class TurningEntry(_Entry):
-    """A signal's residual is periodic in its joint's angle; ``amplitude``: noise units, ``confidence``: selection frequency."""
-
-    joint: str
-    signal: str
-    order: int
-    share: float
-    amplitude: float
-    confidence: float
-
-
 class AdequacyEntry(_Entry):
     """Whether the final model is adequate: information, no decision. ``replicates`` sets of runs were made by it."""
 
@@ -238,13 +221,6 @@ class ThresholdEntry(_Entry):
     none: MaybeNumber = None
 
 
-class RecommendationEntry(_Entry):
-    """A run to record next."""
-
-    excitation: str
-    why: str
-
-
 class Result(_Entry):
     """Contents of ``result.json``."""
 
@@ -255,17 +231,17 @@ class Result(_Entry):
     separating_runs: list[str] = Field(default_factory=list)
     calibration: dict[str, CalibrationEntry]
     localisation: dict[str, LocalisationEntry]
-    relations: list[RelationEntry] = Field(default_factory=list)
+    relations: list[Relation] = Field(default_factory=list)
     gap: GapEntry | None
     run_gaps: list[RunGapEntry] = Field(default_factory=list)
     runs: RunsEntry
     patch: str
     detectable: dict[str, DetectableEntry] = Field(default_factory=dict)
     closure: str = ""
-    turning: TurningEntry | None = None
+    turning: Turning | None = None
     evidence: list[EvidenceEntry] = Field(default_factory=list)
     thresholds: list[ThresholdEntry] = Field(default_factory=list)
-    recommendations: list[RecommendationEntry] = Field(default_factory=list)
+    recommendations: list[Recommendation] = Field(default_factory=list)
     adequacy: AdequacyEntry | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel
 
 
@@ -308,12 +284,11 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
     """
     places = sorted(analysis.localisation, key=lambda place: -place.share)
     gap, as_it_is = analysis.gap, (
-        "calibration", "relations", "detectable", "turning", "evidence", "thresholds", "run_gaps", "channel_gaps", "intake",
+        "verdict", "relations", "detectable", "turning", "evidence", "thresholds", "run_gaps", "channel_gaps", "intake",
         "recommendations", "known_effects", "seconds",
     )  # fmt: skip
     content = {
         **{name: getattr(analysis, name) for name in as_it_is},
-        "verdict": analysis.verdict,
         "summary": sentence(analysis),
         "closure": closure(analysis),
         "effects": [_effect(effect) for effect in analysis.effects],
@@ -325,7 +300,7 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
             **vars(gap),
             "reduction": min(max(gap.reduction, 0.0), 1.0) if math.isfinite(gap.reduction) else 0.0,
             "reduction_signed": gap.reduction,
-            "reduction_ci95": gap.reduction_ci95 if all(map(math.isfinite, gap.reduction_ci95)) else None,
+            "reduction_ci95": _interval(*gap.reduction_ci95),
         },
         "runs": {"fit": analysis.fit_runs, "heldout": analysis.heldout_runs},
         "patch": str(patch),
@@ -334,7 +309,7 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
             "made_by": MADE_BY, "data": analysis.data, "date": _today(), "version": __version__, **analysis.provenance
         },
     }  # fmt: skip
-    return Result.model_validate(_plain(content))
+    return Result.model_validate_json(json_text(content))
 
 
 def write_result(analysis: Analysis, folder: Path) -> Path:
@@ -358,11 +333,7 @@ def _effect(effect: FoundEffect) -> dict[str, Any]:
         "name": effect.name,
         "where": effect.where,
         "parameters": {
-            name: {
-                "value": one.value,
-                "ci95": _interval(min(one.low, one.value), max(one.high, one.value)) if math.isfinite(one.low) else None,
-                "unit": one.unit,
-            }
+            name: {"value": one.value, "ci95": _interval(one.low, one.high, holding=one.value), "unit": one.unit}
             for name, one in effect.parameters.items()
         },
         "confidence": effect.confidence,
@@ -379,8 +350,11 @@ def _calibrated(moved: Calibrated) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _interval(low: float, high: float) -> list[float] | None:
-    return [low, high] if math.isfinite(low) and math.isfinite(high) else None
+def _interval(low: float, high: float, holding: float | None = None) -> list[float] | None:
+    """Return an interval, which holds a value where one is given; None where the data give none."""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return None
+    return [low, high] if holding is None else [min(low, holding), max(high, holding)]
 
 
 def _adequacy(found: Adequacy) -> dict[str, Any]:
@@ -397,21 +371,6 @@ def _adequacy(found: Adequacy) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
-    """Return nested records, mappings and sequences of plain JSON types; what is not finite becomes null."""
-    if is_dataclass(value):
-        return _plain(vars(value))
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float):
-        return finite(float(value))  # NumPy's are floats, too
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    return value if isinstance(value, str | bool | int | type(None)) else str(value)
-
-
 def _today() -> str:
     return datetime.now(UTC).date().isoformat()
 
@@ -426,15 +385,12 @@ def read_result(path: str | Path) -> Result:
         InputError: no such file, broken JSON, or contents that are not those of a result; the message names the place.
     """
     try:
-        return Result.model_validate(json.loads(Path(path).read_text(encoding="utf-8")))
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "content"
-        raise InputError(f"{path}: {place}: {first['msg']}") from None
+    return parse_config(Result, content, str(path))
 
 
 # ---- what a result leaves open ---------------------------------------------------------------------------------------
@@ -492,10 +448,14 @@ def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[Pat
         best.setdefault(entry.name, entry)
         total[entry.name] = total.get(entry.name, 0.0) + entry.probability
     whole = sum(total.values()) or 1.0
-    ranked = [
-        Explanation(name, share / whole, (*added, _added_effect(best[name])) if name in best else added)
-        for name, share in sorted(total.items(), key=lambda one: -one[1])
-    ]
+    ranked = []
+    for name, share in sorted(total.items(), key=lambda one: -one[1]):
+        effects = added
+        if name in best:
+            entry = best[name]
+            values = {key: value for key, value in entry.values.items() if value is not None}
+            effects = (*added, PatchEffect(name, tuple(entry.where), values, entry.formula, entry.units))
+        ranked.append(Explanation(name, share / whole, effects))
     chosen = next((entry.name for entry in entries if entry.outcome == SELECTED), NOTHING)
     rivals = {entry.name for entry in entries if entry.outcome == EQUIVALENT}
     if ranked[0].name == chosen and ranked[0].probability >= DECIDED and not rivals:
@@ -506,8 +466,3 @@ def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[Pat
             credible.add(one.name)
         reached += one.probability
     return [one for one in ranked if one.name in credible | rivals | {chosen}]
-
-
-def _added_effect(entry: EvidenceEntry) -> PatchEffect:
-    values = {name: value for name, value in entry.values.items() if value is not None}
-    return PatchEffect(entry.name, tuple(entry.where), values, entry.formula, entry.units)

@@ -24,7 +24,7 @@ import pandas as pd
 from numba import NumbaError, njit
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, check_folder, check_name, check_number, nearest
+from wlr_gym.base.errors import InputError, check_file, check_folder, check_name, check_number, nearest
 from wlr_gym.base.random import generator
 from wlr_gym.base.text import row_words
 from wlr_gym.gap.analysis import IntakeFinding
@@ -112,8 +112,7 @@ def load_rig(path: str | Path) -> Rig:
         InputError: no such file, one that does not run or has no ``RIG``, or a rig that contradicts itself, with what and why.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a Python file that defines RIG")
+    check_file(path)
     spec = importlib.util.spec_from_file_location(f"wlr_gym_rig_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
@@ -141,11 +140,15 @@ def check_rig(rig: Rig, place: str) -> None:
         parts = value.values() if isinstance(value, Mapping) else value
         _check(isinstance(value, whole) and all(isinstance(one, part) for one in parts), f"{place}: {field}", value, expected)
     columns = [column.name for column in rig.columns]
-    laws = [name for law in rig.laws.values() for name in law.parameters]
-    numbers = [*(one.name for one in rig.parameters), *laws]
+    numbers = [one.name for one in rig.parameters] + [name for law in rig.laws.values() for name in law.parameters]
     lists = {"states": list(rig.states), "inputs": list(rig.inputs), "columns": columns, "parameters and laws": numbers}
     for what, names in lists.items():
-        _check_names(names, f"{place}: {what}")
+        where = f"{place}: {what}"
+        _check(bool(names), where, names, "one name or more")
+        for name in names:
+            right = name.isidentifier() and not name.startswith("_") and not keyword.iskeyword(name)
+            _check(right, where, name, "a name of letters, digits and _, without _ in front, that Python does not use itself")
+            _check(names.count(name) == 1, where, name, "every name once")
     if shared := {CLOCK, *rig.inputs} & {*columns}:
         raise InputError(f"{place}: columns: '{min(shared)}' is an input or the clock: expected another name")
     for state, source in rig.states.items():
@@ -159,22 +162,14 @@ def check_rig(rig: Rig, place: str) -> None:
         inside = all(isinstance(end, float | int) for end in ends) and one.low <= one.nominal <= one.high
         _check(inside, f"{place}: parameters: {one.name}: nominal", one.nominal, f"a number in {one.low} to {one.high}")
     for law_name, law in rig.laws.items():
-        sizes = [one for one in law.parameters.values() if one.is_size]
-        _check(bool(sizes), f"{place}: laws: {law_name}: parameters", list(law.parameters), "one that says how large it is")
+        where, sizes = f"{place}: laws: {law_name}", [one for one in law.parameters.values() if one.is_size]
+        _check(bool(sizes), f"{where}: parameters", list(law.parameters), "one that says how large it is")
         for name, one in law.parameters.items():
-            _check_law_number(one, f"{place}: laws: {law_name}: {name}")
+            _check_law_number(one, f"{where}: {name}")
     check_number(f"{place}: disagreement", rig.disagreement, least=0.0)
     check_number(f"{place}: step", rig.step, "s", above=0.0)
     right = bool(rig.windows) and all(length > 0.0 for length in rig.windows)
     _check(right, f"{place}: windows", rig.windows, "lengths above 0")
-
-
-def _check_names(names: Sequence[str], place: str) -> None:
-    _check(bool(names), place, names, "one name or more")
-    for name in names:
-        right = name.isidentifier() and not name.startswith("_") and not keyword.iskeyword(name)
-        _check(right, place, name, "a name of letters, digits and _, without _ in front, that Python does not use itself")
-        _check(names.count(name) == 1, place, name, "every name once")
 
 
 def _check_law_number(one: EffectParameter, place: str) -> None:
@@ -222,6 +217,12 @@ def read_rig_runs(folder: str | Path, rig: Rig) -> list[RigRun]:
 
 
 def _run(path: Path, rig: Rig) -> RigRun:
+    def refuse(name: str, wrong: Any, expected: Callable[[int], str]) -> None:
+        """Refuse the first row of a column that is wrong (rows,)."""
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise InputError(f"{path}: column '{name}', {row_words(path, row)}: expected {expected(row)}")
+
     try:
         table = _READERS[path.suffix.lower()](path)
     except (OSError, ValueError) as error:
@@ -234,28 +235,16 @@ def _run(path: Path, rig: Rig) -> RigRun:
             raise InputError(f"{path}: column '{name}' holds {table[name].dtype}: expected numbers")
     if len(table) < LEAST_ROWS:
         raise InputError(f"{path}: {len(table)} rows: expected {LEAST_ROWS} or more")
-    t, inputs, measured = (table[names].to_numpy(np.float64) for names in ([CLOCK], list(rig.inputs), columns))
-    for name, values in ((CLOCK, t), *zip(rig.inputs, inputs.T, strict=True)):
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values.ravel())))
-            raise InputError(
-                f"{path}: column '{name}', {row_words(path, row)}: expected a finite number, as it drives the simulation"
-            )
-    if (np.diff(t[:, 0]) <= 0.0).any():
-        row = int(np.argmax(np.diff(t[:, 0]) <= 0.0)) + 1
-        raise InputError(
-            f"{path}: column '{CLOCK}', {row_words(path, row)}: expected times that rise, "
-            f"got {t[row, 0]:g} after {t[row - 1, 0]:g}"
-        )
+    for name in (CLOCK, *rig.inputs):
+        refuse(name, ~np.isfinite(table[name]), lambda _: "a finite number, as it drives the simulation")
+    t, inputs, measured = (table[names].to_numpy(np.float64) for names in (CLOCK, list(rig.inputs), columns))
+    falls = np.diff(t, prepend=-np.inf) <= 0.0
+    refuse(CLOCK, falls, lambda row: f"times that rise, got {t[row]:g} after {t[row - 1]:g}")
     for name, values in zip(columns, measured.T, strict=True):
-        if np.isinf(values).any():
-            raise InputError(
-                f"{path}: column '{name}', {row_words(path, int(np.argmax(np.isinf(values))))}: infinite; "
-                "expected a finite number"
-            )
+        refuse(name, np.isinf(values), lambda _: "a finite number, got an infinite one")
         if not np.isfinite(values).any():
             raise InputError(f"{path}: column '{name}' holds no number")
-    return RigRun(path.stem, t[:, 0], inputs, measured)
+    return RigRun(path.stem, t, inputs, measured)
 
 
 # ---- its equation compiled -------------------------------------------------------------------------------------------
