@@ -24,7 +24,6 @@ def test_output_that_cannot_be_a_folder(tmp_path, capsys, arguments):
     [
         (["train", "--max-minutes", "-1"], "--max-minutes -1: expected more than 0"),
         (["train", "--total-steps", "64"], "--total-steps goes with --resume; of a new training: --set total_steps=64"),
-        (["evaluate", "do_nothing", "--seed", "-1"], "--seed -1: expected a number from 0 to 4294967295"),
     ],
 )
 def test_numbers_out_of_range(tmp_path, capsys, arguments, words):

@@ -84,37 +84,38 @@ def runs(tmp_path_factory):
     return folder
 
 
-def refused(words, capsys, *, option="--out"):
-    """Run a command twice: the second time it is refused, and what is there is as before."""
-    assert main(words) == 0
-    out = Path(words[words.index(option) + 1])
+EVALUATE = "evaluate do_nothing --baselines --episodes 2 --randomization none --no-progress --out OUT/card"
+COMPARE = "compare --excitation straight --seconds 0.2 --no-plots --out OUT/c"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        EVALUATE,
+        "replay RUNS --no-plots --out OUT/replayed",
+        "export RUNS --to rosbag2 --out OUT/bags",
+        f"{COMPARE} --plants gibbs_appell gibbs_appell:physics_step=0.0005",
+        "record --excitation straight --commands-only --out OUT/motions",
+        "play --seconds 0.1 --size 64 64 --randomization none --video OUT/film.webp",
+    ],
+    ids=lambda words: words.partition(" ")[0],
+)
+def test_results_are_not_replaced(words, tmp_path, runs, capsys):
+    """The second time a command is refused, and what is there is as before."""
+    if words.startswith("export"):
+        pytest.importorskip("mcap")
+    command = words.replace("RUNS", str(runs)).replace("OUT", str(tmp_path)).split()
+    option = "--video" if "--video" in command else "--out"
+    assert main(command) == 0
+    out = Path(command[command.index(option) + 1])
     before = {path: path.read_bytes() for path in ([out] if out.is_file() else out.rglob("*")) if path.is_file()}
     capsys.readouterr()
-    assert main(words) == 2
+    assert main(command) == 2
     error = capsys.readouterr().err
     assert f"{option} {out}" in error
     assert "exists; choose another name, or replace it with --force" in error
     assert before == {path: path.read_bytes() for path in before}
-    assert main([*words, "--force"]) == 0
-
-
-def test_a_card_is_not_replaced(tmp_path, capsys):
-    words = ["evaluate", "do_nothing", "--baselines", "--episodes", "2", "--randomization", "none", "--no-progress"]
-    refused([*words, "--out", str(tmp_path / "card")], capsys)
-
-
-def test_a_replay_is_not_replaced(tmp_path, runs, capsys):
-    refused(["replay", str(runs), "--no-plots", "--out", str(tmp_path / "replayed")], capsys)
-
-
-def test_exported_runs_are_not_replaced(tmp_path, runs, capsys):
-    pytest.importorskip("mcap")
-    refused(["export", str(runs), "--to", "rosbag2", "--out", str(tmp_path / "bags")], capsys)
-
-
-def test_a_comparison_is_not_replaced(tmp_path, capsys):
-    words = ["compare", "--excitation", "straight", "--seconds", "0.2", "--no-plots"]
-    refused([*words, "--plants", "gibbs_appell", "gibbs_appell:physics_step=0.0005", "--out", str(tmp_path / "c")], capsys)
+    assert main([*command, "--force"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -131,15 +132,6 @@ def test_nothing_is_written_among_results_of_another_command(tmp_path, runs, cap
     assert main([*command.replace("RUNS", str(runs)).split(), "--out", str(tmp_path)]) == 2
     assert f"--out {tmp_path}: '{there}' of another command is in it; choose another folder" in capsys.readouterr().err
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(there, "of another")]
-
-
-def test_setpoints_are_not_replaced(tmp_path, capsys):
-    refused(["record", "--excitation", "straight", "--commands-only", "--out", str(tmp_path / "motions")], capsys)
-
-
-def test_a_film_is_not_replaced(tmp_path, capsys):
-    words = ["play", "--seconds", "0.1", "--size", "64", "64", "--randomization", "none"]
-    refused([*words, "--video", str(tmp_path / "film.webp")], capsys, option="--video")
 
 
 def test_an_analysis_a_policy_and_a_picture_are_not_replaced(tmp_path, runs, capsys):

@@ -157,27 +157,19 @@ def test_delay_shifts_the_response_also_by_parts_of_a_step():
 # --- effects
 
 
-def blocked(**changes):
-    """Motor at full supply against a brake: its torque and the friction that holds it."""
-    return run(0.01, goal=1e3, coulomb=50.0, **FREE, **changes)[-1]
-
-
-def test_saturated_torque_falls_behind_the_current():
-    current = 7.4 / R
-    assert blocked(saturation=0.6)[TORQUE] == pytest.approx(K * current / (1.0 + 0.6 * current), rel=1e-12)
-
-
-def test_torque_limit_limits_and_leaves_less_alone():
-    assert blocked(torque_limit=0.3)[TORQUE] == pytest.approx(0.3, rel=1e-12)
-    assert blocked(torque_limit=0.3, supply=1.0)[TORQUE] == pytest.approx(K / R, rel=1e-12)
-
-
-def test_warm_winding_has_more_resistance():
-    assert blocked(thermal=0.0039, warmth=20.0)[TORQUE] == pytest.approx(K / R * 7.4 / 1.078, rel=1e-12)
-
-
-def test_weak_motor_gives_its_share():
-    assert blocked(torque_scale=0.7)[TORQUE] == pytest.approx(0.7 * K / R * 7.4, rel=1e-12)
+@pytest.mark.parametrize(
+    ("changes", "torque"),
+    [
+        ({"saturation": 0.6}, K / R * 7.4 / (1.0 + 0.6 * 7.4 / R)),  # falls behind the current
+        ({"torque_limit": 0.3}, 0.3),
+        ({"torque_limit": 0.3, "supply": 1.0}, K / R),  # less is left alone
+        ({"thermal": 0.0039, "warmth": 20.0}, K / R * 7.4 / 1.078),
+        ({"torque_scale": 0.7}, 0.7 * K / R * 7.4),
+    ],
+)
+def test_what_changes_the_motors_torque(changes, torque):
+    """Motor at full supply against a brake."""
+    assert run(0.01, goal=1e3, coulomb=50.0, **FREE, **changes)[-1, TORQUE] == pytest.approx(torque, rel=1e-12)
 
 
 @pytest.mark.parametrize(

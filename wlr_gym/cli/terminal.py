@@ -73,18 +73,11 @@ def print_table(
     if title:
         console.print(title, style="bold", markup=False, highlight=False)
     while columns:
-        count, gap = _fitting([column.least for column in columns], console.width)
+        least = list(itertools.accumulate(column.least for column in columns))
+        gap = next((gap for gap in _GAPS if least[-1] + gap * (len(columns) - 1) <= console.width), _GAPS[0])
+        count = max(2, sum(width + gap * k <= console.width for k, width in enumerate(least)))
         _print_columns(console, columns[:count], gap, styles)
         columns = [columns[0], *columns[count:]] if count < len(columns) else []
-
-
-def _fitting(least: Sequence[int], width: int) -> tuple[int, int]:
-    """Return how many of the columns fit beside each other, two at least, and the gap between them."""
-    for gap in _GAPS:
-        if sum(least) + gap * (len(least) - 1) <= width:
-            return len(least), gap
-    fitting = [k for k in range(2, len(least)) if sum(least[:k]) + _GAPS[0] * (k - 1) <= width]
-    return max(fitting, default=min(2, len(least))), _GAPS[0]
 
 
 def _print_columns(console: Console, columns: Sequence[_Column], gap: int, styles: Sequence[str]) -> None:

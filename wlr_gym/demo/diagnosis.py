@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from wlr_gym.data import Run
     from wlr_gym.gap.analysis import Analysis
-    from wlr_gym.gap.report.result import EffectEntry, GapEntry, RunGapEntry
+    from wlr_gym.gap.report.result import EffectEntry, GapEntry
     from wlr_gym.physics.effects import PatchEffect
 
 DRIVE_TITLE = "3. A robot with a hidden fault"
@@ -214,31 +214,25 @@ def check(demo: Demo, tell: Tell) -> Section:
         "The runs that no fit has seen: error of the gap report (1 = sensor noise), and what the effects remove of what is "
         "above the noise floor."
     )
-    html += _held_out_runs(heldout) + heading("The hidden fault") + _revealed(hidden, result.effects, answer)
+    rows = []
+    for one in heldout:
+        errors = [error(_number(value)) for value in (one.before, one.calibrated, one.after)]
+        rows.append((one.run, *errors, percent(_number(one.reduction))))
+    html += table(("held-out run", "as given", "calibrated", "with effects", "removed"), rows, range(1, 5))
+    html += heading("The hidden fault") + _revealed(hidden, result.effects, answer)
+    said = "No run was held out."
+    if (gap := result.gap) is not None:
+        steps = (error(_number(value)) for value in (gap.heldout_calibrated, gap.heldout_after, gap.noise_floor))
+        said = "Error of the held-out runs: {} calibrated, {} with what was found; noise floor {}.".format(*steps)
     worse = [one.run for one in heldout if _number(one.after) > _number(one.calibrated)]
     not_good = [*answer.outside, *([f"the effects make the error of {listed(worse)} larger"] if worse else [])]
     verdict = SHOWN if answer.right and fell(result.gap) else NOT_SHOWN
-    return Section(CHECK_TITLE, f"{answer.sentence} {_held_out(result.gap)}", html, verdict, not_good)
+    return Section(CHECK_TITLE, f"{answer.sentence} {said}", html, verdict, not_good)
 
 
 def fell(gap: GapEntry | None) -> bool:
     """Whether the effects make the error of the held-out runs smaller."""
     return gap is not None and _number(gap.heldout_after) < _number(gap.heldout_calibrated)
-
-
-def _held_out(gap: GapEntry | None) -> str:
-    if gap is None:
-        return "No run was held out."
-    calibrated, after, floor = (error(_number(value)) for value in (gap.heldout_calibrated, gap.heldout_after, gap.noise_floor))
-    return f"Error of the held-out runs: {calibrated} calibrated, {after} with what was found; noise floor {floor}."
-
-
-def _held_out_runs(heldout: Sequence[RunGapEntry]) -> str:
-    rows = []
-    for one in heldout:
-        errors = [error(_number(value)) for value in (one.before, one.calibrated, one.after)]
-        rows.append((one.run, *errors, percent(_number(one.reduction))))
-    return table(("held-out run", "as given", "calibrated", "with effects", "removed"), rows, range(1, 5))
 
 
 def _number(value: float | None) -> float:

@@ -41,6 +41,7 @@ _DOCS = (
     "Documentation, in the repository: docs/quickstart.md; docs/policies.md (sections 1 and 2); docs/gap.md (3 to 5); "
     "docs/adapt.md (6); docs/glossary.md (every term)."
 )
+_EMULATED = "Everything here is simulated or emulated; no hardware was driven."
 
 
 def write_page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> Path:
@@ -53,35 +54,30 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
     """Return the page."""
     worst = max((one.verdict for one in sections), key=_ORDER.index, default=SKIPPED)
     title = "wlr_gym: learn, drive, find what the simulator lacks, train on"
-    lines = "".join(_line(one) for one in sections)
+    lines = [
+        f'<li>{_MARKS[one.verdict]} <a href="#{anchor(one.title)}"><b>{escape(one.title)}</b></a> '
+        f"{escape(one.headline or _WITHOUT[one.verdict])}{_not_good(one)}</li>"
+        for one in sections
+    ]
+    files = [link(demo, demo.out / path, text) for path, text in _FILES.items() if (demo.out / path).exists()]
     words = f"{'. '.join(f'{term.capitalize()}: {meaning}' for term, meaning in TERMS.items())}. {_MEASURES}"
-    stopped = "<p><b>Stopped before it was over: the page has what was made until then.</b></p>" if interrupted else ""
-    header = (
-        f'<header>\n<p class="label">wlr demo</p>\n<h1>{escape(title)}</h1>\n</header>\n{stopped}'
-        f'<ul style="list-style: none; padding: 0">{lines}</ul>\n{_files(demo)}'
-        f'<p class="small">{escape(words)}</p>\n<p class="small">{escape(_DOCS)}</p>\n'
-        '<p class="small">Everything here is simulated or emulated; no hardware was driven.</p>'
-    )
+    header = [
+        f'<header>\n<p class="label">wlr demo</p>\n<h1>{escape(title)}</h1>\n</header>',
+        "<p><b>Stopped before it was over: the page has what was made until then.</b></p>" if interrupted else "",
+        f'<ul style="list-style: none; padding: 0">{"".join(lines)}</ul>',
+        f'<p class="small">Files: {", ".join(files)}.</p>' if files else "",
+        *(f'<p class="small">{escape(text)}</p>' for text in (words, _DOCS, _EMULATED)),
+    ]
     footer = (
         f"<footer><p>wlr_gym {escape(__version__)}, seed {demo.seed}: the same seed gives the same numbers on one machine. "
         f"Another hidden fault: <code>wlr demo --seed {demo.seed + 1}</code>.</p></footer>"
     )
     body = [section(one.title, _not_good(one), one.html) for one in sections]
-    return document(title, _COLOURS[worst], [header, *body, footer])
-
-
-def _line(one: Section) -> str:
-    title, text = f"<b>{escape(one.title)}</b>", escape(one.headline or _WITHOUT[one.verdict])
-    return f'<li>{_MARKS[one.verdict]} <a href="#{anchor(one.title)}">{title}</a> {text}{_not_good(one)}</li>'
+    return document(title, _COLOURS[worst], [*header, *body, footer])
 
 
 def _not_good(one: Section) -> str:
     return f'<p class="small"><b>Not good:</b> {escape("; ".join(one.not_good))}.</p>' if one.not_good else ""
-
-
-def _files(demo: Demo) -> str:
-    links = [link(demo, demo.out / path, text) for path, text in _FILES.items() if (demo.out / path).exists()]
-    return f'<p class="small">Files: {", ".join(links)}.</p>\n' if links else ""
 
 
 _WITHOUT = {SHOWN: "", NOT_SHOWN: "Not shown.", SKIPPED: "Left out.", FAILED: "Failed."}

@@ -163,9 +163,19 @@ def compare(demo: Demo, tell: Tell) -> Section:
         "of the range of commands, rms over the episode. Excess slip: mean over wheels and time. Mean ± half of the 95 % "
         "confidence interval."
     )
-    html += "".join(heading(said) + _table(card, label) + paragraph(_against(card, label)) for label, said in FLOORS.items())
+    found = []
+    for label, floor in FLOORS.items():
+        headings, *body = rows(card.scores[label], _metrics(card), short=True)
+        errors = {name: own["tracking_error"] for name, own in card.comparison[label].items()}
+        others = [f"{name} by {e.mean:.0f} % (95 % interval {e.low:.0f} to {e.high:.0f})" for name, e in errors.items()]
+        paired = f"Paired episode by episode, the tracking error of {OURS} is lower (minus: higher) than that of "
+        html += heading(floor) + table(headings, body, range(2, len(headings))) + paragraph(f"{paired}{'; '.join(others)}.")
+        blind = errors[BLIND]
+        lower = f"{abs(blind.mean):.0f} % {'lower' if blind.mean > 0 else 'higher'}"
+        found.append(f"{lower if blind.excludes_zero else 'not distinguishable'} {_WHERE[label]}")
+    headline = f"The tracking error of a policy that observes its slip, against the same training without: {'; '.join(found)}."
     better = all(card.comparison[label][BLIND]["tracking_error"].low > 0.0 for label in FLOORS)
-    return Section(ICE_TITLE, _headline(card), html + _film(demo, tell), SHOWN if better else NOT_SHOWN, falls_short(card))
+    return Section(ICE_TITLE, headline, html + _film(demo, tell), SHOWN if better else NOT_SHOWN, falls_short(card))
 
 
 def _play(demo: Demo, tell: Tell) -> Card:
@@ -188,11 +198,6 @@ def _play(demo: Demo, tell: Tell) -> Card:
 
 def _metrics(card: Card) -> list[Metric]:
     return [metric for metric in card.metrics if metric.key in SHOWN_METRICS]
-
-
-def _table(card: Card, label: str) -> str:
-    headings, *body = rows(card.scores[label], _metrics(card), short=True)
-    return table(headings, body, range(2, len(headings)))
 
 
 def falls_short(card: Card) -> list[str]:
@@ -224,21 +229,6 @@ def _listed(card: Card, label: str, policies: tuple[str, str], metrics: Iterable
             for one in metrics
         ]
     )
-
-
-def _against(card: Card, label: str) -> str:
-    errors = {name: own["tracking_error"] for name, own in card.comparison[label].items()}
-    others = [f"{name} by {e.mean:.0f} % (95 % interval {e.low:.0f} to {e.high:.0f})" for name, e in errors.items()]
-    return f"Paired episode by episode, the tracking error of {OURS} is lower (minus: higher) than that of {'; '.join(others)}."
-
-
-def _headline(card: Card) -> str:
-    said = []
-    for label, where in _WHERE.items():
-        better = card.comparison[label][BLIND]["tracking_error"]
-        lower = f"{abs(better.mean):.0f} % {'lower' if better.mean > 0 else 'higher'}"
-        said.append(f"{lower if better.excludes_zero else 'not distinguishable'} {where}")
-    return f"The tracking error of a policy that observes its slip, against the same training without: {'; '.join(said)}."
 
 
 def _film(demo: Demo, tell: Tell) -> str:

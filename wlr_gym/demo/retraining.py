@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +13,6 @@ from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, SKIPPED, Demo, Sec
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, places, plain
 from wlr_gym.learning.evaluation import Subject
-
-if TYPE_CHECKING:
-    from wlr_gym.learning.adaptation.driving import EmulatedRobot
-    from wlr_gym.learning.adaptation.state import Progress
 
 TITLE = "6. What training on wins back"
 OLD, NEW = "old policy", "trained on"
@@ -31,7 +27,7 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     from wlr_gym.gap.decision import Decided, History
     from wlr_gym.gap.report.result import RESULT_FILE, read_result
     from wlr_gym.learning.adaptation.adapt import state_uncertainty
-    from wlr_gym.learning.adaptation.driving import EmulatedRobot, drive_after
+    from wlr_gym.learning.adaptation.driving import AFTER, EmulatedRobot, drive_after, episodes_of, errors_of, seeds_of
     from wlr_gym.learning.adaptation.retraining import train_on, trained_policy
     from wlr_gym.learning.adaptation.state import Asked, Progress
     from wlr_gym.physics.effects import load_patch
@@ -61,7 +57,8 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING * share)
     after = drive_after(progress, EmulatedRobot(own, hidden), trained_policy(progress))
     progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING + _WITHOUT * share)
-    numbers = after.numbers | {"healthy": _without_fault(progress, EmulatedRobot(own))}
+    driven = episodes_of(progress, "without_fault", {"old": POLICY}, EmulatedRobot(own), seeds_of(AFTER, asked))
+    numbers = after.numbers | {"healthy": errors_of(driven["old"]).tolist()}
     headline, verdict = outcome(numbers)
     said, not_good = won_back(numbers)
     html = paragraph(
@@ -77,15 +74,6 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     )
     html += _episodes(numbers) + _said(after) + paragraph(said) + _film(demo, hidden, numbers, tell)
     return Section(TITLE, headline, html, verdict, not_good)
-
-
-def _without_fault(progress: Progress, robot: EmulatedRobot) -> list[float]:
-    """Return the old policy's tracking errors on the same robot without the fault, in the episodes that both have driven."""
-    from wlr_gym.learning.adaptation.driving import AFTER, episodes_of, errors_of, seeds_of
-
-    asked = progress.asked
-    driven = episodes_of(progress, "without_fault", {"old": asked.policy}, robot, seeds_of(AFTER, asked))
-    return errors_of(driven["old"]).tolist()
 
 
 def won_back(numbers: dict[str, Any]) -> tuple[str, list[str]]:
@@ -119,7 +107,7 @@ def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
         numbers: tracking errors ``old`` and ``new`` of the same episodes, ``better_percent`` and ``better_ci95``.
     """
     better, (low, high) = numbers["better_percent"], numbers["better_ci95"]
-    before, after = (f"{_mean(numbers[name]):.3f}" for name in ("old", "new"))
+    before, after = (f"{np.mean(numbers[name]):.3f}" for name in ("old", "new"))
     interval, verdict, tail = f"95 % interval {low:.0f} to {high:.0f} %", NOT_SHOWN, ""
     if low > 0.0:
         change, verdict = f"{better:.0f} % lower", SHOWN
@@ -131,10 +119,6 @@ def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
         tail = " No difference beyond the interval."
     text = f"Tracking error on the robot with the fault {before} before and {after} after training on: {change}"
     return f"{text} ({interval}, {len(numbers['old'])} pairs of episodes).{tail}", verdict
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)
 
 
 def _said(step: Any) -> str:
@@ -156,7 +140,7 @@ def _film(demo: Demo, hidden: Any, numbers: dict[str, Any], tell: Tell) -> str:
     sources = ((OLD, POLICY, "old"), (NEW, str(demo.adapted / TRAINING / "policy"), "new"))
     fault = listed([f"{plain(one.name)}, {places(one.where)}" for one in hidden.effects])
     tell("film: the old policy beside the new one", _TRAINING + _DRIVING + _WITHOUT)
-    subjects = [Subject(f"{name}: tracking error {_mean(numbers[key]):.3f}", (source,)) for name, source, key in sources]
+    subjects = [Subject(f"{name}: tracking error {np.mean(numbers[key]):.3f}", (source,)) for name, source, key in sources]
     path, robot = demo.out / "trained_on.webp", {"randomization": "none", "effects": hidden, **having(())}
     options = {"schedule": SCHEDULE, "title": f"fault: {fault}"}
     return filmed(path, demo, subjects, 0.5 * demo.film_seconds, robot, _CAPTION, **options)

@@ -287,15 +287,11 @@ def _draw_moves(
     axes.set_ylim(-0.6, len(gaps) - 0.4)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(_few_plain_ticks)
+    axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
     axes.set_xlabel("error of replayed runs (1 = sensor noise)", fontsize=9)
     tidy(axes)
     axes.tick_params(which="minor", labelsize=7)
     return handles
-
-
-def _few_plain_ticks(value: float, position: float) -> str:
-    return f"{value:g}" if f"{value:.0e}"[0] in "25" else ""
 
 
 def _channels(gaps: Sequence[ChannelGap], *, with_effects: bool) -> Figure:

@@ -15,7 +15,6 @@ from wlr_gym.gap.analysis import (
     UNKNOWN,
     Adequacy,
     Analysis,
-    FoundEffect,
     GapFigures,
     ParameterEstimate,
     Turning,
@@ -290,15 +289,13 @@ def _effect_found(analysis: Analysis) -> str:
         for effect in analysis.effects
     ]
     lost = names[0] if len(names) == 1 else f"{len(names)} effects: {listed(names)}"
-    return f"The model lacks {lost}{_improvement(analysis)}{_doubt(analysis)}."
-
-
-def _doubt(analysis: Analysis) -> str:
-    """Which other names these data leave possible, each beside the effect that it may stand for."""
-    doubts = [(plain(group.names[0]), _others(group.names, analysis.effects)) for group in analysis.equivalent]
-    several = len(analysis.effects) > 1
-    told = [f"{chosen if several else 'it'} from {others}" for chosen, others in doubts if others]
-    return f"; these data do not distinguish {', nor '.join(told)}" if told else ""
+    doubts = []  # other names that these data leave possible, each beside the effect that it may stand for
+    for group in analysis.equivalent:
+        others = [plain(name) for name in group.names if name not in {effect.name for effect in analysis.effects}]
+        if others:
+            doubts.append(f"{plain(group.names[0]) if len(names) > 1 else 'it'} from {listed(others, 'or')}")
+    doubt = f"; these data do not distinguish {', nor '.join(doubts)}" if doubts else ""
+    return f"The model lacks {lost}{_improvement(analysis)}{doubt}."
 
 
 def _unknown(analysis: Analysis) -> str:
@@ -357,11 +354,6 @@ def _improvement(analysis: Analysis) -> str:
 def removed(analysis: Analysis) -> str:
     """Return ``95 % (95 % interval 91 to 97 %)``: what the effects remove of the avoidable error; negative = they add to it."""
     return f"{percent(analysis.gap.reduction if analysis.gap else math.nan)} ({interval(analysis)})"
-
-
-def _others(names: Sequence[str], effects: Sequence[FoundEffect]) -> str:
-    chosen = {effect.name for effect in effects}
-    return listed([plain(name) for name in names if name not in chosen], "or")
 
 
 _SENTENCES: dict[str, Callable[[Analysis], str]] = {

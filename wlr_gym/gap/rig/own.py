@@ -428,8 +428,10 @@ class OwnRigProblem(RigProblem):
             moved = [self._simulated(values, run, length, shift=step) for step in np.diag(steps)]
             changes = np.stack([(one - plain) / self._noise for one in moved], axis=2)
             changes = np.where(missing[:, :, None] | ~np.isfinite(changes), 0.0, changes)
-            columns = slice(k * count, (k + 1) * count)
-            found += [(window, columns, _basis(changes[window])) for window in _windows(self._runs[run].t, length)]
+            for rows in _windows(self._runs[run].t, length):
+                left, sizes, _ = np.linalg.svd(changes[rows].reshape(-1, len(steps)), full_matrices=False)
+                basis = left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
+                found.append((rows, slice(k * count, (k + 1) * count), basis))
         return found
 
     def without_first_states(self, run: int, residuals: Array) -> Array:
@@ -448,7 +450,12 @@ class OwnRigProblem(RigProblem):
         """
         values = self._values(setting)
         clean = [self._simulated(values, run, math.inf) for run in runs]
-        stays = all(self._stays(run, one) for run, one in zip(runs, clean, strict=True))
+        stays = True
+        for run, simulated in zip(runs, clean, strict=True):
+            measured = self._runs[run].measured
+            spans = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
+            away = np.abs(simulated - np.nanmean(measured, axis=0))
+            stays &= bool((away <= FARTHEST * (spans + self._noise)).all())  # what is not finite does not
         draws = [generator(run, "gap", "floor") for run in runs]
         for _ in range(count):
             drawn = [self._noise * rng.standard_normal(one.shape) for one, rng in zip(clean, draws, strict=True)]
@@ -459,13 +466,6 @@ class OwnRigProblem(RigProblem):
             made = [replace(self._runs[run], measured=one + own) for run, one, own in read]
             twin = OwnRigProblem(made, self._compiled, self.known)
             yield [residual[0] for residual in twin.residuals([setting], range(len(made)))]
-
-    def _stays(self, run: int, simulated: Array) -> bool:
-        """Whether a simulation from the first row on (rows, columns) stays near what was measured."""
-        measured = self._runs[run].measured
-        spans = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
-        away = np.abs(simulated - np.nanmean(measured, axis=0))
-        return bool(np.isfinite(simulated).all() and (away <= FARTHEST * (spans + self._noise)).all())
 
     def _remade_windows(self, values: dict[str, float], run: int, drawn: Array) -> Array:
         """Residuals (rows, signals) of windows that the model itself made, each from its first state; ``drawn``: noise."""
@@ -498,12 +498,6 @@ def _windows(t: Array, length: float) -> list[slice]:
     window = np.floor((t - t[0]) / length + 1e-9)
     edges = [*np.flatnonzero(np.diff(window, prepend=-1.0)).tolist(), len(t)]
     return [slice(first, last) for first, last in itertools.pairwise(edges)]
-
-
-def _basis(changes: Array) -> Array:
-    """Orthonormal basis (rows x columns, at most states) of changes (rows, columns, states); none where nothing changes."""
-    left, sizes, _ = np.linalg.svd(changes.reshape(-1, changes.shape[-1]), full_matrices=False)
-    return left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
 
 
 def _state(run: RigRun, rig: Rig, name: str) -> Array:

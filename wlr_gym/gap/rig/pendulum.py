@@ -426,9 +426,12 @@ class Replay:
         time = recording.t
         count = max(2, int((time[-1] - time[0]) / STEP) + 1)
         self._grid = time[0] + STEP * np.arange(count + 1)
-        self.goals: Array = _mean_setpoints(recording, self._grid)
+        written = time - GOAL_LEAD  # each row's goal holds until the next is written
+        edges = np.concatenate([[self._grid[0] - 1.0], written[1:], [self._grid[-1] + 1.0]])
+        integral = np.concatenate([[0.0], np.cumsum(np.diff(edges) * recording.goal)])
+        self.goals: Array = np.diff(np.interp(self._grid, edges, integral)) / STEP
         middle = self._grid[:-1] + 0.5 * STEP
-        row = np.clip(np.searchsorted(time - GOAL_LEAD, middle, side="right") - 1, 0, len(time) - 1)
+        row = np.clip(np.searchsorted(written, middle, side="right") - 1, 0, len(time) - 1)
         self._inputs = np.stack(
             [
                 np.interp(middle, time, recording.supply),
@@ -460,14 +463,6 @@ class Replay:
         found = simulate(pack(models, self.recording, STEP), lag, self.goals, self._inputs, starts, begun, STEP)
         below, above = found[:, self._below], found[:, self._below + 1]
         return below + (above - below) * self._share[:, None]
-
-
-def _mean_setpoints(recording: Recording, grid: Array) -> Array:
-    """Mean goal within every substep: each row's goal holds until the next is written."""
-    written = recording.t - GOAL_LEAD
-    edges = np.concatenate([[grid[0] - 1.0], written[1:], [grid[-1] + 1.0]])
-    integral = np.concatenate([[0.0], np.cumsum(np.diff(edges) * recording.goal)])
-    return np.diff(np.interp(grid, edges, integral)) / STEP
 
 
 # ---- the problem -----------------------------------------------------------------------------------------------------
