@@ -20,71 +20,31 @@ from wlr_gym.gap.selection.search import Round
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.robot import JOINTS, LEGS
 
-_FRICTION = frozenset({"coulomb_friction", "viscous_friction", "stribeck_friction", "load_dependent_friction"})
-_PULL = frozenset({"floor_slope", "external_force", "tether"})
+_FRICTION = ("coulomb_friction", "viscous_friction", "stribeck_friction", "load_dependent_friction")
+_PULL = ("floor_slope", "external_force", "tether")
 #: One of the first and one of the second -> excitation that separates them, and why it does.
-_SEPARATED_BY: Sequence[tuple[frozenset[str], frozenset[str], str, str]] = (
-    (
-        frozenset({"rolling_resistance"}),
-        _FRICTION,
-        "straight",
-        "repeat it with extra weight on the body: rolling resistance grows with the load on a wheel, gear friction does not",
-    ),
-    (
-        frozenset({"rolling_resistance"}),
-        _PULL,
-        "turns",
-        "turn round and drive back: a pull keeps its direction on the floor, resistance turns with the robot",
-    ),
-    (
-        _PULL,
-        frozenset({"com_offset", "payload", "imu_misalignment"}),
-        "turns",
-        "a full turn on the spot: what belongs to the floor changes sign with the heading, what belongs to the body does not",
-    ),
-    (
-        frozenset({"com_offset"}),
-        frozenset({"payload"}),
-        "chirp",
-        "an extra mass also slows every acceleration down, a displaced centre does not",
-    ),
-    (
-        frozenset({"command_delay"}),
-        frozenset({"camera_delay", "backlash", "viscous_friction"}),
-        "chirp",
-        "the phase of a delay grows with frequency at full amplitude; friction and play lose amplitude",
-    ),
-    (
-        frozenset({"backlash"}),
-        frozenset({"stribeck_friction", "coulomb_friction"}),
-        "stop_and_go",
-        "reversals at two loads: play is constant in angle and vanishes under a steady load, friction is constant in torque",
-    ),
-    (
-        frozenset({"weak_motor"}),
-        frozenset({"supply_sag", "load_dependent_friction"}),
-        "rear_legs",
-        "drive and be driven: friction changes its sign with the speed, a weak motor does not; sag needs a high total current",
-    ),
-    (
-        frozenset({"wheel_radius_error"}),
-        frozenset({"camera_misalignment", "tyre_creep"}),
-        "turns",
-        "a wrong radius turns the robot where wheels differ; a wrong camera scale does not",
-    ),
-    (
-        frozenset({"friction_anisotropy", "slip_weakening"}),
-        frozenset({"friction_level", "friction_asymmetry", "tyre_creep"}),
-        "turns",
-        "spins in place at several speeds beside straight braking: lateral and longitudinal grip are used apart",
-    ),
-    (
-        frozenset({"coulomb_friction"}),
-        frozenset({"viscous_friction", "stribeck_friction"}),
-        "straight",
-        "several steady speeds, one of them near zero",
-    ),
-)
+_SEPARATED_BY: Sequence[tuple[Sequence[str], Sequence[str], str, str]] = (
+    (("rolling_resistance",), _FRICTION, "straight",
+     "repeat it with extra weight on the body: rolling resistance grows with the load on a wheel, gear friction does not"),
+    (("rolling_resistance",), _PULL, "turns",
+     "turn round and drive back: a pull keeps its direction on the floor, resistance turns with the robot"),
+    (_PULL, ("com_offset", "payload", "imu_misalignment"), "turns",
+     "a full turn on the spot: what belongs to the floor changes sign with the heading, what belongs to the body does not"),
+    (("com_offset",), ("payload",), "chirp",
+     "an extra mass also slows every acceleration down, a displaced centre does not"),
+    (("command_delay",), ("camera_delay", "backlash", "viscous_friction"), "chirp",
+     "the phase of a delay grows with frequency at full amplitude; friction and play lose amplitude"),
+    (("backlash",), ("stribeck_friction", "coulomb_friction"), "stop_and_go",
+     "reversals at two loads: play is constant in angle and vanishes under a steady load, friction is constant in torque"),
+    (("weak_motor",), ("supply_sag", "load_dependent_friction"), "rear_legs",
+     "drive and be driven: friction changes its sign with the speed, a weak motor does not; sag needs a high total current"),
+    (("wheel_radius_error",), ("camera_misalignment", "tyre_creep"), "turns",
+     "a wrong radius turns the robot where wheels differ; a wrong camera scale does not"),
+    (("friction_anisotropy", "slip_weakening"), ("friction_level", "friction_asymmetry", "tyre_creep"), "turns",
+     "spins in place at several speeds beside straight braking: lateral and longitudinal grip are used apart"),
+    (("coulomb_friction",), ("viscous_friction", "stribeck_friction"), "straight",
+     "several steady speeds, one of them near zero"),
+)  # fmt: skip
 #: Excitations in which no leg moves, or none at the front.
 _LEGS_STAND, _FRONT_STANDS = ("straight", "turns", "s_curve", "stop_and_go"), ("rear_legs",)
 #: Why an excitation separates effects at legs, where it is not for the reason that holds at wheels.
@@ -151,12 +111,10 @@ def recommend(
             why = f"{name} fails cross-validation: runs left out of the fit do not show it"
             found.setdefault(motion_for(motions[name], where), why)
     if verdict != EFFECT_FOUND:
-        visible: dict[str, bool] = {}
-        for score in last.scores:
-            visible[score.candidate.name] = visible.get(score.candidate.name, False) or score.visible
+        visible = {score.candidate.name for score in last.scores if score.visible}
         blind: dict[str, list[str]] = {}
-        for name, shown in visible.items():
-            if not shown and name in motions:
+        for name in dict.fromkeys(score.candidate.name for score in last.scores):
+            if name not in visible and name in motions:
                 blind.setdefault(motions[name], []).append(name)
         for excitation, names in blind.items():
             found.setdefault(excitation, f"would show {', '.join(sorted(names))}, of which these data show nothing")
@@ -176,9 +134,6 @@ def record_commands(excitations: Iterable[str]) -> list[str]:
 
 # ---- relations -------------------------------------------------------------------------------------------------------
 
-#: What effects outside the library change.
-_TORQUE = "torque in the {}"
-
 
 def relation_of(candidate: Candidate) -> str | None:
     """Return the relation that a candidate changes, in words; None where it changes several places at once."""
@@ -190,7 +145,7 @@ def relation_of(candidate: Candidate) -> str | None:
     where = places(candidate.where)
     if candidate.formula and candidate.where[0] not in JOINTS:
         return where
-    return (_TORQUE if search is None else search.relation).format(where)
+    return f"torque in the {where}" if search is None else search.relation.format(where)
 
 
 def relations(scores: Sequence[Score]) -> tuple[Relation, ...]:
