@@ -24,13 +24,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 from scipy.stats import quantile_test
 
 from studies.bench.blind.cases import strange
-from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import keep_request, make_output_folder
+from wlr_gym.base.errors import InputError, check_name
+from wlr_gym.base.files import keep_request, make_output_folder, write_text
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.text import tally
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.terminal import print_json
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
 from wlr_gym.gap.decision import Decided
@@ -129,8 +133,7 @@ def chosen_cases(names: tuple[str, ...]) -> tuple[AdaptCase, ...]:
     if len(names) == 1 and names[0].isdigit():
         return tuple(there.values())[: int(names[0])]
     for name in names:
-        if name not in there:
-            raise unknown_name("case", name, there)
+        check_name("case", name, there)
     return tuple(there[name] for name in names)
 
 
@@ -220,6 +223,34 @@ class AdaptStudy:
             episodes=self.episodes,
             seed=case.copy,
         )
+
+
+@dataclass(frozen=True)
+class AdaptStudyOptions(JsonOption):
+    out: Path
+    """Folder for results; an interrupted study resumes from it."""
+    cases: tuple[str, ...] = ()
+    """Names of cases, or how many of them; default: all."""
+    contenders: tuple[str, ...] = tuple(CONTENDERS)
+    """Some of none, truth, wide, ours, calibrated."""
+    quick: bool = False
+    """Tiny sizes: shows that it runs; the numbers mean nothing."""
+
+
+def run(options: AdaptStudyOptions) -> int:
+    """Adapt a policy to robots with hidden faults, and others beside it; print and write the table."""
+    for name in options.contenders:
+        check_name("contender", name, CONTENDERS)
+    say = Console(soft_wrap=True, markup=False, highlight=False).print
+    study = AdaptStudy(options.out, chosen_cases(options.cases), contenders=options.contenders)
+    lines = run_adapt_study(study.quick() if options.quick else study, say)
+    text = markdown(lines)
+    write_text(options.out / "adapt.md", text)
+    say(text)
+    if options.json:
+        print_json(lines)
+    say(f"written: {options.out / LINES_FILE}, {options.out / 'adapt.md'}")
+    return OK
 
 
 def run_adapt_study(study: AdaptStudy, say: Say = print) -> list[dict[str, Any]]:

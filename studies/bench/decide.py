@@ -13,9 +13,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from rich.console import Console
 
 from studies.bench.blind.cases import CAMERA_SHARE, NAMED, OF_CAMERA, hide, named
 from studies.bench.blind.commands import BlindScript
@@ -24,12 +25,15 @@ from studies.bench.blind.dataset import BlindRobot, copy_of, write
 from studies.bench.blind.drive import BlindProfile
 from studies.bench.blind.score import FAILED, at_least, at_most, found_names
 from studies.bench.gap import read_result
-from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import keep_request, make_output_folder, write_json
+from wlr_gym.base.errors import Interval
+from wlr_gym.base.files import keep_request, make_output_folder, write_json, write_text
 from wlr_gym.base.jobs import Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.text import tally
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.terminal import print_json
 from wlr_gym.data.excitations import Motion, excite
 from wlr_gym.data.record import next_run
 from wlr_gym.data.runs import read_meta
@@ -156,20 +160,39 @@ def _at_random(data: Path, folder: Path, record: Callable[[Motion, Path], Record
 # ---- the study -------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class DecideStudyOptions(JsonOption):
+    out: Path
+    """Folder for results; an interrupted study resumes from it."""
+    cases: Annotated[int, Interval(least=1)] = CASES
+    """How many robots."""
+    contenders: tuple[Literal["chosen", "random", "eight"], ...] = ("chosen", "random", "eight")
+    """Who decides what is driven next."""
+    processes: Annotated[int, Interval(least=1)] = 2
+    """Contenders at a time."""
+
+
+def run(options: DecideStudyOptions) -> int:
+    """Let the gap workflow choose what robots with hidden effects drive, and others beside it; print and write the tables."""
+    say = Console(soft_wrap=True, markup=False, highlight=False).print
+    lines = run_decide_study(options.out, options.cases, options.contenders, options.processes, say)
+    text = markdown(lines)
+    write_text(options.out / "decide.md", text)
+    say(text)
+    if options.json:
+        print_json(lines)
+    say(f"written: {options.out / LINES_FILE}, {options.out / 'decide.md'}")
+    return OK
+
+
 def run_decide_study(
     out: Path, count: int = CASES, contenders: Sequence[str] = tuple(CONTENDERS), processes: int = 2, say: Say = print
 ) -> list[dict[str, Any]]:
     """Do what is left of a study, failed contenders too, and return its lines; they are in ``decide.json``, too.
 
     Raises:
-        InputError: no cases or processes, an unknown contender, or the folder has a study of other robots or runs.
+        InputError: the folder has a study of other robots or runs.
     """
-    for name, value in (("--cases", count), ("--processes", processes)):
-        if value < 1:
-            raise InputError(f"{name} {value}: expected 1 or more")
-    for name in contenders:
-        if name not in CONTENDERS:
-            raise unknown_name("contender", name, CONTENDERS)
     for folder in ("", "lines", "work"):
         make_output_folder(out / folder)
     request = {"first_seed": FIRST_SEED, "severity": SEVERITY, "further": FURTHER, "start": list(START), "eight": list(EIGHT)}
@@ -214,10 +237,6 @@ def _work(task: Mapping[str, Any], send: Send) -> None:
     folder = out / "work" / f"{one.name}_{contender}"
     shutil.rmtree(folder, ignore_errors=True)
     write_json(_file(out, one, contender), decided_by(contender, one, folder))
-
-
-if __name__ == "__main__":
-    serve(_work)
 
 
 # ---- tables ----------------------------------------------------------------------------------------------------------
@@ -280,3 +299,7 @@ def _cell(line: Line) -> str:
     return (
         f"{'right' if line['right'] else ', '.join(line['found']) or line['verdict']}, {line['ended']}, {line['seconds']:.0f} s"
     )
+
+
+if __name__ == "__main__":
+    serve(_work)

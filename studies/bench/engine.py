@@ -30,9 +30,6 @@ from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 
@@ -550,16 +547,15 @@ def save_picture(report: dict[str, Any], path: Path) -> None:
     axes.set(xscale="log", yscale="log", xlabel=_ERROR)
     axes.set_ylabel("simulated seconds of a robot per second of one core")
     shown = [one for one in report["settings"] if one["upright"] and one["threads"] == 1 and one["call"] == "step"]
-    labels: list[Label] = []
     for precision in ("float64", "float32"):
         rows = [one for one in shown if one["side"] == "engine" and one["precision"] == precision]
-        labels += _draw(axes, rows, f"engine, {precision}", _COLOURS[precision], "o")
+        _draw(axes, rows, f"engine, {precision}", _COLOURS[precision], "o")
     drawn: set[str] = set()
     for cone, contact, integrator in KINDS:
         kind = {"side": "MuJoCo", "cone": cone, "contact": contact, "integrator": integrator}
         rows = [one for one in shown if all(one[name] == value for name, value in kind.items())]
         label = f"MuJoCo: {contact}, {cone}, {integrator}"
-        labels += _draw(axes, rows, label, _COLOURS[contact], "s", is_second=contact in drawn)
+        _draw(axes, rows, label, _COLOURS[contact], "s", is_second=contact in drawn)
         drawn.add(contact)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:g}")
@@ -567,7 +563,6 @@ def save_picture(report: dict[str, Any], path: Path) -> None:
     axes.set_title(_HOW_TO_READ, fontsize=9, loc="left")
     tidy(axes)
     legend_below(figure, columns=3)
-    place_labels(figure, axes, labels)
     save(figure, path)
 
 
@@ -575,24 +570,22 @@ def _point(one: dict[str, Any]) -> tuple[float, float]:
     return 1e3 * one["error"], one["speed"]["median"]
 
 
-def _draw(
-    axes: Axes, rows: list[dict[str, Any]], label: str, colour: str, marker: str, *, is_second: bool = False
-) -> list[Label]:
-    """Draw a curve over the step, and crosses of settings with another number of passes or iterations; return their labels.
+def _draw(axes: Axes, rows: list[dict[str, Any]], label: str, colour: str, marker: str, *, is_second: bool = False) -> None:
+    """Draw a curve over the step, and crosses for settings with another number of passes or iterations, with their numbers.
 
-    The second of one colour is dashed, its markers are open, and its steps, which are those of the first, are not written.
+    The second curve of one colour is dashed with open markers. Its steps are those of the first and carry no numbers.
     """
-    usual = [one for one in rows if one["is_usual"]]
-    other = [one for one in rows if not one["is_usual"]]
     line: dict[str, Any] = {"marker": marker, "label": label}
     if is_second:
         line |= {"linestyle": "--", "markerfacecolor": "white"}
     crosses: dict[str, Any] = {"marker": "x", "linestyle": "none"}
-    for chosen, style in ((usual, line), (other, crosses)):
+    for usual, style in ((True, line), (False, crosses)):
+        chosen = [one for one in rows if one["is_usual"] == usual]
         if chosen:
             axes.plot(*zip(*map(_point, chosen), strict=True), color=colour, markersize=5, linewidth=1.2, **style)
-    steps = [] if is_second else [Label(*_point(one), f"{1e3 * one['step']:g}", colour) for one in usual]
-    return steps + [Label(*_point(one), _unusual(one), colour) for one in other]
+        for one in chosen if not (is_second and usual) else ():
+            text = f"{1e3 * one['step']:g}" if usual else _unusual(one)
+            axes.annotate(text, _point(one), (6, -3), textcoords="offset points", fontsize=7.5, color=colour, va="center")
 
 
 def _unusual(one: dict[str, Any]) -> str:
@@ -614,71 +607,3 @@ def _draw_pair(axes: Axes, shown: Sequence[dict[str, Any]]) -> None:
     text = f"rings: {level_name(LEVELS[0])}\n{ratio:.0f} times as fast\n\nengine: {ours['label']}\nMuJoCo: {peer['label']}"
     middle = 1e3 * peer["error"], float(np.sqrt(ours["speed"]["median"] * peer["speed"]["median"]))
     axes.annotate(text, middle, (8, 0), textcoords="offset points", va="center", fontsize=9)
-
-
-# ---- labels of the picture, each where it covers least of the lines, the points and the labels before it -------------
-
-
-#: Where a label may be, best first: points from its point to the right and up, and how it is aligned.
-_PLACES = (
-    (7, 0, "left", "center"),
-    (-7, 0, "right", "center"),
-    (5, -5, "left", "top"),
-    (-5, 5, "right", "bottom"),
-    (5, 5, "left", "bottom"),
-    (-5, -5, "right", "top"),
-    (0, 6, "center", "bottom"),
-    (0, -6, "center", "top"),
-)
-#: Pixels between the places at which a line and a label are sampled.
-_STEP = 2.0
-#: Half the width of a marker, pixels.
-_MARKER = 4.0
-
-
-@dataclass(frozen=True)
-class Label:
-    """A text beside a point of the data."""
-
-    x: float
-    y: float
-    text: str
-    colour: str
-
-
-def place_labels(figure: Figure, axes: Axes, labels: Sequence[Label]) -> None:
-    """Write the labels; everything else of the figure must have been drawn, for its layout."""
-    figure.draw_without_rendering()
-    taken = np.concatenate([_samples(axes.transData.transform(np.asarray(line.get_xydata()))) for line in axes.lines])
-    for label in labels:
-        covered = [_covered(axes, label, k, taken) for k in range(len(_PLACES))]
-        box = _write(axes, label, int(np.argmin(covered)))
-        taken = np.concatenate([taken, _grid(box)])
-
-
-def _write(axes: Axes, label: Label, place: int) -> Array:
-    """Write a label at one of its places; return its corners, pixels."""
-    x, y, horizontal, vertical = _PLACES[place]
-    style = {"textcoords": "offset points", "fontsize": 7.5, "color": label.colour, "ha": horizontal, "va": vertical}
-    return axes.annotate(label.text, (label.x, label.y), (x, y), **style).get_window_extent().get_points()
-
-
-def _covered(axes: Axes, label: Label, place: int, taken: Array) -> int:
-    """Return how many of the samples a label would cover."""
-    (left, bottom), (right, top) = _write(axes, label, place)
-    axes.texts[-1].remove()
-    return int(np.sum((taken[:, 0] > left) & (taken[:, 0] < right) & (taken[:, 1] > bottom) & (taken[:, 1] < top)))
-
-
-def _samples(points: Array) -> Array:
-    """Return points on the lines between points (N, 2), and all over their markers."""
-    counts = np.ceil(np.linalg.norm(np.diff(points, axis=0), axis=1) / _STEP).astype(int) + 1
-    pieces = [np.linspace(start, end, count) for start, end, count in zip(points[:-1], points[1:], counts, strict=True)]
-    markers = [_grid(np.stack([point - _MARKER, point + _MARKER])) for point in points]
-    return np.concatenate([*markers, *pieces])
-
-
-def _grid(box: Array) -> Array:
-    """Return points all over a box of two corners."""
-    x, y = (np.arange(low, high, _STEP) for low, high in box.T)
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -19,24 +19,27 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
+from rich.console import Console
 
 from studies.bench.blind.cases import FIRST_SCORED_SEED, FURTHER_NULLS, SETS, BlindCase, case
 from studies.bench.blind.score import FAILED, score
-from studies.bench.gap_classifier import answers_of, first_screen, train, training_sets
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.base.files import make_output_folder, write_json, write_text
 from wlr_gym.base.jobs import Ended, Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.text import duration, tally
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import JsonOption, ray_address
+from wlr_gym.cli.terminal import print_json
 
 #: Folder of a data set, folder for the analysis' files -> contents of result.json.
 Analyser = Callable[[Path, Path], Mapping[str, Any]]
 #: Of a result: what the score is made of.
-_ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "screen", "wall_seconds", "blind_test")
+_ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "wall_seconds", "blind_test")
 _MODULE = "studies.bench.gap"
 #: Sets of a whole test.
 ALL_SETS = SETS + FURTHER_NULLS
@@ -62,13 +65,6 @@ class Plan:
     keep_data: bool = False
     runs: tuple[int, ...] = ()
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be run."""
-        if self.sets < 1:
-            raise InputError(f"--sets {self.sets}: expected 1 or more")
-        if self.processes < 1:
-            raise InputError(f"--processes {self.processes}: expected 1 or more")
-
     def cases(self) -> list[BlindCase]:
         """Return the data sets, in the order they are analysed: the further nulls spread among the others."""
         cases = [case(index, self.first_seed) for index in range(self.sets)]
@@ -83,6 +79,34 @@ class Plan:
         return self.out / "results" / f"{one.name}.json"
 
 
+@dataclass(frozen=True)
+class BlindTestOptions(JsonOption):
+    out: Path
+    """Folder for data sets, results, truths and the score; an interrupted test resumes from it."""
+    sets: Annotated[int, Interval(least=1)] = ALL_SETS
+    """Data sets; the default has 240 of all kinds and 160 more without an effect."""
+    processes: Annotated[int, Interval(least=1)] = 2
+    """Data sets at a time."""
+    ray: tuple[str, ...] | None = None
+    """Run on Ray: alone, it is started on this machine; with an address (auto, 10.0.0.1:6379), that cluster is used."""
+    answers: Path | None = None
+    """answers.json of another folder; its sets are not analysed again, but for those that failed."""
+
+
+def run(options: BlindTestOptions) -> int:
+    """Test the gap workflow on data sets with hidden truths; print and write its score."""
+    say = Console(soft_wrap=True, markup=False, highlight=False).print
+    plan = Plan(options.out, options.sets, options.processes)
+    report = run_blind_test(plan, say=say, answers=options.answers, ray=ray_address(options.ray))
+    text = markdown(report)
+    write_text(options.out / "score.md", text)
+    say(text)
+    if options.json:
+        print_json(report)
+    say(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")
+    return OK
+
+
 def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
     """Run the gap workflow on a folder; return its result file. The report with its pictures is not drawn."""
     from wlr_gym.gap.report.result import write_result
@@ -90,7 +114,7 @@ def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
 
     make_output_folder(out)
     done = analyse(folder, threads=1)
-    return {**read_result(write_result(done, out)), "screen": first_screen(done.evidence)}
+    return read_result(write_result(done, out))
 
 
 def run_blind_test(
@@ -132,18 +156,6 @@ def run_blind_test(
     report = score(_kept(plan, cases), {one.name: one.as_dict() for one in cases})
     write_json(plan.out / "score.json", report)
     write_answers(plan.out)
-    return report
-
-
-def score_classifier(plan: Plan, sets: int, say: Callable[[str], None] = print) -> dict[str, Any]:
-    """Train the baseline on so many sets of the engine, and score its answers to the sets of a test that was run.
-
-    Training sets stay in ``plan.out``, and so does the score, as ``score_classifier.json``.
-    """
-    trained = train(training_sets(plan.out / "training", sets, plan.processes, say))
-    cases = plan.cases()
-    report = score(answers_of(trained, _kept(plan, cases)), {one.name: one.as_dict() for one in cases})
-    write_json(plan.out / "score_classifier.json", report)
     return report
 
 
@@ -388,10 +400,6 @@ def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = ()) -> str:
     return fingerprint(tables)
 
 
-if __name__ == "__main__":
-    serve(_work)
-
-
 # ---- the score as a table --------------------------------------------------------------------------------------------
 
 
@@ -524,3 +532,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         ordered = sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0]))
         rows.append(f"| {hidden} | {tally(dict(ordered))} |")
     return "\n".join(rows) + "\n"
+
+
+if __name__ == "__main__":
+    serve(_work)

@@ -14,15 +14,20 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
 from studies.bench.lab_renderer import Lab, frames, lens, true_places
+from studies.bench.measure import machine
 from studies.bench.vision import FilmedDrive, lab_drive, pose_at, true_slip
-from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.errors import InputError, Interval, require_package
 from wlr_gym.base.files import write_json
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.perception.markers.targets import Target, load_target
 from wlr_gym.perception.vision.analysis import VideoAnalysis, analyse
 from wlr_gym.perception.vision.self_calibration import UNSURE
@@ -45,6 +50,32 @@ _READING = 0.0002
 #: without a finding that doubts the result; share of refused films.
 LARGEST_ERROR, LARGEST_RATIO, SHARE, SILENT, REFUSALS = 0.001, 2.5, 0.95, 4.0, 0.02
 SIGMAS_HOLD = (0.8, 1.3)
+
+
+@dataclass(frozen=True)
+class LabFilmsOptions(JsonOption):
+    out: Path
+    """Folder for the result of every film; interrupted, it resumes from it."""
+    count: Annotated[int, Interval(least=1)] = FILMS
+    """Films."""
+    seed: int = SEED
+    """Of the films; another one gives other films."""
+
+
+def run(options: LabFilmsOptions) -> int:
+    """Film a lab that is not perfect; print and write the score."""
+    console = Console(soft_wrap=True, highlight=False)
+    results = run_lab_films(options.out, options.count, options.seed, lambda text: console.print(text, markup=False))
+    found = score(results)
+    report = {"machine": machine(), "seed": options.seed, "score": found, "films": [asdict(result) for result in results]}
+    write_json(options.out / "score.json", report)
+    words = {True: "yes", False: "NO", None: "-"}
+    rows = [(what, value, bar, words[met]) for what, value, bar, met in bars(found)]
+    print_table(console, ("what", "found", "bar", "met"), rows, f"{options.count} films of a lab")
+    if options.json:
+        print_json(report)
+    console.print(f"written: {options.out / 'score.json'}")
+    return OK
 
 
 @dataclass(frozen=True)

@@ -49,9 +49,7 @@ def speed_table(rows: Iterable[Row]) -> list[str]:
     lines = ["| what | ours | peer | ratio [min..max] | bar | command | measured |", "|---|---|---|---|---|---|---|"]
     for row in rows:
         cells = (row["what"], _value(row["ours"], row["unit"]), _peer(row), _ratio(row), _bar(row))
-        lines.append(
-            f"| {' | '.join(cells)} | `python -m studies.bench --only {row['name']}` | {_condition(row['measured'])} |"
-        )
+        lines.append(f"| {' | '.join(cells)} | `python -m studies.bench {row['name']}` | {_condition(row['measured'])} |")
     return lines
 
 
@@ -147,7 +145,7 @@ def write_readme(text: str, rows: list[Row]) -> str:
             return text
         wide, narrow = (f"{ratios[f'{precision}, {what}']:.0f}{TIMES}" for precision in ("float64", "float32"))
         cells.append(f"{what}: {wide} as fast (float64), {narrow} (float32)")
-    command = "`python -m studies.bench --only engine` ([performance](docs/performance.md))"
+    command = "`python -m studies.bench engine` ([performance](docs/performance.md))"
     error = "rms distance from the engine's contact model"
     what = "engine against MuJoCo (float64), a batch of 320 robots against one"
     head = f"{what}, core of an {engine[0]['measured']['processor']}; error: {error}"

@@ -7,12 +7,11 @@ import re
 import pytest
 from blocks import PAGES, ROOT, Block, blocks, program_of
 
-from studies.bench.__main__ import BenchOptions
+from studies.bench.__main__ import STUDIES, find_program
 from studies.paper.__main__ import PaperOptions
 from wlr_gym.cli import COMMANDS, parse_command
 from wlr_gym.cli.options import parse
 
-STUDIES = {"python -m studies.bench": BenchOptions, "python -m studies.paper": PaperOptions}
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]+)?\)")
 #: Pages that exist on the documentation site only (.ci/docs/pages.py).
 MADE = ("commands.md", "api.md")
@@ -40,8 +39,10 @@ def test_there_are_commands_to_check() -> None:
 @pytest.mark.parametrize("command", CASES)
 def test_command_parses(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     program, (name, *arguments) = program_of(command)
-    if program in STUDIES:
-        parse(STUDIES[program], program, [name, *arguments], "")
+    words = [name, *arguments]
+    if program.startswith("python -m studies."):
+        kind = PaperOptions if program.endswith("paper") else find_program(words)[0]
+        parse(kind, program, arguments if name in STUDIES else words)
         return
     if name == "--import":
         _, name, *arguments = arguments

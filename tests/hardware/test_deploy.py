@@ -471,7 +471,7 @@ STOP_TICKS = round(HARDWARE.safety.stop_time / PERIOD)
     ids=["to its end", "stopped"],
 )
 def test_every_tick_of_the_wall_clock_is_accounted_for(tmp_path, monkeypatch, late, sleeps, reason):
-    """True on any computer, however busy; how well it keeps up is measured by ``python -m studies.bench --only bus``."""
+    """True on any computer, however busy; how well it keeps up is measured by ``python -m studies.bench bus``."""
     core, result, waits = sleepy_drive(tmp_path, monkeypatch, late, sleeps)
     log = tmp_path / "log"
     events, on_the_way, driven = read_events(log / "run_01.csv"), times_of(log / "ramp_01.csv"), times_of(log / "run_01.csv")

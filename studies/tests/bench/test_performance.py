@@ -32,7 +32,7 @@ def test_a_pair_is_shown_with_its_peer_and_ratio():
     row = Measurement("engine", "substeps", "1/s", (2e6, 4e6, 3e6), (1e5, 1e5, 1e5), "mujoco.batch", 25.0)
     (line,) = performance.speed_table(performance.merged([], report(row)))[2:]
     assert line.startswith(
-        "| substeps | 3 M/s | 100 k/s (mujoco.batch) | 30 [20..40] | >= 25 | `python -m studies.bench --only engine` |"
+        "| substeps | 3 M/s | 100 k/s (mujoco.batch) | 30 [20..40] | >= 25 | `python -m studies.bench engine` |"
     )
 
 
