@@ -67,7 +67,8 @@ def test_evaluate_on_mujoco_says_so(tmp_path):
 @pytest.mark.slow
 def test_train_on_mujoco_with_its_precision(tmp_path):
     pytest.importorskip("torch")
-    small = ["total_steps=16", "num_envs=2", "steps_per_env=8", "batch_size=16", "epochs=1", "environment.precision=float64"]
+    small = ["total_steps=16", "num_envs=2", "steps_per_env=8", "batch_size=16", "epochs=1", "evaluation_episodes=2"]
+    small += ["environment.precision=float64"]
     assert main(["train", "--backend", "mujoco", "--out", str(tmp_path), "--no-progress", "--set", *small]) == 0
     settings = yaml.safe_load((tmp_path / "config.yaml").read_text())["settings"]
     assert (settings["environment"]["precision"], settings["environment"]["backend"]) == ("float64", "mujoco")
