@@ -35,8 +35,7 @@ from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.terminal import print_json
 from wlr_gym.data.excitations import Motion, excite
-from wlr_gym.data.record import next_run
-from wlr_gym.data.runs import read_meta
+from wlr_gym.data.runs import next_run, read_meta
 from wlr_gym.gap.decision import Budget, Decided, Recorded, decide, motions_to_drive
 from wlr_gym.robot import load_robot
 

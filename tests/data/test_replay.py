@@ -16,9 +16,9 @@ from wlr_gym import cli
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Profile, Run, RunMeta, read_dataset, read_run
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay, robot_of
+from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay
 from wlr_gym.data.run_states import camera_pose, euler_angles, local_fit, quaternion, rest_pose
-from wlr_gym.data.runs import note_robot
+from wlr_gym.data.runs import note_robot, robot_of
 from wlr_gym.data.sensors import channel_noise
 from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant

@@ -17,7 +17,8 @@ from wlr_gym.cli.options import RobotOption
 from wlr_gym.data import read_dataset, read_run, simulate_again
 from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import COMMANDS, Profile
-from wlr_gym.data.record import motion_of, next_run, read_commands, record_simulation
+from wlr_gym.data.record import motion_of, read_commands, record_simulation
+from wlr_gym.data.runs import next_run
 from wlr_gym.data.sensors import SENSED
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.robot import JOINTS, load_robot

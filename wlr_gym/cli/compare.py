@@ -108,8 +108,7 @@ def run(options: CompareOptions) -> int:
 def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     from wlr_gym.data.excitations import EXCITATIONS, excite
     from wlr_gym.data.record import motion_of
-    from wlr_gym.data.replay import robot_of
-    from wlr_gym.data.runs import read_runs
+    from wlr_gym.data.runs import read_runs, robot_of
 
     if options.runs is None:
         robot = load_robot(options.robot or "nominal")

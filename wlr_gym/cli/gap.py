@@ -125,8 +125,7 @@ def run(options: GapOptions) -> int:
 
 def _decide(options: GapOptions, known: Patch, threads: int, console: Console) -> int:
     """Have runs driven until it is decided; 1 where the last analysis could not be made."""
-    from wlr_gym.data.replay import robot_of
-    from wlr_gym.data.runs import read_dataset
+    from wlr_gym.data.runs import read_dataset, robot_of
     from wlr_gym.gap.analysis import BAD_DATA
     from wlr_gym.gap.decision import Budget, decide
     from wlr_gym.gap.report.page import REPORT_FILE
@@ -271,8 +270,8 @@ def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callab
 def _simulated(motion: Motion, data: Path, *, robot: Robot, hidden: Patch, backend: str) -> Recorded:
     """Drive the simulator; no two runs of a folder have the same noise."""
     from wlr_gym.base.random import spawn_seeds
-    from wlr_gym.data.record import next_run, record_simulation
-    from wlr_gym.data.runs import read_meta
+    from wlr_gym.data.record import record_simulation
+    from wlr_gym.data.runs import next_run, read_meta
     from wlr_gym.gap.decision import Recorded
 
     path = next_run(data)

@@ -424,6 +424,6 @@ def noise_seed(folder: Path, seed: int | None) -> int:
     It follows from ``seed`` and the run's number; without a seed it is drawn anew.
     """
     from wlr_gym.base.random import spawn_seeds
-    from wlr_gym.data.record import next_run
+    from wlr_gym.data.runs import next_run
 
     return int(spawn_seeds(seed, 1, next_run(folder).stem)[0]) % (LARGEST_SEED + 1)

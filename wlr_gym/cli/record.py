@@ -173,7 +173,8 @@ def _record_simulations(
     options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console
 ) -> int:
     from wlr_gym.base.random import spawn_seeds
-    from wlr_gym.data.record import next_run, record_simulation
+    from wlr_gym.data.record import record_simulation
+    from wlr_gym.data.runs import next_run
 
     assert options.out is not None
     patch, found = options.patch(), []

@@ -140,7 +140,8 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.data import read_run
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, motion_of
-    from wlr_gym.data.replay import compare_repeat, robot_of
+    from wlr_gym.data.replay import compare_repeat
+    from wlr_gym.data.runs import robot_of
     from wlr_gym.hardware.deployment import drive_robot
 
     motions = [motion_of(measured) for measured in runs]

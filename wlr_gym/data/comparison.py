@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
+from wlr_gym.base.errors import InputError, check_name, check_number, unknown_name
+from wlr_gym.data.excitations import CONTROL_PERIOD, SETTLE, Motion
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import euler_angles, standing_at
 from wlr_gym.data.sensors import channel_noise
@@ -36,7 +36,8 @@ class ComparedSignal:
     """One compared signal.
 
     Attributes:
-        unit, doc: SI unit, meaning. resolution: what the robot's sensors resolve of it, in ``unit``.
+        unit: SI.
+        resolution: what the robot's sensors resolve of it, in ``unit``.
         turns: an angle that may jump by a whole turn.
         shared: how wheels that all stick share a load, which rigid bodies leave open: each plant has an answer of its own,
             and it moves nothing. Their total force and moment are not open.
@@ -44,9 +45,51 @@ class ComparedSignal:
 
     unit: str
     resolution: float
-    doc: str
     turns: bool = False
     shared: bool = False
+
+
+def _force(truth: Truth, axis: int) -> Array:
+    """Of the floor on each wheel (rows, 4), N: along its heading (0), along its axle (1), normal (2)."""
+    return truth.contact_force.reshape(-1, 4, 3)[:, :, axis]
+
+
+def _friction_moment(truth: Truth, robot: Robot) -> Array:
+    """Of all wheels about the body's vertical (rows,), N m."""
+    signs, hip = np.array(CORNER_SIGNS), robot.hip_position
+    x = signs[:, 0] * hip.x + robot.leg.length * np.cos(truth.joint_position[:, LEG_SLICE])
+    return (x * _force(truth, 1) - signs[:, 1] * hip.y * _force(truth, 0)).sum(axis=1)
+
+
+#: Signal -> SI unit, the noise that it is resolved to (a channel's, or one of :func:`resolutions`' own), and its values.
+_SIGNALS: dict[str, tuple[str, str, Callable[[Sensors, Truth, Robot], Array]]] = {
+    "pos_leg": ("rad", "pos_leg_lf", lambda s, t, robot: s.joint_position[:, LEG_SLICE]),
+    "pos_wheel": ("rad", "pos_wheel_lf", lambda s, t, robot: s.joint_position[:, WHEEL_SLICE]),
+    "vel_leg": ("rad/s", "vel_leg_lf", lambda s, t, robot: s.joint_velocity[:, LEG_SLICE]),
+    "vel_wheel": ("rad/s", "vel_wheel_lf", lambda s, t, robot: s.joint_velocity[:, WHEEL_SLICE]),
+    "eff_leg": ("N m", "eff_leg_lf", lambda s, t, robot: s.joint_effort[:, LEG_SLICE]),
+    "eff_wheel": ("N m", "eff_wheel_lf", lambda s, t, robot: s.joint_effort[:, WHEEL_SLICE]),
+    "gyro": ("rad/s", "gyro_x", lambda s, t, robot: s.gyro),
+    "acc": ("m/s2", "acc_x", lambda s, t, robot: s.accelerometer),
+    "cam_xy": ("m", "cam_x", lambda s, t, robot: s.camera_pose[:, :2]),
+    "cam_yaw": ("rad", "cam_yaw", lambda s, t, robot: s.camera_pose[:, 2]),
+    "volt": ("V", "volt", lambda s, t, robot: s.supply_voltage),
+    "true_xy": ("m", "cam_x", lambda s, t, robot: t.position[:, :2]),
+    "true_z": ("m", "cam_z", lambda s, t, robot: t.position[:, 2]),
+    "true_yaw": ("rad", "cam_yaw", lambda s, t, robot: euler_angles(t.quaternion)[0]),
+    "true_tilt": ("rad", "cam_pitch", lambda s, t, robot: np.stack(euler_angles(t.quaternion)[1:], axis=1)),
+    "motor_torque_leg": ("N m", "eff_leg_lf", lambda s, t, robot: t.motor_torque[:, LEG_SLICE]),
+    "motor_torque_wheel": ("N m", "eff_wheel_lf", lambda s, t, robot: t.motor_torque[:, WHEEL_SLICE]),
+    "normal_force": ("N", "load", lambda s, t, robot: _force(t, 2)),
+    "total_along": ("N", "tread", lambda s, t, robot: _force(t, 0).sum(axis=1)),
+    "total_across": ("N", "tread", lambda s, t, robot: _force(t, 1).sum(axis=1)),
+    "total_turn": ("N m", "turn", lambda s, t, robot: _friction_moment(t, robot)),
+    "friction_along": ("N", "tread", lambda s, t, robot: _force(t, 0)),
+    "friction_across": ("N", "tread", lambda s, t, robot: _force(t, 1)),
+    "slip_along": ("m/s", "slip", lambda s, t, robot: t.slip_velocity[:, 0::2]),
+    "slip_across": ("m/s", "slip", lambda s, t, robot: t.slip_velocity[:, 1::2]),
+}
+_TURNS, _SHARED = ("cam_yaw", "true_yaw"), ("friction_along", "friction_across")
 
 
 def resolutions(robot: Robot) -> dict[str, ComparedSignal]:
@@ -56,43 +99,17 @@ def resolutions(robot: Robot) -> dict[str, ComparedSignal]:
     over its radius, slip from its velocity reading times the radius, normal forces from the accelerometer times the mass.
     """
     noise = channel_noise(robot)
-    radius, mass = robot.wheel.radius, robot.body.mass + 4 * ((robot.leg.mass or 0.0) + (robot.wheel.mass or 0.0))
-    leg, wheel = LEGS[0], WHEELS[0]
-    tread, slip = noise[f"eff_{wheel}"] / radius, noise[f"vel_{wheel}"] * radius
+    tread = noise["eff_wheel_lf"] / robot.wheel.radius
+    noise |= {
+        "tread": tread, "turn": tread * robot.hip_position.y, "load": robot.total_mass * noise["acc_z"],
+        "slip": noise["vel_wheel_lf"] * robot.wheel.radius,
+    }  # fmt: skip
     return {
-        "pos_leg": ComparedSignal("rad", noise[f"pos_{leg}"], "encoder of a leg"),
-        "pos_wheel": ComparedSignal("rad", noise[f"pos_{wheel}"], "encoder of a wheel"),
-        "vel_leg": ComparedSignal("rad/s", noise[f"vel_{leg}"], "velocity reading of a leg"),
-        "vel_wheel": ComparedSignal("rad/s", noise[f"vel_{wheel}"], "velocity reading of a wheel"),
-        "eff_leg": ComparedSignal("N m", noise[f"eff_{leg}"], "effort reading of a leg"),
-        "eff_wheel": ComparedSignal("N m", noise[f"eff_{wheel}"], "effort reading of a wheel"),
-        "gyro": ComparedSignal("rad/s", noise["gyro_x"], "gyroscope"),
-        "acc": ComparedSignal("m/s2", noise["acc_x"], "accelerometer"),
-        "cam_xy": ComparedSignal("m", noise["cam_x"], "camera x, y"),
-        "cam_yaw": ComparedSignal("rad", noise["cam_yaw"], "camera yaw", turns=True),
-        "volt": ComparedSignal("V", noise["volt"], "supply voltage"),
-        "true_xy": ComparedSignal("m", noise["cam_x"], "body origin on the floor"),
-        "true_z": ComparedSignal("m", noise["cam_z"], "height of the body origin"),
-        "true_yaw": ComparedSignal("rad", noise["cam_yaw"], "heading", turns=True),
-        "true_tilt": ComparedSignal("rad", noise["cam_pitch"], "pitch and roll"),
-        "motor_torque_leg": ComparedSignal("N m", noise[f"eff_{leg}"], "motor torque of a leg"),
-        "motor_torque_wheel": ComparedSignal("N m", noise[f"eff_{wheel}"], "motor torque of a wheel"),
-        "normal_force": ComparedSignal("N", mass * noise["acc_z"], "floor on a wheel, normal"),
-        "total_along": ComparedSignal("N", tread, "floor on all wheels, along their heading"),
-        "total_across": ComparedSignal("N", tread, "floor on all wheels, along their axles"),
-        "total_turn": ComparedSignal("N m", tread * robot.hip_position.y, "friction of all wheels about the body's vertical"),
-        "friction_along": ComparedSignal("N", tread, "floor on a wheel, along its heading", shared=True),
-        "friction_across": ComparedSignal("N", tread, "floor on a wheel, along its axle", shared=True),
-        "slip_along": ComparedSignal("m/s", slip, "longitudinal slip velocity of a wheel"),
-        "slip_across": ComparedSignal("m/s", slip, "lateral slip velocity of a wheel"),
+        name: ComparedSignal(unit, noise[kind], name in _TURNS, name in _SHARED) for name, (unit, kind, _) in _SIGNALS.items()
     }
 
 
 # ---- plants, and what each of them does on the same motions ----------------------------------------------------------
-
-
-#: s at the first setpoints before time 0, not compared: until the bounce of being set down has died out.
-SETTLE = 0.5
 
 
 @dataclass(frozen=True)
@@ -141,8 +158,7 @@ def parse_plant(text: str, physics_step: float = 0.001) -> ComparedPlant:
             plant = replace(plant, precision=value)
         else:
             raise unknown_name("option", name, ("physics_step", "precision"), f"plant '{text}'")
-    if plant.precision not in (precisions := ("float64", "float32")):
-        raise unknown_name("precision", plant.precision, precisions, f"plant '{text}'")
+    check_name("precision", plant.precision, ("float64", "float32"), f"plant '{text}'")
     PlantOptions(control_period=CONTROL_PERIOD, physics_step=plant.physics_step)
     return plant
 
@@ -167,38 +183,7 @@ class Traces:
         shape = self.sensors.shape[:2]
         sensors = Sensors(self.sensors.reshape(-1, self.sensors.shape[2]))
         truth = Truth(self.truth.reshape(-1, self.truth.shape[2]))
-        yaw, pitch, roll = euler_angles(truth.quaternion)
-        force, slip = truth.contact_force.reshape(-1, 4, 3), truth.slip_velocity.reshape(-1, 4, 2)
-        signs, hip = np.array(CORNER_SIGNS), self.robot.hip_position
-        x, y = signs[:, 0] * hip.x + self.robot.leg.length * np.cos(truth.joint_position[:, LEG_SLICE]), signs[:, 1] * hip.y
-        flat = {
-            "pos_leg": sensors.joint_position[:, LEG_SLICE],
-            "pos_wheel": sensors.joint_position[:, WHEEL_SLICE],
-            "vel_leg": sensors.joint_velocity[:, LEG_SLICE],
-            "vel_wheel": sensors.joint_velocity[:, WHEEL_SLICE],
-            "eff_leg": sensors.joint_effort[:, LEG_SLICE],
-            "eff_wheel": sensors.joint_effort[:, WHEEL_SLICE],
-            "gyro": sensors.gyro,
-            "acc": sensors.accelerometer,
-            "cam_xy": sensors.camera_pose[:, :2],
-            "cam_yaw": sensors.camera_pose[:, 2:],
-            "volt": sensors.supply_voltage[:, None],
-            "true_xy": truth.position[:, :2],
-            "true_z": truth.position[:, 2:],
-            "true_yaw": yaw[:, None],
-            "true_tilt": np.stack([pitch, roll], axis=1),
-            "motor_torque_leg": truth.motor_torque[:, LEG_SLICE],
-            "motor_torque_wheel": truth.motor_torque[:, WHEEL_SLICE],
-            "normal_force": force[:, :, 2],
-            "total_along": force[:, :, 0].sum(axis=1, keepdims=True),
-            "total_across": force[:, :, 1].sum(axis=1, keepdims=True),
-            "total_turn": (x * force[:, :, 1] - y * force[:, :, 0]).sum(axis=1, keepdims=True),
-            "friction_along": force[:, :, 0],
-            "friction_across": force[:, :, 1],
-            "slip_along": slip[:, :, 0],
-            "slip_across": slip[:, :, 1],
-        }
-        return {name: values.reshape(*shape, -1) for name, values in flat.items()}
+        return {name: values(sensors, truth, self.robot).reshape(*shape, -1) for name, (_, _, values) in _SIGNALS.items()}
 
 
 def drive(
@@ -287,10 +272,6 @@ class Difference:
         """Root mean square in units of the resolution."""
         return self.rms / self.resolution
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields, and both sizes in units of the resolution."""
-        return {**vars(self), "rms_in_noise_units": self.rms_in_noise, "largest_in_noise_units": self.largest / self.resolution}
-
 
 @dataclass(frozen=True)
 class Agreement:
@@ -315,10 +296,6 @@ class Agreement:
         """Names of the bounds that are not kept."""
         return tuple(name for name, bound in BOUNDS.items() if not getattr(self, name) <= bound)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures and the broken bounds."""
-        return {**vars(self), "broken": list(self.broken)}
-
 
 @dataclass(frozen=True)
 class MotionComparison:
@@ -336,10 +313,12 @@ class MotionComparison:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
-        return {
-            "motion": self.motion, "agreement": self.agreement.as_dict(), "parts_first_in": self.first,
-            "differences": {name: difference.as_dict() for name, difference in self.differences.items()},
-        }  # fmt: skip
+        sizes = {
+            name: {**vars(one), "rms_in_noise_units": one.rms_in_noise, "largest_in_noise_units": one.largest / one.resolution}
+            for name, one in self.differences.items()
+        }
+        agreement = {**vars(self.agreement), "broken": list(self.agreement.broken)}
+        return {"motion": self.motion, "agreement": agreement, "parts_first_in": self.first, "differences": sizes}
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,8 +390,7 @@ def compare(
         raise InputError("nothing to compare: expected at least one motion")
     if len({motion.period for motion in motions}) > 1:
         raise InputError("the motions have different periods; expected one")
-    if not threshold > 0.0:
-        raise InputError(f"threshold = {threshold:g}: expected more than 0 units of sensor noise")
+    check_number("threshold", threshold, "units of sensor noise", above=0.0)
     robot, patch = robot or load_robot(), load_patch(effects)
     signals = resolutions(robot)
 
@@ -487,8 +465,7 @@ def severe_patch(name: str) -> Patch:
     Raises:
         InputError: no such effect.
     """
-    if name not in EFFECTS:
-        raise unknown_name("effect", name, EFFECTS)
+    check_name("effect", name, EFFECTS)
     effect = EFFECTS[name]
     chosen = [place for place in effect.where if place in (LEGS[1], WHEELS[2])]
     values = {parameter: spec.severity for parameter, spec in effect.parameters.items()}

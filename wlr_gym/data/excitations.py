@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 #: s between the setpoints of a motion.
 CONTROL_PERIOD = 0.02
+#: s at the first setpoints before a motion: until the bounce of being set down has died out.
+SETTLE = 0.5
 #: s of rest before and after every motion.
 REST = 1.0
 #: What a careful operator writes into the servos' profile registers.
@@ -63,6 +65,12 @@ class Motion:
         wheels = self.setpoints[:, WHEEL_SLICE]
         driven = np.isfinite(wheels).sum(axis=1)
         return wheel_radius * self.period * np.cumsum(np.nansum(wheels, axis=1) / np.maximum(driven, 1))
+
+    def start(self, robot: Robot) -> Array:
+        """Return the setpoints (8,) it starts from: a leg without one at home, wheels at rest."""
+        setpoints = self.setpoints[0].copy()
+        setpoints[WHEEL_SLICE] = 0.0
+        return np.where(np.isnan(setpoints), robot.home.leg_angle, setpoints)
 
     def cut(self, seconds: float | None) -> Motion:
         """Return its first ``seconds``; None = all of it."""

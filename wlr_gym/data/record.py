@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +12,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import LARGEST_NOISE_SEED, InputError, require_seed
 from wlr_gym.base.files import make_output_folder, replace_file
 from wlr_gym.base.text import row_words
-from wlr_gym.data.comparison import SETTLE
-from wlr_gym.data.excitations import CONTROL_PERIOD, Motion
+from wlr_gym.data.excitations import CONTROL_PERIOD, SETTLE, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
 from wlr_gym.data.replay import held_setpoints, profile_parameters
 from wlr_gym.data.run_states import standing_at
@@ -23,7 +21,7 @@ from wlr_gym.data.sensors import channels, sensed_columns
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import PlantOptions
-from wlr_gym.robot import JOINTS, LEGS, WHEEL_SLICE, Robot
+from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -104,12 +102,6 @@ def motion_of(run: Run) -> Motion:
 # ---- runs ------------------------------------------------------------------------------------------------------------
 
 
-def next_run(folder: Path, suffix: str = ".parquet") -> Path:
-    """Return the path of the next run of a folder: ``run_01.parquet``, ``run_02.parquet``, ..."""
-    numbers = [int(found.group(1)) for path in folder.glob("run_*") if (found := re.match(r"run_(\d+)\.", path.name))]
-    return folder / f"run_{max(numbers, default=0) + 1:02d}{suffix}"
-
-
 def record_simulation(
     path: Path,
     motion: Motion,
@@ -146,9 +138,10 @@ def record_simulation(
     columns = sensed_columns(robot)
     rows = np.empty((len(motion.setpoints), len(columns)))
     try:
-        plant.reset(seeds, parameters, state=standing_at(start_setpoints(motion, robot)[None], robot, parameters))
+        stand = motion.start(robot)[None]
+        plant.reset(seeds, parameters, state=standing_at(stand, robot, parameters))
         for _ in range(round(SETTLE / motion.period)):
-            plant.step(start_setpoints(motion, robot)[None], torque_on[:1])
+            plant.step(stand, torque_on[:1])
         start = replace(plant.mechanical_state(), time=np.zeros(1))  # the run begins here
         sensors = plant.reset(seeds, parameters, state=start)
         for tick, setpoints in enumerate(motion.setpoints):
@@ -171,13 +164,6 @@ def record_simulation(
     table = {"t": motion.period * np.arange(len(rows)), **dict(zip(COMMANDS, motion.setpoints.T, strict=True))}
     table |= dict(zip(columns, rows.T, strict=True))
     return write_run(path, table, meta_of(motion, robot, meta), record, robot)
-
-
-def start_setpoints(motion: Motion, robot: Robot) -> Array:
-    """Return the setpoints (8,) a motion starts from: a leg without one at home, wheels at rest."""
-    setpoints = motion.setpoints[0].copy()
-    setpoints[WHEEL_SLICE] = 0.0
-    return np.where(np.isnan(setpoints), robot.home.leg_angle, setpoints)
 
 
 def meta_of(motion: Motion, robot: Robot, meta: RunMeta | None = None) -> RunMeta:

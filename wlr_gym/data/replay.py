@@ -23,13 +23,13 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.plots import BLUE, GREY, ORANGE, new_figure, save, tidy
 from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, Profile
 from wlr_gym.data.run_states import euler_angles, measured_state, start_state, starts_at_rest
-from wlr_gym.data.runs import Run, Simulation, robot_of_meta, simulation_path
+from wlr_gym.data.runs import Run, Simulation, robot_of, simulation_path
 from wlr_gym.data.sensors import channel_noise, channels, sensed_columns
 from wlr_gym.physics.effects import Patch, Source, apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot, load_robot
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -90,15 +90,6 @@ class ReplayResult:
     robot: Robot
     clock: float
     physics_step: float
-
-
-def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
-    """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one.
-
-    Raises:
-        InputError: see :func:`wlr_gym.data.runs.robot_of_meta`.
-    """
-    return robot_of_meta(run.meta, run.path.parent) if robot is None else load_robot(robot)
 
 
 def profile_parameters(parameters: Parameters, profile: Profile) -> Parameters:

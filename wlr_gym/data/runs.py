@@ -33,10 +33,6 @@ from wlr_gym.robot.parameter_table import ELEMENTS
 
 if TYPE_CHECKING:
     import pandas
-if TYPE_CHECKING:
-    import pandas
-
-    from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
 
@@ -149,6 +145,12 @@ def run_files(folder: Path) -> list[Path]:
     """Return the runs of a folder, ``run_2`` before ``run_10``; what else is known of a run lies beside it (:data:`BESIDE`)."""
     files = [path for path in folder.glob("run_*") if path.suffix.lower() in SUFFIXES and not path.stem.endswith(BESIDE)]
     return sorted(files, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)])
+
+
+def next_run(folder: Path, suffix: str = ".parquet") -> Path:
+    """Return the path of the next run of a folder: ``run_01.parquet``, ``run_02.parquet``, ..."""
+    numbers = [int(found[1]) for path in folder.glob("run_*") if (found := re.match(r"run_(\d+)\.", path.name))]
+    return folder / f"run_{max(numbers, default=0) + 1:02d}{suffix}"
 
 
 def read_meta(folder: str | Path) -> RunMeta:
@@ -416,6 +418,15 @@ def robot_of_meta(meta: RunMeta, folder: Path, file: str = META_FILE) -> Robot:
             "more; name the one to use with --robot"
         )
     return robot
+
+
+def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
+    """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one.
+
+    Raises:
+        InputError: see :func:`robot_of_meta`.
+    """
+    return robot_of_meta(run.meta, run.path.parent) if robot is None else load_robot(robot)
 
 
 # ---- the record of a simulation --------------------------------------------------------------------------------------

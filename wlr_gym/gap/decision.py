@@ -31,8 +31,7 @@ from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import META_FILE, Profile
 from wlr_gym.data.record import motion_of, record_simulation
-from wlr_gym.data.replay import robot_of
-from wlr_gym.data.runs import Run, read_meta, read_run, run_files
+from wlr_gym.data.runs import Run, read_meta, read_run, robot_of, run_files
 from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED
 from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95
 from wlr_gym.gap.problem import Setting

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.excitations import Motion
-from wlr_gym.data.record import start_setpoints
 from wlr_gym.hardware.loop import ControlLoop, StoppedError
 from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.hardware.plant import RobotPlant
@@ -186,7 +185,7 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     refuse_deadman(plant)
     loop, robot = plant.loop, plant.robot
     state = standing_state(robot, Parameters.nominal(robot))
-    state.joint_position[0, LEG_SLICE] = start_setpoints(motion, robot)[LEG_SLICE]
+    state.joint_position[0, LEG_SLICE] = motion.start(robot)[LEG_SLICE]
     reason, ticks = "", 0
     torque_on = np.isfinite(motion.setpoints)
     setpoints = np.nan_to_num(motion.setpoints)

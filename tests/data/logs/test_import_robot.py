@@ -11,7 +11,7 @@ from wlr_gym.data import convert, read_run, write_run
 from wlr_gym.data.format import RunMeta
 from wlr_gym.data.logs import export_run, import_log
 from wlr_gym.data.logs.map import content, map_text
-from wlr_gym.data.replay import robot_of
+from wlr_gym.data.runs import robot_of
 from wlr_gym.robot import load_robot, robot_content
 
 

@@ -19,7 +19,7 @@ from wlr_gym.data.format import COLUMNS, COMMANDS, REQUIRED, Profile, RunMeta
 from wlr_gym.data.logs import export_run, import_log, read_exported, read_logs
 from wlr_gym.data.logs.messages import nanoseconds, seconds
 from wlr_gym.data.logs.write import McapStream
-from wlr_gym.data.replay import robot_of
+from wlr_gym.data.runs import robot_of
 from wlr_gym.robot import load_robot, robot_content, robot_hash
 
 OPTIONAL = [name for name in COLUMNS if name not in REQUIRED]

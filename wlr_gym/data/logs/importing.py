@@ -8,7 +8,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,19 +35,16 @@ from wlr_gym.data.logs.map import (
     resolve,
 )
 from wlr_gym.data.logs.messages import RUN
-from wlr_gym.data.logs.open import first_messages, quiet, read_logs, read_recordings
+from wlr_gym.data.logs.open import first_messages, quiet, read_logs
 from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields, write_samples
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
 from wlr_gym.data.logs.tables import TABLE
-from wlr_gym.data.logs.topics import Log, Share, TopicStore
+from wlr_gym.data.logs.topics import Share
 from wlr_gym.data.logs.write import read_exported
-from wlr_gym.data.record import next_run
-from wlr_gym.data.runs import check_meta, note_robot, noted, own_robot, robot_of_meta, write_meta, write_run
+from wlr_gym.data.runs import check_meta, next_run, note_robot, noted, own_robot, robot_of_meta, write_meta, write_run
 from wlr_gym.robot import Robot, load_robot, robot_hash
 
 MAP_FILE, RECORD_FILE = "map.yaml", "import.yaml"
-#: Share of an import that reading the log takes.
-_READING = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,41 +120,32 @@ def import_log(
     resolved = resolve(found, chosen, "map")
     check_map_file(out / MAP_FILE, content(found))
     check_meta(out, meta)
-    record, read = _read_record(out), 0.0
-
-    def reading(share: float) -> None:
-        nonlocal read
-        read = max(read, share)
-        tell(_READING * read)
-
-    def making(share: float) -> None:
-        tell(_READING * read + (1.0 - _READING) * share * read)
-
+    record, made = _read_record(out), []
+    general = () if meta.states_profile else (NO_PROFILE,)
+    units = sorted({source.unit for name, source in resolved.items() if is_effort(name) and source.unit in CURRENTS})
+    if units and robot is None and found.meta.robot is None:
+        by = f"by the torque constants of '{chosen.name}': name your robot (--robot)"
+        general += (f"efforts in {', '.join(units)} become N m {by}",)
     with _beside(out) as folder:
-        made: list[ImportedRun] = []
-        for recording in read_recordings(log, wanted_fields(resolved), tell=reading):
-            with closing(recording):
-                _check_new(recording, record, out)
-                first = len(made)
-                for one in runs_of(recording, found, resolved, split, making):
-                    findings = _check(one, recording.name, resolved, chosen)
-                    path = write_run(folder / f"{len(made)}{suffix}", one.table)
-                    write_samples(_samples_of(path), one)
-                    made.append(ImportedRun(path, recording.name, one.origin, one.facts, findings, one.notes))
-                made[first:] = [replace(one, notes=(*recording.notes, *one.notes)) for one in made[first:]]
-        tell(1.0)
+        for recording in read_logs(log, wanted_fields(resolved), tell=tell):
+            _check_new(recording.name, record, out)
+            for one in runs_of(recording, found, resolved, split):
+                findings = _check(one, recording.name, resolved, chosen)
+                path = write_run(folder / f"{len(made)}{suffix}", one.table)
+                write_samples(_samples_of(path), one)
+                notes = (*recording.notes, *one.notes, *general)
+                made.append(ImportedRun(path, recording.name, one.origin, one.facts, findings, notes))
         if not made:
             raise InputError(f"{log}: nothing in it")
         write_meta(out, note_robot(out, chosen, meta))
         write_map(out / MAP_FILE, found)
-        is_named = robot is not None or found.meta.robot is not None
-        said = (*(() if meta.states_profile else (NO_PROFILE,)), *(() if is_named else _unnamed_robot(resolved, chosen)))
-        imported = []
-        for one in made:
-            imported.append(_moved(replace(one, notes=(*one.notes, *said)), next_run(out, suffix)))
-            record[imported[-1].path.stem] = _entry(imported[-1])
-            _write_record(out, record)  # with each run: whatever stops this, it knows all that are there
-    return imported
+        for k, run in enumerate(made):
+            path = next_run(out, suffix)
+            os.replace(_samples_of(run.path), _samples_of(path))
+            os.replace(run.path, path)
+            made[k] = replace(run, path=path)
+            _add_to_record(out, record, made[k])  # with each run: whatever stops this, it knows all that are there
+    return made
 
 
 def _map_of(map: LogMap | Mapping[str, Any] | str | Path | None, log: Path, out: Path, robot: str | None) -> LogMap:
@@ -182,17 +170,17 @@ def check_map_file(path: Path, data: Mapping[str, Any]) -> None:
     Raises:
         InputError: the file is there, and says something else.
     """
-    if path.exists() and _said(read_map(path), str(path)) != _said(data, "map"):
+
+    def meant(data: Mapping[str, Any]) -> object:
+        """What a map says, to be compared: a robot file that it names stands beside it."""
+        found = parse_config(LogMap, decided(data), str(path))
+        robot = own_robot(found.meta, Path())
+        meta = found.meta if robot is None else noted(robot, found.meta)
+        return found.model_copy(update={"meta": meta}), data if open_places(data) else None
+
+    if path.exists() and meant(read_map(path)) != meant(data):
         hint = f"import with it (--map {path}), move it away, or name another folder (--out)"
         raise InputError(f"{path}: is there already, and is another map: {hint}")
-
-
-def _said(data: Mapping[str, Any], where: str) -> object:
-    """Return what a map says, to be compared: a robot file that it names stands beside it."""
-    found = parse_config(LogMap, decided(data), where)
-    robot = own_robot(found.meta, Path())
-    meta = found.meta if robot is None else noted(robot, found.meta)
-    return found.model_copy(update={"meta": meta}), data if open_places(data) else None
 
 
 def write_map(path: Path, map: LogMap | Proposal) -> None:
@@ -243,12 +231,12 @@ def _import_own(log: Path, out: Path, suffix: str, tell: Share) -> ImportedRun:
     run = read_exported(log, tell)
     make_output_folder(out)
     record = _read_record(out)
-    _check_new(Log(log, {}), record, out)
+    _check_new(str(log), record, out)
     path = next_run(out, suffix)
     findings = tuple(check_table(run.table, str(log)))
     write_run(path, run.table, run.meta, run.simulation, run.robot)
     imported = ImportedRun(path, str(log), 0, (), findings, run.notes)
-    _write_record(out, record | {path.stem: _entry(imported)})
+    _add_to_record(out, record, imported)
     return imported
 
 
@@ -274,13 +262,6 @@ def _samples_of(run: Path) -> Path:
     return run.with_name(f"{run.stem}.samples.parquet")
 
 
-def _moved(run: ImportedRun, path: Path) -> ImportedRun:
-    """Move a run to its place, and its samples before it."""
-    os.replace(_samples_of(run.path), _samples_of(path))
-    os.replace(run.path, path)
-    return replace(run, path=path)
-
-
 def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Robot) -> tuple[Finding, ...]:
     """Return what is odd about a run; a refusal says from which topic and field the column came."""
     try:
@@ -290,18 +271,11 @@ def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Ro
         return findings
     except InputError as error:
         found = re.search(r"column '(\w+)'", str(error))
-        source = resolved.get(found.group(1)) if found else None
+        source = resolved.get(found[1]) if found else None
         if source is None:
             raise
         where = f"from topic '{source.topic}', field '{source.field}', read as {source.unit}: check its unit in the map"
         raise InputError(f"{error} ({where})") from None
-
-
-def _unnamed_robot(resolved: Mapping[str, Resolved], robot: Robot) -> Iterator[str]:
-    """Yield a note where currents or counts become torques, and nobody said of which robot."""
-    units = sorted({source.unit for column, source in resolved.items() if is_effort(column) and source.unit in CURRENTS})
-    if units:
-        yield f"efforts in {', '.join(units)} become N m by the torque constants of '{robot.name}': name your robot (--robot)"
 
 
 # ---- the record of what was imported ---------------------------------------------------------------------------------
@@ -315,31 +289,25 @@ def _read_record(out: Path) -> dict[str, Any]:
     return record
 
 
-def _check_new(log: Log | TopicStore, record: Mapping[str, Any], out: Path) -> None:
-    source = Log(log.path.resolve(), {}, part=log.part).name
+def _whole(source: str) -> str:
+    """Return a log's name with its whole path."""
+    path, comma, part = source.partition(", episode")
+    return f"{Path(path).resolve()}{comma}{part}"
+
+
+def _check_new(source: str, record: Mapping[str, Any], out: Path) -> None:
     for run, entry in record.items():
-        if isinstance(entry, dict) and entry.get("log") == source:
+        if isinstance(entry, dict) and entry.get("log") == _whole(source):
             hint = f"remove it, and its entry in {RECORD_FILE}, or name another folder"
-            raise InputError(f"{log.name}: {out / run} comes from it already: {hint}")
+            raise InputError(f"{source}: {out / run} comes from it already: {hint}")
 
 
-def _entry(run: ImportedRun) -> dict[str, Any]:
-    path, comma, part = run.source.partition(", episode")
+def _add_to_record(out: Path, record: dict[str, Any], run: ImportedRun) -> None:
+    facts = {fact.column: asdict(fact) for fact in run.facts}
     channels = {
-        fact.column: {
-            key: round(value, 6) if isinstance(value, float) else value
-            for key, value in asdict(fact).items()
-            if key != "column"
-        }
-        for fact in run.facts
+        column: {key: round(one, 6) if isinstance(one, float) else one for key, one in fact.items() if key != "column"}
+        for column, fact in facts.items()
     }
-    return {
-        "log": f"{Path(path).resolve()}{comma}{part}",
-        "origin_ns": run.origin,
-        "notes": list(run.notes),
-        "channels": channels,
-    }
-
-
-def _write_record(out: Path, record: Mapping[str, Any]) -> None:
-    write_text(out / RECORD_FILE, yaml.safe_dump(dict(record), sort_keys=False, default_flow_style=None, width=160))
+    entry = {"log": _whole(run.source), "origin_ns": run.origin, "notes": list(run.notes), "channels": channels}
+    record[run.path.stem] = entry
+    write_text(out / RECORD_FILE, yaml.safe_dump(record, sort_keys=False, default_flow_style=None, width=160))

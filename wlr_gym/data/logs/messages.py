@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -18,13 +18,24 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CAMERA, COLUMNS, FLOW, RunMeta
-from wlr_gym.data.replay import robot_of
 from wlr_gym.data.run_states import euler_angles, has_camera, measured_state, quaternion
-from wlr_gym.data.runs import Run, Simulation
+from wlr_gym.data.runs import Run, Simulation, robot_of
 from wlr_gym.physics.plants.base import standing_state
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.robot import CORNER_NAMES, CORNER_SIGNS, CORNERS, JOINTS, LEG_SLICE, LEGS, WHEELS, Robot, robot_content
+from wlr_gym.robot import (
+    CORNER_NAMES,
+    CORNER_SIGNS,
+    CORNERS,
+    JOINTS,
+    LEG_SLICE,
+    LEGS,
+    WHEEL_SLICE,
+    WHEELS,
+    Robot,
+    robot_content,
+)
 from wlr_gym.robot.interchange.urdf import urdf_text
+from wlr_gym.robot.parameter_table import XYZ
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import contact_slip_velocity
 
@@ -49,8 +60,9 @@ BODY, FLOOR = "body", "floor"
 LAYOUT = 1
 #: s; a header's seconds are 32 bits.
 _LAST_SECOND = 2**31 - 1
-_XYZ = "xyz"
 _KINDS = (("position", "pos"), ("velocity", "vel"), ("effort", "eff"))
+#: What fields that are no numbers hold where nothing is said of them.
+_NOTHING = {"string": "", "bool": False}
 
 
 class Sent(NamedTuple):
@@ -80,19 +92,34 @@ def definition(kind: str) -> str:
 
 
 def make(kind: str, **fields: Any) -> Any:
-    """Return a message of a type."""
-    return typestore().types[kind](**fields)
+    """Return a message of a type; mappings become the messages in it, and what is not given is zero or empty."""
+    store = typestore()
+    return store.types[kind](**{name: _field(of, fields.get(name)) for name, (_, of) in store.fielddefs[kind][1]})
 
 
-def sent(topic: str, kind: str, time: int, message: Any) -> Sent:
-    """Return a message as it is written."""
-    return Sent(topic, kind, time, bytes(typestore().serialize_cdr(message, kind)))
+def _field(of: Any, given: Any) -> Any:
+    """Return a field's value; it is of a type (its name), of a plain kind (name, length), or a list (what of, count)."""
+    if isinstance(of, str):
+        return make(of, **(given or {})) if given is None or isinstance(given, Mapping) else given
+    what, count = of
+    if isinstance(what, str):
+        return _NOTHING.get(what, 0.0 if what.startswith("float") else 0) if given is None else given
+    _, element = what
+    if isinstance(element, str):
+        return [_field(element, one) for one in given or ()]
+    if given is None:
+        return [] if element[0] == "string" else np.zeros(count, element[0])
+    return given
 
 
-def header(time: int, frame: str) -> Any:
+def sent(topic: str, kind: str, time: int, **fields: Any) -> Sent:
+    """Return a message as it is written; fields as of :func:`make`."""
+    return Sent(topic, kind, time, bytes(typestore().serialize_cdr(make(kind, **fields), kind)))
+
+
+def header(time: int, frame: str) -> dict[str, Any]:
     """Return the header of a message at ``time`` (ns)."""
-    stamp = make("builtin_interfaces/msg/Time", sec=time // 1_000_000_000, nanosec=time % 1_000_000_000)
-    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+    return {"stamp": {"sec": time // 1_000_000_000, "nanosec": time % 1_000_000_000}, "frame_id": frame}
 
 
 # ---- times -----------------------------------------------------------------------------------------------------------
@@ -135,57 +162,46 @@ def run_message(
         "meta": meta.content(),
         "simulation": simulation.model_dump(mode="json") if simulation else None,
     } | ({} if robot is None else {"robot": robot_content(robot)})
-    return sent(RUN, STRING, time, make(STRING, data=json.dumps(content)))
+    return sent(RUN, STRING, time, data=json.dumps(content))
 
 
 def row_messages(row: Mapping[str, float], time: int) -> Iterator[Sent]:
     """Yield the messages of one row; channels that it does not have are NaN or not sent."""
-    yield sent(JOINT_STATES, JOINT_STATE, time, _joint_state(row, time))
-    yield sent(COMMANDS, JOINT_STATE, time, _commands(row, time))
-    if any(f"{kind}_{axis}" in row for kind in ("gyro", "acc") for axis in _XYZ):
-        yield sent(IMU, IMU_TYPE, time, _imu(row, time))
+    of_body, of_floor = header(time, BODY), header(time, FLOOR)
+    states = {field: _values(row, [f"{kind}_{joint}" for joint in JOINTS]) for field, kind in _KINDS}
+    yield sent(JOINT_STATES, JOINT_STATE, time, header=of_body, name=list(JOINTS), **states)
+    # Legs are commanded in position, wheels in velocity; NaN = torque off.
+    commands, none = np.array([row[f"cmd_{joint}"] for joint in JOINTS]), np.full(len(LEGS), np.nan)
+    setpoints = {
+        "position": np.concatenate([commands[LEG_SLICE], none]),
+        "velocity": np.concatenate([none, commands[WHEEL_SLICE]]),
+    }
+    yield sent(COMMANDS, JOINT_STATE, time, header=of_body, name=list(JOINTS), **setpoints)
+    if any(f"{kind}_{axis}" in row for kind in ("gyro", "acc") for axis in XYZ):
+        yield sent(IMU, IMU_TYPE, time, header=of_body, **_imu(row))
     if "volt" in row:
-        yield sent(SUPPLY, SUPPLY_TYPE, time, make(SUPPLY_TYPE, header=header(time, BODY), voltage=row["volt"]))
+        yield sent(SUPPLY, SUPPLY_TYPE, time, header=of_body, voltage=row["volt"])
     frame = {name.removeprefix("cam_"): row.get(name, math.nan) for name in SEEN}
     if not all(map(math.isnan, frame.values())):
-        yield sent(CAMERA_TOPIC, CAMERA_TYPE, time, make(CAMERA_TYPE, header=header(time, FLOOR), **frame))
+        yield sent(CAMERA_TOPIC, CAMERA_TYPE, time, header=of_floor, **frame)
     flow = {name.removeprefix("flow_"): row.get(name, math.nan) for name in FLOW}
     if not all(map(math.isnan, flow.values())):
-        yield sent(FLOW_TOPIC, FLOW_TYPE, time, make(FLOW_TYPE, header=header(time, BODY), **flow))
+        yield sent(FLOW_TOPIC, FLOW_TYPE, time, header=of_body, **flow)
 
 
-def _joint_state(row: Mapping[str, float], time: int) -> Any:
-    fields = {field: _values(row, [f"{kind}_{joint}" for joint in JOINTS]) for field, kind in _KINDS}
-    return make(JOINT_STATE, header=header(time, BODY), name=list(JOINTS), **fields)
-
-
-def _commands(row: Mapping[str, float], time: int) -> Any:
-    """Legs are commanded in position, wheels in velocity; NaN = torque off."""
-    legs, wheels = (np.array([row[f"cmd_{joint}"] for joint in joints]) for joints in (LEGS, WHEELS))
-    none = np.full(len(LEGS), np.nan)
-    position, velocity = np.concatenate([legs, none]), np.concatenate([none, wheels])
-    empty = np.zeros(0)
-    return make(JOINT_STATE, header=header(time, BODY), name=list(JOINTS), position=position, velocity=velocity, effort=empty)
-
-
-def _imu(row: Mapping[str, float], time: int) -> Any:
+def _imu(row: Mapping[str, float]) -> dict[str, Any]:
     """A first covariance of -1 means that the message does not hold that quantity."""
     unknown = np.array([-1.0, *[0.0] * 8])
-    vectors = {kind: _values(row, [f"{kind}_{axis}" for axis in _XYZ]) for kind in ("gyro", "acc")}
-    known = {kind: np.zeros(9) if np.isfinite(values).any() else unknown for kind, values in vectors.items()}
-    vector = {
-        kind: make("geometry_msgs/msg/Vector3", **dict(zip(_XYZ, map(float, v), strict=True))) for kind, v in vectors.items()
-    }
-    return make(
-        IMU_TYPE,
-        header=header(time, BODY),
-        orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=unknown,
-        angular_velocity=vector["gyro"],
-        angular_velocity_covariance=known["gyro"],
-        linear_acceleration=vector["acc"],
-        linear_acceleration_covariance=known["acc"],
-    )
+    fields = {"orientation": {"w": 1.0}, "orientation_covariance": unknown}
+    for name, kind in (("angular_velocity", "gyro"), ("linear_acceleration", "acc")):
+        values = _values(row, [f"{kind}_{axis}" for axis in XYZ])
+        fields[name] = _vector(values)
+        fields[f"{name}_covariance"] = np.zeros(9) if np.isfinite(values).any() else unknown
+    return fields
+
+
+def _vector(values: Iterable[float]) -> dict[str, float]:
+    return dict(zip(XYZ, map(float, values), strict=True))
 
 
 def _values(row: Mapping[str, float], names: Sequence[str]) -> Array:
@@ -199,8 +215,8 @@ PLACES: dict[str, tuple[str, str]] = (
     {f"{kind}_{joint}": (JOINT_STATES, f"{field}[{joint}]") for field, kind in _KINDS for joint in JOINTS}
     | {f"cmd_{joint}": (COMMANDS, f"position[{joint}]") for joint in LEGS}
     | {f"cmd_{joint}": (COMMANDS, f"velocity[{joint}]") for joint in WHEELS}
-    | {f"gyro_{axis}": (IMU, f"angular_velocity.{axis}") for axis in _XYZ}
-    | {f"acc_{axis}": (IMU, f"linear_acceleration.{axis}") for axis in _XYZ}
+    | {f"gyro_{axis}": (IMU, f"angular_velocity.{axis}") for axis in XYZ}
+    | {f"acc_{axis}": (IMU, f"linear_acceleration.{axis}") for axis in XYZ}
     | {name: (CAMERA_TOPIC, name.removeprefix("cam_")) for name in SEEN}
     | {name: (FLOW_TOPIC, name.removeprefix("flow_")) for name in FLOW}
     | {"volt": (SUPPLY, "voltage")}
@@ -257,8 +273,7 @@ def display_messages(run: Run, times: list[int]) -> dict[int, list[Sent]]:
     step = max(round(1.0 / RATE / float(np.median(np.diff(run["t"])))), 1)
     rows = np.arange(0, len(times), step)
     robot = robot_of(run)
-    text = make(STRING, data=urdf_text(robot))
-    shown.setdefault(times[0], []).append(sent(DESCRIPTION, STRING, times[0], text))
+    shown.setdefault(times[0], []).append(sent(DESCRIPTION, STRING, times[0], data=urdf_text(robot)))
     motion = _motion(run, robot, rows, [times[row] for row in rows]) if has_camera(run) else [[] for _ in rows]
     angles = np.stack([run[f"pos_{joint}"][rows] for joint in JOINTS], axis=1)
     for row, moved, links in zip(rows, motion, _links(robot, angles, [times[row] for row in rows]), strict=True):
@@ -285,8 +300,9 @@ def _links(robot: Robot, angles: Array, times: list[int]) -> Iterator[Sent]:
 def _camera_pose(run: Run, row: int, time: int) -> Sent:
     z, pitch = (float(run[name][row]) if name in run else 0.0 for name in ("cam_z", "cam_pitch"))
     turn = quaternion(run["cam_yaw"][[row]], np.nan_to_num([pitch]), np.zeros(1))[0]
-    place = (float(run["cam_x"][row]), float(run["cam_y"][row]), float(np.nan_to_num(z)))
-    return sent(POSE, POSE_TYPE, time, make(POSE_TYPE, header=header(time, FLOOR), pose=_pose(place, turn)))
+    place = (run["cam_x"][row], run["cam_y"][row], np.nan_to_num(z))
+    pose = {"position": _vector(place), "orientation": _quaternion(turn)}
+    return sent(POSE, POSE_TYPE, time, header=header(time, FLOOR), pose=pose)
 
 
 def _motion(run: Run, robot: Robot, rows: NDArray[np.intp], times: list[int]) -> list[list[Sent]]:
@@ -314,55 +330,27 @@ def _feet(parameters: Parameters, position: Array, turn: Array, legs: Array) -> 
     return position[:, None, :2] + np.einsum("nij,nwj->nwi", level, hips + along)[..., :2], yaw
 
 
-def _pose(place: tuple[float, float, float], turn: Array) -> object:
-    point = make("geometry_msgs/msg/Point", x=place[0], y=place[1], z=place[2])
-    return make("geometry_msgs/msg/Pose", position=point, orientation=_quaternion(turn))
+def _quaternion(turn: Array) -> dict[str, float]:
+    return dict(zip("wxyz", map(float, turn), strict=True))
 
 
-def _quaternion(turn: Array) -> object:
-    w, x, y, z = map(float, turn)
-    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+def _transform(time: int, frame: str, child: str, position: Array, turn: Array) -> dict[str, Any]:
+    moved = {"translation": _vector(position), "rotation": _quaternion(turn)}
+    return {"header": header(time, frame), "child_frame_id": child, "transform": moved}
 
 
-def _transform(time: int, frame: str, child: str, position: Array, turn: Array) -> object:
-    x, y, z = map(float, position)
-    moved = make(
-        "geometry_msgs/msg/Transform", translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z), rotation=_quaternion(turn)
-    )
-    return make("geometry_msgs/msg/TransformStamped", header=header(time, frame), child_frame_id=child, transform=moved)
+def _transforms(time: int, transforms: list[dict[str, Any]]) -> Sent:
+    return sent(TRANSFORMS, TRANSFORM_TYPE, time, transforms=transforms)
 
 
-def _transforms(time: int, transforms: list[object]) -> Sent:
-    return sent(TRANSFORMS, TRANSFORM_TYPE, time, make(TRANSFORM_TYPE, transforms=transforms))
-
-
-def _markers(time: int, feet: Array, arrows: Array) -> Sent:
-    markers = [_arrow(time, k, feet[k], arrows[k]) for k in range(len(feet))]
-    return sent(SLIP, MARKER_TYPE, time, make(MARKER_TYPE, markers=markers))
-
-
-def _arrow(time: int, corner: int, foot: Array, velocity: Array) -> object:
-    tip = foot + _LENGTH * velocity
-    points = [make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.005) for x, y in (foot, tip)]
-    return make(
-        MARKER_TYPE.replace("Array", ""),
-        header=header(time, FLOOR),
-        ns=f"slip of {CORNER_NAMES[CORNERS[corner]]} wheel",
-        id=corner,
-        type=0,  # an arrow
-        action=0,
-        pose=_pose((0.0, 0.0, 0.0), np.array([1.0, 0.0, 0.0, 0.0])),
-        scale=make("geometry_msgs/msg/Vector3", x=_SHAFT, y=2 * _SHAFT, z=0.0),
-        color=make("std_msgs/msg/ColorRGBA", r=0.9, g=0.1, b=0.1, a=1.0),
-        lifetime=make("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-        frame_locked=False,
-        points=points,
-        colors=[],
-        texture_resource="",
-        texture=make("sensor_msgs/msg/CompressedImage", header=header(time, FLOOR), format="", data=np.zeros(0, np.uint8)),
-        uv_coordinates=[],
-        text="",
-        mesh_resource="",
-        mesh_file=make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-        mesh_use_embedded_materials=False,
-    )
+def _markers(time: int, feet: Array, velocities: Array) -> Sent:
+    """Return an arrow of each wheel's slip, from where it touches the floor."""
+    markers = []
+    for corner, (foot, velocity) in enumerate(zip(feet, velocities, strict=True)):
+        markers.append({
+            "header": header(time, FLOOR), "ns": f"slip of {CORNER_NAMES[CORNERS[corner]]} wheel", "id": corner,
+            "pose": {"orientation": {"w": 1.0}}, "scale": {"x": _SHAFT, "y": 2 * _SHAFT},
+            "color": {"r": 0.9, "g": 0.1, "b": 0.1, "a": 1.0}, "texture": {"header": header(time, FLOOR)},
+            "points": [_vector((*place, 0.005)) for place in (foot, foot + _LENGTH * velocity)],
+        })  # fmt: skip
+    return sent(SLIP, MARKER_TYPE, time, markers=markers)

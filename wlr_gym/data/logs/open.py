@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.logs import bags
 from wlr_gym.data.logs.tables import INFO, TABLE, read_lerobot, read_table
-from wlr_gym.data.logs.topics import BLOCK, Collector, Log, Message, Share, TopicStore
+from wlr_gym.data.logs.topics import Collector, Log, Message, Share
 
 #: Topic -> fields that are read; None = all topics and all their fields.
 Wanted = Mapping[str, Collection[str]]
@@ -21,7 +20,9 @@ def quiet(share: float) -> None:
 
 
 def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None = None, tell: Share = quiet) -> Iterator[Log]:
-    """Yield what a file or folder holds, in memory: one recording, or the episodes of a LeRobot data set.
+    """Yield what a file or folder holds: one recording, or the episodes of a LeRobot data set.
+
+    Of messages, which are read one after the other, only the numbers are kept, 8 bytes each.
 
     Args:
         path: what was recorded.
@@ -32,99 +33,71 @@ def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None =
     Raises:
         InputError: no such file, or one that cannot be read.
     """
-    for recording in read_recordings(path, wanted, most, tell):
-        with closing(recording):
-            yield recording.whole()
-
-
-def read_recordings(
-    path: str | Path, wanted: Wanted | None = None, most: int | None = None, tell: Share = quiet
-) -> Iterator[TopicStore]:
-    """Yield what a file or folder holds, as :func:`read_logs`, in bounded memory. Close each.
-
-    Messages are read one after the other, and of each only its numbers are kept.
-
-    Raises:
-        InputError: no such file, or one that cannot be read.
-    """
     path = Path(path)
-    _require_content(path)
+    read = _reader(path)
     columns = None if wanted is None else wanted.get(TABLE, ())
-    if (path / INFO).is_file():
+    if read is not None:
+        yield _gathered(path, read, wanted, most, tell)
+    elif path.is_dir():
         yield from read_lerobot(path, columns, tell)
-    elif _is_table(path):
-        yield read_table(path, columns, most, tell)
     else:
-        yield _gathered(path, _reader(path), wanted, most, tell)
+        yield read_table(path, columns, most)
 
 
-def _require_content(path: Path) -> None:
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
-    if path.is_file() and path.stat().st_size == 0:
-        raise InputError(f"{path}: empty file")
-
-
-def _is_table(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in (".csv", ".parquet")
-
-
-def _reader(path: Path) -> Callable[..., Iterator[Message]]:
-    if path.is_dir():
-        if (path / bags.METADATA).is_file() or any(path.glob("*.db3")) or any(path.glob("*.mcap")):
-            return bags.bag_messages
-        raise InputError(f"{path}: no bag and no data set in it; expected {_KINDS}")
-    if path.suffix.lower() == ".mcap":
-        return bags.mcap_messages
-    if path.suffix.lower() in (".db3", ".bag"):
-        return bags.bag_messages
-    raise InputError(f"{path}: '{path.suffix}' files are not read; expected {_KINDS}")
-
-
-def _gathered(
-    path: Path, read: Callable[..., Iterator[Message]], wanted: Wanted | None, most: int | None, tell: Share
-) -> TopicStore:
-    recording = TopicStore(path)
-    collectors: dict[str, Collector] = {}
-    counts: dict[str, int] = {}
-    kinds: dict[str, str] = {}
-    topics = None if wanted is None else {name.partition(" (")[0] for name in wanted}
-
-    def wants(topic: str) -> bool:
-        recording.known.add(topic)
-        return (topics is None or topic in topics) and (most is None or counts.get(topic, 0) < most)
-
-    try:
-        for message in read(path, wants, recording.notes, tell):
-            same = kinds.setdefault(message.topic, message.kind) == message.kind
-            name = message.topic if same else f"{message.topic} ({message.kind})"
-            if (wanted is not None and name not in wanted) or (most is not None and counts.get(name, 0) >= most):
-                continue
-            if name not in collectors:
-                collectors[name] = Collector(message.kind, None if wanted is None else wanted[name])
-            collectors[name].add(message)
-            counts[name] = counts.get(name, 0) + 1
-            if len(collectors[name]) == BLOCK:
-                recording.add(collectors.pop(name).topic(name))
-        for name, collector in collectors.items():
-            recording.add(collector.topic(name))
-        recording.notes += [f"two types on one topic: the second is '{name}'" for name in counts if name not in kinds]
-        if recording.empty and wanted is None:
-            raise InputError(f"{path}: no message that can be read{''.join('; ' + note for note in recording.notes)}")
-    except BaseException:
-        recording.close()
-        raise
-    return recording
-
-
-def first_messages(path: str | Path) -> Iterator[Message]:
+def first_messages(path: Path) -> Iterator[Message]:
     """Yield the messages of a log from its beginning; none of a table.
 
     Raises:
         InputError: no such file, or one that cannot be read.
     """
-    path = Path(path)
-    _require_content(path)
-    if _is_table(path) or (path / INFO).is_file():
-        return iter(())
-    return _reader(path)(path, lambda topic: True, [], quiet)
+    read = _reader(path)
+    return iter(()) if read is None else read(path, lambda topic: True, [], quiet)
+
+
+def _reader(path: Path) -> Callable[..., Iterator[Message]] | None:
+    """Return what reads a log's messages; None = it is a table."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; expected {_KINDS}")
+    if path.is_dir():
+        if (path / INFO).is_file():
+            return None
+        if (path / bags.METADATA).is_file() or any(path.glob("*.db3")) or any(path.glob("*.mcap")):
+            return bags.bag_messages
+        raise InputError(f"{path}: no bag and no data set in it; expected {_KINDS}")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path}: empty file")
+    readers = {".mcap": bags.mcap_messages, **dict.fromkeys((".db3", ".bag"), bags.bag_messages)}
+    suffix = path.suffix.lower()
+    if suffix not in (*readers, ".csv", ".parquet"):
+        raise InputError(f"{path}: '{path.suffix}' files are not read; expected {_KINDS}")
+    return readers.get(suffix)
+
+
+def _gathered(path: Path, read: Callable[..., Iterator[Message]], wanted: Wanted | None, most: int | None, tell: Share) -> Log:
+    """Gather a bag's messages; those of a second type on a topic become a topic ``/name (type)``."""
+    notes: list[str] = []
+    known: set[str] = set()
+    collectors: dict[str, Collector] = {}
+    topics = None if wanted is None else {name.partition(" (")[0] for name in wanted}
+
+    def is_full(name: str) -> bool:
+        return most is not None and name in collectors and len(collectors[name]) >= most
+
+    def wants(topic: str) -> bool:
+        known.add(topic)
+        return (topics is None or topic in topics) and not is_full(topic)
+
+    kinds: dict[str, str] = {}
+    for message in read(path, wants, notes, tell):
+        first = kinds.setdefault(message.topic, message.kind)
+        name = message.topic if message.kind == first else f"{message.topic} ({message.kind})"
+        if (wanted is not None and name not in wanted) or is_full(name):
+            continue
+        if name not in collectors:
+            collectors[name] = Collector(name, message.kind, None if wanted is None else wanted[name])
+        collectors[name].add(message)
+    notes += [f"two types on one topic: the second is '{name}'" for name in collectors if name not in kinds]
+    if not collectors and wanted is None:
+        raise InputError(f"{path}: no message that can be read{''.join('; ' + note for note in notes)}")
+    found = {name: collectors.pop(name).topic() for name in list(collectors)}
+    return Log(path, found, tuple(notes), known=frozenset(known))

@@ -1,15 +1,11 @@
-"""Make runs of a recording by a map: rows at the true times of one topic, and every sample of every channel beside them.
-
-Long recordings are made part by part: as much of one is in memory as a part needs; cuts are where the robot is quiet.
-"""
+"""Make runs of a recording by a map: rows at the true times of one topic, and every sample of every channel beside them."""
 
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +15,21 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, REQUIRED
 from wlr_gym.data.logs.map import LogMap, Resolved
 from wlr_gym.data.logs.tables import TABLE
-from wlr_gym.data.logs.topics import LOG, Log, Share, Topic, TopicStore
+from wlr_gym.data.logs.topics import LOG, Log, Topic
 from wlr_gym.data.run_states import euler_angles
 from wlr_gym.robot import JOINTS, WHEELS
 from wlr_gym.robot.parameter_table import XYZ
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
+#: Times (ns) and values of a channel.
+Series = tuple[Times, Array]
 
 #: Angles that can be taken of a quaternion.
 ANGLES = ("yaw", "pitch", "roll", "tilt")
 
 
-def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> tuple[Times, Array]:
+def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> Series:
     """Return times (ns) and an angle (rad) of a quaternion: ``yaw``, ``pitch``, ``roll``, or ``tilt`` off upright.
 
     Lost frames, whose quaternion is no rotation, are left out.
@@ -197,7 +195,7 @@ def with_torque_off(topic: Topic, setpoint: str, angle: str) -> Topic:
     return replace(topic, fields={**topic.fields, setpoint: (rows[order], values[order])})
 
 
-def without_wraps(series: Mapping[str, tuple[Times, Array]], joint: str) -> tuple[Array, str]:
+def without_wraps(series: Mapping[str, Series], joint: str) -> tuple[Array, str]:
     """Return a joint's angles, jumps undone where they start anew after a turn or half of one; and what is to be said of it.
 
     Args:
@@ -218,7 +216,7 @@ def without_wraps(series: Mapping[str, tuple[Times, Array]], joint: str) -> tupl
     return np.unwrap(values), f"'pos_{joint}': turns are a guess {where}: at {rate:.3g} rad/s that may be more than half a turn"
 
 
-def _fastest(series: Mapping[str, tuple[Times, Array]], channel: str) -> float:
+def _fastest(series: Mapping[str, Series], channel: str) -> float:
     """Return the highest rate of a channel, rad/s; 0 where it is not known."""
     rates = np.abs(series[channel][1]) if channel in series else np.zeros(0)
     return float(rates[np.isfinite(rates)].max(initial=0.0))
@@ -231,14 +229,6 @@ def _fastest(series: Mapping[str, tuple[Times, Array]], channel: str) -> float:
 _END = 1_000_000_000
 #: Rates of joints' messages from which on not every one makes a row, Hz.
 _QUICK = 75.0
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """A channel's samples, all of them: seconds on the run's clock, and values in SI units."""
-
-    t: Array
-    values: Array
 
 
 @dataclass(frozen=True)
@@ -272,17 +262,17 @@ class MadeRun:
 
     Attributes:
         table: columns of a run, (rows,).
-        samples: channel -> every sample, at its own time.
+        samples: channel -> every sample: its time on the run's clock (s), and value (SI units).
         facts: how the rows came about.
         origin: ns on the log's clock where the run's ``t`` is 0.
         notes: what was left out or changed.
     """
 
     table: dict[str, Array]
-    samples: dict[str, Samples]
+    samples: dict[str, tuple[Array, Array]]
     facts: tuple[ChannelFact, ...]
     origin: int
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...]
 
 
 def wanted_fields(resolved: Mapping[str, Resolved]) -> dict[str, set[str]]:
@@ -294,11 +284,13 @@ def wanted_fields(resolved: Mapping[str, Resolved]) -> dict[str, set[str]]:
     return wanted
 
 
-class NoRowsError(InputError):
-    """Nowhere, or nowhere between the times that were asked for, is there all that a row needs."""
+_MISSING = {
+    "cmd": "the setpoints that drove the robot, which every replay needs; without them no simulator can be compared",
+    "pos": "the joints' angles, which every replay is compared with",
+}
 
 
-def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between: tuple[int, int] | None = None) -> MadeRun:
+def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeRun:
     """Return the run that a map makes of a log.
 
     Every message of one topic makes a row, at its true time; a channel with a sample at that time has it as it is. Of the
@@ -308,267 +300,204 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved], between:
         log: what was recorded.
         found: the map.
         resolved: what it means for each channel.
-        between: ns; rows from the first to before the second only: what the log has around them says what holds at their ends,
-            and channels that are unknown all that time are left out. None = all.
 
     Raises:
-        InputError: a required channel, a topic or a field is missing.
-        NoRowsError: no two rows have all that a row needs.
-    """
-    check_sources(log.name, resolved)
-    return _Making(log, found, dict(resolved), between).run()
-
-
-_MISSING = {
-    "cmd": "the setpoints that drove the robot, which every replay needs; without them no simulator can be compared",
-    "pos": "the joints' angles, which every replay is compared with",
-}
-
-
-def check_sources(log: str, resolved: Mapping[str, Resolved]) -> None:
-    """Refuse a map that lacks a required channel.
-
-    Raises:
-        InputError: naming the log and the channels, and what they are for.
+        InputError: a required channel, a topic or a field is missing, or no two rows have all that a row needs.
     """
     missing = [name for name in REQUIRED if name != "t" and name not in resolved]
     if missing:
-        raise InputError(f"{log}: no source for {', '.join(missing)}: {_MISSING[missing[0].partition('_')[0]]}")
+        raise InputError(f"{log.name}: no source for {', '.join(missing)}: {_MISSING[missing[0].partition('_')[0]]}")
+    notes: list[str] = []
+    _note_odd_times(log, found, resolved, notes)
+    series = _read_series(log, found, resolved, notes)
+    times = _row_times(log, found, resolved, series, notes)
+    times = _complete(log, resolved, series, times, notes)
+    times = _without_holes(log, resolved, series, times, notes)
+    origin, period = int(times[0]), float(np.median(np.diff(times))) * 1e-9
+    table, samples, facts = {"t": (times - origin) * 1e-9}, {}, []
+    for column, source in resolved.items():
+        at, values = series[column]
+        values = np.unwrap(values) if column == "cam_yaw" else values
+        table[column], how, moved = _at_rows(times, at, values, source.take, period)
+        samples[column] = ((at - origin) * 1e-9, values)
+        rate, known = 1e9 / float(np.median(np.diff(at))), float(np.isfinite(table[column]).mean())
+        facts.append(ChannelFact(column, source.topic, source.field, source.unit, rate, how, moved, known))
+    _note_silent(resolved, series, times, notes)
+    off = np.isnan([table[name] for name in COMMANDS])
+    if off.any():
+        column = COMMANDS[int(np.argmax(off.any(axis=1)))]
+        notes.append(f"{off.any(axis=0).sum()} rows have no setpoint, '{column}' among them: torque off")
+    table = {name: table[name] for name in COLUMNS if name in table}
+    return _from_start(MadeRun(table, samples, tuple(facts), origin, tuple(notes)))
 
 
-def rows_topic(found: LogMap, resolved: Mapping[str, Resolved]) -> str:
-    """Return the topic whose messages make the rows."""
-    return found.rows or resolved[f"pos_{JOINTS[0]}"].topic
+def _from_start(made: MadeRun) -> MadeRun:
+    """Return a run whose wheels' angles count from its start."""
+    table, samples = dict(made.table), dict(made.samples)
+    for wheel in (f"pos_{wheel}" for wheel in WHEELS):
+        start, (t, values) = table[wheel][0], samples[wheel]
+        table[wheel], samples[wheel] = table[wheel] - start, (t, values - start)
+    return replace(made, table=table, samples=samples)
 
 
-@dataclass(eq=False)
-class _Making:
-    """A run that is being made: each channel's samples (ns on the common clock, SI units), and what is to be said of it."""
-
-    log: Log
-    map: LogMap
-    sources: dict[str, Resolved]
-    between: tuple[int, int] | None
-    series: dict[str, tuple[Times, Array]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    def run(self) -> MadeRun:
-        self._say_odd_times()
-        self._read(self._lost_frames())
-        times = self._without_holes(self._complete(self._row_times()))
-        origin, period = int(times[0]), float(np.median(np.diff(times))) * 1e-9
-        table: dict[str, Array] = {"t": _seconds(times, origin)}
-        facts, samples = [], {}
-        seconds = {id(at): _seconds(at, origin) for at, _ in self.series.values()}
-        for column, source in self.sources.items():
-            at, values = self.series[column]
-            values = np.unwrap(values) if column == "cam_yaw" else values
-            table[column], fact = _taken(times, at, values, source, period)
-            samples[column] = Samples(seconds[id(at)], values)
-            facts.append(fact)
-        for wheel in (f"pos_{wheel}" for wheel in WHEELS):
-            start = table[wheel][0]
-            table[wheel] = table[wheel] - start
-            samples[wheel] = Samples(samples[wheel].t, samples[wheel].values - start)
-        self._say_silent(times)
-        off = np.isnan([table[name] for name in COMMANDS])
-        if off.any():
-            column = COMMANDS[int(np.argmax(off.any(axis=1)))]
-            self.notes.append(f"{off.any(axis=0).sum()} rows have no setpoint, '{column}' among them: torque off")
-        return MadeRun(
-            {name: table[name] for name in COLUMNS if name in table}, samples, tuple(facts), origin, tuple(self.notes)
-        )
-
-    # ---- samples ----------------------------------------------------------------------------------------------------
-
-    def _say_odd_times(self) -> None:
-        """Say of which topics messages have the time of the one before, of which only the later counts, or go back in time."""
-        for name in dict.fromkeys(source.topic for source in self.sources.values()):
-            topic, use = self.log.topic(name), self.map.use(name).use
-            times = self._within(topic.clock(use), name)
-            count = _repetitions(times)
-            received = _repetitions(topic.received) if self.between is None else 0
-            hint = f": in the map, clocks: {{{name}: {{use: log}}}}" if use != LOG and received < count else ""
-            if count:
-                self.notes.append(f"topic '{name}': {count} of {len(times)} messages repeat a time and are left out{hint}")
-            back = np.diff(times)
-            if (back < 0).any():
-                much = f"{(back < 0).sum()} times, by up to {-back.min() * 1e-9:.3g} s"
-                anew = "; a clock that began anew mixes two recordings: 'use: log'" if back.min() < -1e9 and use != LOG else ""
-                self.notes.append(f"topic '{name}': its times go back {much}: sorted by time{anew}")
-
-    def _within(self, at: Times, topic: str) -> Times:
-        """Return those of a topic's times (ns, its own clock) that are in the span of rows."""
-        if self.between is None:
-            return at
-        moved = at + round(self.map.use(topic).offset * 1e9)
-        return at[(moved >= self.between[0]) & (moved < self.between[1])]
-
-    def _lost_frames(self) -> dict[str, Times]:
-        """Return topic -> times (ns) of frames without a rotation, where there are any."""
-        yaw = self.sources.get("cam_yaw")
-        if yaw is None:
-            return {}
-        where = f"{self.log.name}: channel 'cam_yaw'"
-        at = lost_frames(self.log.topic(yaw.topic), yaw.field, self.map.use(yaw.topic).use, where)
-        if count := len(self._within(at, yaw.topic)):
-            self.notes.append(f"topic '{yaw.topic}': {count} lost frame{'s are' if count > 1 else ' is'} left out")
-        return {yaw.topic: at}
-
-    def _read(self, lost: Mapping[str, Times]) -> None:
-        for column, source in list(self.sources.items()):
-            at, values = self._series(column, lost)
-            if len(at) < 2:
-                text = f"topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2"
-                if self.between is None or column in REQUIRED:
-                    raise NoRowsError(f"{self.log.name}: channel '{column}': {text}")
-                self.notes.append(f"'{column}' is left out: {text}")
-                del self.sources[column]
-                continue
-            same = (other for other, _ in self.series.values() if np.array_equal(other, at))
-            self.series[column] = (next(same, at), values)  # a topic's channels share their times
-        for joint in JOINTS:
-            angles, said = without_wraps(self.series, joint)
-            self.series[f"pos_{joint}"] = (self.series[f"pos_{joint}"][0], angles)
-            self.notes += [said] if said else []
-
-    def _series(self, column: str, lost: Mapping[str, Times]) -> tuple[Times, Array]:
-        """Return a channel's samples in SI units on the common clock, in the order of time; times once only."""
-        source = self.sources[column]
-        topic, clock = self.log.topic(source.topic), self.map.use(source.topic)
-        if column in COMMANDS and (angle := self.sources[column.replace("cmd", "pos")]).topic == source.topic:
-            topic = with_torque_off(topic, source.field, angle.field)
-        where = f"{self.log.name}: channel '{column}'"
-        if source.field in topic.fields or source.field.rpartition(".")[2] not in ANGLES:
-            at, raw = topic.series(source.field, clock.use, where)
-        else:
-            at, raw = pose_angle(topic, source.field, clock.use, self.map.frames.get("cam"), where)
-        if column in CAMERA and source.topic in lost:
-            seen = ~np.isin(at, lost[source.topic])
-            at, raw = at[seen], raw[seen]
-        at = at + round(clock.offset * 1e9)
-        keep = np.concatenate([np.diff(at) > 0, [True]])  # of two at one time, the later message
-        if column not in COMMANDS:
-            keep &= np.isfinite(raw)
-        if not keep.all():
-            at, raw = at[keep], raw[keep]
-        return at, source.sign * (source.factor * raw - source.zero)
-
-    # ---- times of rows ----------------------------------------------------------------------------------------------
-
-    def _row_times(self) -> Times:
-        rows = rows_topic(self.map, self.sources)
-        of_rows = [self.series[column][0] for column, source in self.sources.items() if source.topic == rows]
-        if not of_rows:
-            raise InputError(f"{self.log.name}: rows = '{rows}': no channel comes from that topic")
-        times = max(of_rows, key=len)
-        if self.between is not None:
-            times = times[(times >= self.between[0]) & (times < self.between[1])]
-        times = times[:: self.map.every]
-        if len(times) < 2:
-            raise NoRowsError(f"{self.log.name}: topic '{rows}': {len(times)} messages; a run has at least 2")
-        rate = 1e9 / float(np.median(np.diff(times)))
-        if rate > _QUICK:
-            hint = f"'every: {round(rate / 50)}' takes 50"
-            self.notes.append(f"rows come {rate:.0f} times a second, from topic '{rows}': {hint}")
-        return times
-
-    def _complete(self, times: Times) -> Times:
-        """Return the rows that have all required channels, less up to a second at the ends where others begin later.
-
-        The last setpoint holds to the end of the rows: some robots are sent one only when it changes.
-        """
-        half = int(np.median(np.diff(times)) / 2)
-        begins = {name: int(self.series[name][0][0]) - half for name in REQUIRED if name in self.series}
-        ends = {
-            name: int(at[-1]) + half
-            for name, (at, _) in self.series.items()
-            if name in REQUIRED and self.sources[name].take != "hold"
-        }
-        first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
-        for name, (at, _) in self.series.items():
-            if self.sources[name].take in ("interpolate", "nearest"):
-                reach = int(np.median(np.diff(at)) / 2)
-                if at[0] - reach < first + _END:
-                    begins[name] = int(at[0]) - reach
-                if at[-1] + reach > last - _END:
-                    ends[name] = int(at[-1]) + reach
-        first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
-        kept = times[(times >= first) & (times <= last)]
-        if len(kept) < 2:
-            spans = [
-                f"{name} from {self.series[name][0][0] * 1e-9:.3f} to {self.series[name][0][-1] * 1e-9:.3f} s"
-                for name in REQUIRED[1::8]
-            ]
-            together = f"setpoints and positions are never known together ({'; '.join(spans)}): check 'clocks'"
-            raise NoRowsError(f"{self.log.name}: {together}")
-        sides = (
-            (times[times < first], "beginning", max(begins, key=lambda name: begins[name])),
-            (times[times > last], "end", min(ends, key=lambda name: ends[name], default="")),
-        )
-        for rows, side, name in sides:
-            if len(rows):
-                text = f"'{name}' (topic '{self.sources[name].topic}') is not known there"
-                self.notes.append(f"{len(rows)} rows ({len(rows) * 2e-9 * half:.1f} s) at the {side} are left out: {text}")
-        return kept
-
-    def _without_holes(self, times: Times) -> Times:
-        """Return the rows at which all angles are known: where another topic than the rows' is silent, some are not."""
-        said, keep, step = [], np.ones(len(times), bool), float(np.median(np.diff(times))) * 1e-9
-        for name in (one for one in REQUIRED if one in self.series and self.sources[one].take == "interpolate"):
-            missing = keep & ~bridged(times, self.series[name][0])
-            keep &= ~missing
-            if missing.any():
-                text = f"'{name}' (topic '{self.sources[name].topic}') has a hole there"
-                said.append(f"{missing.sum()} rows ({missing.sum() * step:.1f} s) are left out: {text}")
-        if keep.sum() < 2:
-            raise NoRowsError(f"{self.log.name}: no two rows have all that a row needs: {'; '.join(said)}")
-        self.notes += said
-        return times[keep]
-
-    def _say_silent(self, times: Times) -> None:
-        """Say where a setpoint is held for longer than usual: nothing came, or nothing changed."""
-        said = set()
-        step = float(np.median(np.diff(times)))
-        for name, (at, _) in self.series.items():
-            topic = self.sources[name].topic
-            if self.sources[name].take != "hold" or topic in said:
-                continue
-            age = times - at[np.clip(np.searchsorted(at, times + round(0.5 * step), side="right") - 1, 0, len(at) - 1)]
-            held = age > hole(at)
-            if held.any():
-                said.add(topic)
-                text = f"its last message is held over {held.sum()} rows ({held.sum() * step * 1e-9:.1f} s)"
-                self.notes.append(f"topic '{topic}': silent for up to {age.max() * 1e-9:.1f} s: {text}")
-
-
-def _seconds(times: Times, origin: int) -> Array:
-    return np.asarray((times - origin) * 1e-9, np.float64)
-
-
-def _repetitions(times: Times) -> int:
-    return len(times) - len(np.unique(times))
-
-
-def _taken(times: Times, at: Times, values: Array, source: Resolved, period: float) -> tuple[Array, ChannelFact]:
+def _at_rows(times: Times, at: Times, values: Array, take: str, period: float) -> tuple[Array, str, float]:
+    """Return a channel's values at the rows, how they came about, and how far they were moved (s, rms)."""
     place = np.minimum(np.searchsorted(at, times), len(at) - 1)
     exact = at[place] == times
     if exact.all():
-        result, how, moved = values[place], "as recorded", 0.0
-    else:
-        take, how = TAKES[source.take]
-        result, moved = take(times, at, values, period)
-        result = np.where(exact, values[place], result)
-    rate = 1e9 / float(np.median(np.diff(at)))
-    known = float(np.isfinite(result).mean())
-    return result, ChannelFact(source.column, source.topic, source.field, source.unit, rate, how, moved, known)
+        return values[place], "as recorded", 0.0
+    function, how = TAKES[take]
+    result, moved = function(times, at, values, period)
+    return np.where(exact, values[place], result), how, moved
 
 
-# ---- part by part ----------------------------------------------------------------------------------------------------
+# ---- samples of a channel --------------------------------------------------------------------------------------------
 
 
-#: s, and numbers of the log, that a part may have (250 s of 40 channels at 200 Hz); ``split`` may ask for longer ones.
-LONGEST, NUMBERS = 600.0, 2_000_000
+def _note_odd_times(log: Log, found: LogMap, resolved: Mapping[str, Resolved], notes: list[str]) -> None:
+    """Note of which topics messages have the time of the one before, of which only the later counts, or go back in time."""
+    for name in dict.fromkeys(source.topic for source in resolved.values()):
+        topic, use = log.topic(name), found.use(name).use
+        times = topic.clock(use)
+        repeated, received = (len(one) - len(np.unique(one)) for one in (times, topic.received))
+        if repeated:
+            hint = f": in the map, clocks: {{{name}: {{use: log}}}}" if use != LOG and received < repeated else ""
+            notes.append(f"topic '{name}': {repeated} of {len(times)} messages repeat a time and are left out{hint}")
+        back = np.diff(times)
+        if (back < 0).any():
+            much = f"{(back < 0).sum()} times, by up to {-back.min() * 1e-9:.3g} s"
+            anew = "; a clock that began anew mixes two recordings: 'use: log'" if back.min() < -1e9 and use != LOG else ""
+            notes.append(f"topic '{name}': its times go back {much}: sorted by time{anew}")
+
+
+def _read_series(log: Log, found: LogMap, resolved: Mapping[str, Resolved], notes: list[str]) -> dict[str, Series]:
+    """Return each channel's samples in SI units on the common clock, in the order of time; times once only."""
+    lost: Times = np.zeros(0, np.int64)
+    yaw = resolved.get("cam_yaw")
+    if yaw is not None:
+        where = f"{log.name}: channel 'cam_yaw'"
+        lost = lost_frames(log.topic(yaw.topic), yaw.field, found.use(yaw.topic).use, where)
+        if len(lost):
+            notes.append(f"topic '{yaw.topic}': {len(lost)} lost frame{'s are' if len(lost) > 1 else ' is'} left out")
+    series = {}
+    for column, source in resolved.items():
+        topic, clock = log.topic(source.topic), found.use(source.topic)
+        where = f"{log.name}: channel '{column}'"
+        if column in COMMANDS and (angle := resolved[column.replace("cmd", "pos")]).topic == source.topic:
+            topic = with_torque_off(topic, source.field, angle.field)
+        if source.field in topic.fields or source.field.rpartition(".")[2] not in ANGLES:
+            at, raw = topic.series(source.field, clock.use, where)
+        else:
+            at, raw = pose_angle(topic, source.field, clock.use, found.frames.get("cam"), where)
+        keep = np.concatenate([np.diff(at) > 0, [True]])  # of two at one time, the later message
+        if column not in COMMANDS:
+            keep &= np.isfinite(raw)
+        if yaw is not None and column in CAMERA and source.topic == yaw.topic:
+            keep &= ~np.isin(at, lost)
+        at, raw = at[keep] + round(clock.offset * 1e9), raw[keep]
+        if len(at) < 2:
+            text = f"topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2"
+            raise InputError(f"{where}: {text}")
+        series[column] = at, source.sign * (source.factor * raw - source.zero)
+    for joint in JOINTS:
+        angles, said = without_wraps(series, joint)
+        series[f"pos_{joint}"] = series[f"pos_{joint}"][0], angles
+        notes += [said] if said else []
+    return series
+
+
+# ---- times of rows ---------------------------------------------------------------------------------------------------
+
+
+def _row_times(
+    log: Log, found: LogMap, resolved: Mapping[str, Resolved], series: Mapping[str, Series], notes: list[str]
+) -> Times:
+    topic = found.rows or resolved[f"pos_{JOINTS[0]}"].topic
+    of_rows = [series[column][0] for column, source in resolved.items() if source.topic == topic]
+    if not of_rows:
+        raise InputError(f"{log.name}: rows = '{topic}': no channel comes from that topic")
+    times = max(of_rows, key=len)[:: found.every]
+    if len(times) < 2:
+        raise InputError(f"{log.name}: topic '{topic}': {len(times)} messages; a run has at least 2")
+    rate = 1e9 / float(np.median(np.diff(times)))
+    if rate > _QUICK:
+        hint = f"'every: {round(rate / 50)}' takes 50"
+        notes.append(f"rows come {rate:.0f} times a second, from topic '{topic}': {hint}")
+    return times
+
+
+def _complete(
+    log: Log, resolved: Mapping[str, Resolved], series: Mapping[str, Series], times: Times, notes: list[str]
+) -> Times:
+    """Return the rows that have all required channels, less up to a second at the ends where others begin later.
+
+    The last setpoint holds to the end of the rows: some robots are sent one only when it changes.
+    """
+    half = int(np.median(np.diff(times)) / 2)
+    required = [name for name in REQUIRED if name in series]
+    begins = {name: int(series[name][0][0]) - half for name in required}
+    ends = {name: int(series[name][0][-1]) + half for name in required if resolved[name].take != "hold"}
+    first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
+    for name in (one for one in series if resolved[one].take in ("interpolate", "nearest")):
+        at = series[name][0]
+        reach = int(np.median(np.diff(at)) / 2)
+        if at[0] - reach < first + _END:
+            begins[name] = int(at[0]) - reach
+        if at[-1] + reach > last - _END:
+            ends[name] = int(at[-1]) + reach
+    first, last = max(begins.values()), min(ends.values(), default=int(times[-1]))
+    kept = times[(times >= first) & (times <= last)]
+    if len(kept) < 2:
+        known = {name: series[name][0][[0, -1]] * 1e-9 for name in REQUIRED[1::8]}
+        spans = [f"{name} from {begin:.3f} to {end:.3f} s" for name, (begin, end) in known.items()]
+        raise InputError(f"{log.name}: setpoints and positions are never known together ({'; '.join(spans)}): check 'clocks'")
+    for count, side, name in (
+        ((times < first).sum(), "beginning", max(begins, key=lambda name: begins[name])),
+        ((times > last).sum(), "end", min(ends, key=lambda name: ends[name], default="")),
+    ):
+        if count:
+            text = f"'{name}' (topic '{resolved[name].topic}') is not known there"
+            notes.append(f"{count} rows ({count * 2e-9 * half:.1f} s) at the {side} are left out: {text}")
+    return kept
+
+
+def _without_holes(
+    log: Log, resolved: Mapping[str, Resolved], series: Mapping[str, Series], times: Times, notes: list[str]
+) -> Times:
+    """Return the rows at which all angles are known: where another topic than the rows' is silent, some are not."""
+    said, keep, step = [], np.ones(len(times), bool), float(np.median(np.diff(times))) * 1e-9
+    for name in (one for one in REQUIRED if one in series and resolved[one].take == "interpolate"):
+        missing = keep & ~bridged(times, series[name][0])
+        keep &= ~missing
+        if missing.any():
+            text = f"'{name}' (topic '{resolved[name].topic}') has a hole there"
+            said.append(f"{missing.sum()} rows ({missing.sum() * step:.1f} s) are left out: {text}")
+    if keep.sum() < 2:
+        raise InputError(f"{log.name}: no two rows have all that a row needs: {'; '.join(said)}")
+    notes += said
+    return times[keep]
+
+
+def _note_silent(resolved: Mapping[str, Resolved], series: Mapping[str, Series], times: Times, notes: list[str]) -> None:
+    """Note where a setpoint is held for longer than usual: nothing came, or nothing changed."""
+    said, step = set(), float(np.median(np.diff(times)))
+    for name, (at, _) in series.items():
+        topic = resolved[name].topic
+        if resolved[name].take != "hold" or topic in said:
+            continue
+        age = times - at[np.clip(np.searchsorted(at, times + round(0.5 * step), side="right") - 1, 0, len(at) - 1)]
+        rows = int((age > hole(at)).sum())
+        if rows:
+            said.add(topic)
+            text = f"its last message is held over {rows} rows ({rows * step * 1e-9:.1f} s)"
+            notes.append(f"topic '{topic}': silent for up to {age.max() * 1e-9:.1f} s: {text}")
+
+
+# ---- several runs of one recording -----------------------------------------------------------------------------------
+
+
+#: s; a longer recording becomes several runs.
+LONGEST = 600.0
 #: Share of a part's length by which a cut may be moved to where the robot is quieter.
 _PLAY = 0.25
 #: s that samples of a part go on at its ends.
@@ -577,84 +506,20 @@ _AROUND = 0.1
 _HOLE, _LEAST_HOLE, _LEAST_PIECE = 5.0, 0.5, 1.0
 
 
-def runs_of(
-    recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], split: float | None, tell: Share
-) -> Iterator[MadeRun]:
-    """Yield the runs that a map makes of a recording.
+def runs_of(log: Log, found: LogMap, resolved: Mapping[str, Resolved], split: float | None) -> Iterator[MadeRun]:
+    """Yield the runs that a map makes of a recording, cut where the robot is quietest.
 
-    One, or of one that is longer than :data:`LONGEST`, or has more than :data:`NUMBERS`, several; with ``split``, runs of about
-    so many seconds, none of them across a hole. What is to be said of all of them goes into the recording's notes.
+    One, or several of about :data:`LONGEST`; with ``split``, runs of about so many seconds. Cut ones go across no hole.
 
     Raises:
-        InputError: what :func:`wlr_gym.data.logs.rows.make_run` raises; parts without rows are left out, and said.
+        InputError: what :func:`wlr_gym.data.logs.rows.make_run` raises.
     """
-    check_sources(recording.name, resolved)
-    edges = _edges(recording, found, resolved, split)
-    if len(edges) < 3:
-        yield from _parts(make_run(recording.whole(), found, resolved), split)
-        return
-    recording.notes.append(f"cut into {len(edges) - 1} parts, where the robot is quietest")
-    start, begin, refused = edges[0], edges[0], 0
-    for k, edge in enumerate(edges[1:], 1):
-        here = f"{(begin - start) * 1e-9:.0f} s on: "
-        play = round(_PLAY * min(edge - edges[k - 1], edges[k + 1] - edge)) if k + 1 < len(edges) else 0
-        try:
-            made, begin = _part_until(recording, found, resolved, (begin, edge), play)
-        except NoRowsError as error:
-            refused, begin = refused + 1, edge
-            if refused == len(edges) - 1:
-                raise
-            recording.notes.append(f"{here}no run: {str(error).partition(': ')[2]}")
-        else:
-            yield from _parts(replace(made, notes=tuple(here + note for note in made.notes)), split)
-        tell(k / (len(edges) - 1))
-
-
-def _part_until(
-    recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], span: tuple[int, int], play: int
-) -> tuple[MadeRun, int]:
-    """Return the rows of a span (ns), its end moved by up to ``play`` to where the robot is quiet, and that end."""
-    begin, edge = span
-    end = edge + play
-
-    def when(topic: str) -> tuple[str, int, int]:
-        clock = found.use(topic)
-        offset = round(clock.offset * 1e9)
-        return clock.use, begin - offset, end - offset
-
-    made = make_run(recording.between(when), found, resolved, (begin, end))
-    t, middle = made.table["t"], (edge - made.origin) * 1e-9
-    last = _quiet_row(made, middle, play * 1e-9 / _PLAY) if play and 0.0 < middle < t[-1] else 0
-    if last < 2:  # nothing to be cut
-        return _part(made, 0, len(t)), end
-    return _part(made, 0, last), made.origin + round(float(t[last]) * 1e9)
-
-
-def _edges(recording: TopicStore, found: LogMap, resolved: Mapping[str, Resolved], split: float | None) -> list[int]:
-    """Return where parts begin and end, ns on the common clock; none where the recording is a part itself."""
-    rows = rows_topic(found, resolved)
-    if rows not in recording:
-        return []
-    clock = found.use(rows)
-    spans = recording.spans(rows, clock.use)
-    seconds = len(spans) * float(np.median([last - first for first, last in spans])) * 1e-9  # whatever a stray header says
-    longest = max(min(LONGEST, seconds * NUMBERS / max(recording.numbers, 1)), split or 0.0)
-    count = min(math.ceil(seconds / longest), len(spans)) if longest > 0.0 else 1
-    begins = sorted({first for first, _ in spans})
-    inner = [begins[k * len(begins) // count] for k in range(1, count)]
-    edges = sorted({begins[0], *inner, max(last for _, last in spans) + 1})
-    return [edge + round(clock.offset * 1e9) for edge in edges]
-
-
-# ---- cutting what is in memory ---------------------------------------------------------------------------------------
-
-
-def _parts(made: MadeRun, split: float | None) -> Iterator[MadeRun]:
-    """Yield a recording whole, or in parts of about ``split`` seconds, none of them across a hole."""
-    if split is None:
+    made = make_run(log, found, resolved)
+    t = made.table["t"]
+    if split is None and t[-1] <= LONGEST:
         yield made
         return
-    t = made.table["t"]
+    split = split or LONGEST
     holes = np.flatnonzero(np.diff(t) > max(_HOLE * float(np.median(np.diff(t))), _LEAST_HOLE)) + 1
     pieces = list(itertools.pairwise([0, *holes.tolist(), len(t)]))
     kept = [(first, last) for first, last in pieces if t[last - 1] - t[first] >= _LEAST_PIECE] or pieces
@@ -666,9 +531,8 @@ def _parts(made: MadeRun, split: float | None) -> Iterator[MadeRun]:
         whole = float(piece.table["t"][-1])
         count = max(round(whole / split), 1)
         cuts = [_quiet_row(piece, k * whole / count, whole / count) for k in range(1, count)]
-        edges = [0, *cuts, len(piece.table["t"])]
-        for begin, end in itertools.pairwise(edges):
-            yield piece if len(edges) == 2 else _part(piece, begin, end)
+        for begin, end in itertools.pairwise([0, *cuts, len(piece.table["t"])]):
+            yield _part(piece, begin, end) if cuts else piece
 
 
 def _quiet_row(made: MadeRun, middle: float, length: float) -> int:
@@ -685,18 +549,14 @@ def _quiet_row(made: MadeRun, middle: float, length: float) -> int:
 
 
 def _part(made: MadeRun, first: int, last: int) -> MadeRun:
-    table = {name: values[first:last].copy() for name, values in made.table.items()}
+    table = {name: values[first:last] for name, values in made.table.items()}
     begin, end = float(table["t"][0]), float(table["t"][-1])
+    table["t"] = table["t"] - begin
     samples = {}
-    for name, one in made.samples.items():
-        inside = (one.t >= begin - _AROUND) & (one.t <= end + _AROUND)
-        samples[name] = Samples(one.t[inside] - begin, one.values[inside])
-    for wheel in (f"pos_{wheel}" for wheel in WHEELS):  # wheels count from the run's start
-        start = table[wheel][0]
-        table[wheel] -= start
-        samples[wheel] = Samples(samples[wheel].t, samples[wheel].values - start)
-    table["t"] -= begin
-    return replace(made, table=table, samples=samples, origin=made.origin + round(begin * 1e9))
+    for name, (t, values) in made.samples.items():
+        inside = (t >= begin - _AROUND) & (t <= end + _AROUND)
+        samples[name] = t[inside] - begin, values[inside]
+    return _from_start(replace(made, table=table, samples=samples, origin=made.origin + round(begin * 1e9)))
 
 
 def write_samples(path: Path, made: MadeRun) -> None:
@@ -706,6 +566,6 @@ def write_samples(path: Path, made: MadeRun) -> None:
 
     schema = pyarrow.schema([("channel", pyarrow.string()), ("t", pyarrow.float64()), ("value", pyarrow.float64())])
     with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-        for name, one in made.samples.items():
-            columns = [pyarrow.array([name] * len(one.t)), pyarrow.array(one.t), pyarrow.array(one.values)]
+        for name, (t, values) in made.samples.items():
+            columns = [pyarrow.array([name] * len(t)), pyarrow.array(t), pyarrow.array(values)]
             writer.write_table(pyarrow.table(columns, schema=schema))

@@ -348,10 +348,7 @@ class _Proposer:
         if "profile" not in self.known.get("meta", {}):
             self.content["meta"]["profile"] = OPEN
             text = "the servos' profile: {wheel_acceleration: rad/s2, leg_velocity: rad/s, leg_acceleration: rad/s2}, {} = none"
-            steps = [self._steps(leg) for leg in LEGS if f"cmd_{leg}" in self.chosen and f"pos_{leg}" in self.chosen]
-            shown = f"; leg setpoints jump by up to {max(s[0] for s in steps):.3g}, and legs move by up to " if steps else ""
-            shown += f"{max(s[1] for s in steps):.3g} a second, as logged" if steps else ""
-            self.note("meta.profile", f"{text}{shown}. Without this line {NO_PROFILE.partition(': ')[2]}")
+            self.note("meta.profile", f"{text}. Without this line {NO_PROFILE.partition(': ')[2]}")
 
     # ---- what is decided --------------------------------------------------------------------------------------------
 
@@ -415,23 +412,6 @@ class _Proposer:
             yield f"{what} {abs(ratio):.3g} times as much as the angles (correlation {correlation:.2f})"
         if kind == "eff":
             yield f"the motor stalls at {effort_range(columns[0], self.robot)[0]:.3g} N m"
-        if name == "cam_yaw" and (course := self._course()) is not None:
-            yield f"it turns {'with' if course > 0 else 'against'} the course of x, y (correlation {course:.2f})"
-
-    def _course(self) -> float | None:
-        """Return the correlation of a heading's turns with those of the way (x, y) that is driven, forth or back."""
-        x, y, yaw = (self.raw(f"cam_{axis}") for axis in ("x", "y", "yaw"))
-        if min(len(one[0]) for one in (x, y, yaw)) < 10:
-            return None
-        grid = _grid(x, y, yaw)
-        steps = np.array([np.interp(grid + _WINDOW, *one) - np.interp(grid, *one) for one in (x, y)])
-        moving = np.hypot(*steps) > 0.3 * np.quantile(np.hypot(*steps), 0.95) if len(grid) else np.zeros(0, bool)
-        if moving.sum() < 10:
-            return None
-        course = np.unwrap(2.0 * np.arctan2(steps[1], steps[0])[moving]) / 2.0  # the same forth and back
-        heading = np.interp(grid[moving] + 0.5 * _WINDOW, yaw[0], yaw[1])
-        spreads = float(np.std(course)), float(np.std(heading))
-        return float(np.corrcoef(course, heading)[0, 1]) if min(spreads) > 1e-6 else None
 
     def _joint_shown(self, joint: str) -> str:
         shown = []
@@ -441,11 +421,7 @@ class _Proposer:
         pair = [f"{kind}_{joint}" for kind in ("cmd", "pos")]
         if all(column in self.chosen for column in pair) and (like := _likeness(*map(self.turned, pair))) is not None:
             shown.append(f"setpoint and angle go together by {like[1]:.2f} (correlation)")
-        first = (LEGS if joint in LEGS else WHEELS)[0]
-        columns = [f"pos_{joint}", f"pos_{first}"]
-        if joint != first and all(one in self.chosen for one in columns) and (like := _likeness(*map(self.turned, columns))):
-            shown.append(f"it goes with {first} by {like[1]:.2f}")
-        if joint in WHEELS and columns[0] in self.chosen and (like := self._rolls(columns[0])) is not None:
+        if joint in WHEELS and pair[1] in self.chosen and (like := self._rolls(pair[1])) is not None:
             shown.append(f"with the pose's way forward by {like[1]:.2f}, {abs(like[0]):.3g} for 1 of the pose")
         return "; ".join(shown) or "no field of it is known"
 
@@ -467,13 +443,6 @@ class _Proposer:
         if all(f"gyro_{axis}" in self.chosen for axis in XYZ):
             sizes = [float(np.std(self.raw(f"gyro_{axis}")[1])) for axis in XYZ]
             yield f"gyro varies by {', '.join(f'{size:.3g}' for size in sizes)} (a robot that drives turns about up)"
-
-    def _steps(self, leg: str) -> tuple[float, float]:
-        """Return the largest jump of a leg's setpoint between two, and how far the leg goes at most in a second."""
-        jumps, (t, values) = np.abs(np.diff(self.raw(f"cmd_{leg}")[1])), self.raw(f"pos_{leg}")
-        grid = np.arange(t[0], t[-1] - 0.1, 0.02) if len(t) else np.zeros(0)
-        rates = np.abs(np.interp(grid + 0.1, t, values) - np.interp(grid, t, values)) / 0.1 if len(grid) else np.zeros(0)
-        return float(jumps.max(initial=0.0)), float(rates.max(initial=0.0))
 
     def _unnamed(self) -> str:
         """Return which lists have as many elements as a robot has joints of a kind, but no names; and a table's columns."""

@@ -15,8 +15,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import in_threads
 from wlr_gym.base.random import generator
 from wlr_gym.data.format import CHANNELS, COLUMNS
-from wlr_gym.data.replay import profile_parameters, robot_of
-from wlr_gym.data.runs import Run, read_dataset
+from wlr_gym.data.replay import profile_parameters
+from wlr_gym.data.runs import Run, read_dataset, robot_of
 from wlr_gym.data.sensors import channel_noise, noise_parts
 from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal

@@ -15,8 +15,7 @@ from typing import Any
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.data.format import RunMeta
-from wlr_gym.data.record import next_run
-from wlr_gym.data.runs import write_run
+from wlr_gym.data.runs import next_run, write_run
 from wlr_gym.hardware.commissioning.stand import Person, PowerError, QuitError, SkippedError, Stand, TrippedError, TroubleError
 from wlr_gym.hardware.commissioning.stand_tests import PartlyError, Reading, StandQuantity, StandTest
 from wlr_gym.hardware.config import Hardware, Measured, MeasuredValue

@@ -18,8 +18,7 @@ from wlr_gym.base.random import generator
 from wlr_gym.data.excitations import Motion, excite
 from wlr_gym.data.format import RunMeta
 from wlr_gym.data.record import meta_of
-from wlr_gym.data.replay import robot_of
-from wlr_gym.data.runs import Run, read_dataset, read_run, run_files
+from wlr_gym.data.runs import Run, read_dataset, read_run, robot_of, run_files
 from wlr_gym.envs.core import make_task, measured_truth
 from wlr_gym.envs.registry import task_source_of
 from wlr_gym.envs.settings import read_settings

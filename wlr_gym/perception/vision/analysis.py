@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import replace_file, write_json
 from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, tidy
-from wlr_gym.data.replay import robot_of
 from wlr_gym.data.run_states import rest_pose
-from wlr_gym.data.runs import Run, own_robot, write_run
+from wlr_gym.data.runs import Run, own_robot, robot_of, write_run
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.pose import sheet_fault
