@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 from tyro.conf import Positional
 
@@ -29,8 +30,10 @@ from wlr_gym.render.video import check_video
 from wlr_gym.robot import CORNERS, JOINTS
 
 if TYPE_CHECKING:
+    import pandas
+
     from wlr_gym.data import Run
-    from wlr_gym.data.replay import ChannelError, ReplayResult
+    from wlr_gym.data.replay import ReplayResult
     from wlr_gym.physics.effects import Patch
 
 ERRORS_FILE = "errors.json"
@@ -166,69 +169,47 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
 
 
 def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, other: str) -> None:
+    """Print what is odd about the runs, and errors by channel, by joint, and of several runs by run."""
+    import pandas
+
+    from wlr_gym.data.format import CHANNELS, COLUMNS
+
     for result in results:
         for finding in result.run.findings:
             line = f"{result.run.name}: {finding.kind} in '{finding.column}': {finding.message}"
             console.print(line, style="yellow", highlight=False, soft_wrap=True)
-    errors = [pair for result in results for pair in result.errors.items()]
-    runs = counted(len(results), "run")
-    _print_errors(errors, f"Measured minus {other}, rms ({runs}, effects added: {patch.summary()})", console)
-    _print_joints(errors, console)
-    if len(results) > 1:
-        _print_runs(results, console)
-
-
-def _grouped(errors: Sequence[tuple[str, ChannelError]]) -> dict[str, list[ChannelError]]:
-    """Put the errors of a joint group (``pos_leg``) together, and those of every other channel by themselves."""
-    from wlr_gym.data.format import CHANNELS, COLUMNS
-
-    groups: dict[str, list[ChannelError]] = {}
-    for name, error in sorted(errors, key=lambda pair: CHANNELS.index(pair[0])):
-        key = COLUMNS[name].group if name.partition("_")[2] in JOINTS else name
-        groups.setdefault(key, []).append(error)
-    return groups
-
-
-def _in_noise_units(errors: Sequence[ChannelError]) -> str:
-    from wlr_gym.data.replay import pooled
-
-    return f"{pooled(errors, lambda error: error.segment_rms / error.noise):.1f}" if errors else "-"
-
-
-def _print_errors(errors: Sequence[tuple[str, ChannelError]], title: str, console: Console) -> None:
-    from wlr_gym.data.replay import pooled
-
     rows = []
-    for group, members in _grouped(errors).items():
-        noise, unit = members[0].noise, members[0].unit
-        segment, full = pooled(members, lambda e: e.segment_rms), pooled(members, lambda e: e.full_run_rms)
-        ratios = (f"{segment / noise:.1f}", f"{full / noise:.1f}")
-        rows.append((group, unit, f"{noise:.2g}", f"{segment:.3g}", f"{full:.3g}", *ratios))
+    for name in CHANNELS:
+        group, corner = COLUMNS[name].group, name.rpartition("_")[2] if name.partition("_")[2] in JOINTS else ""
+        channel, kind = group if corner else name, "cam" if group.startswith("cam") else group
+        for result in results:
+            if (error := result.errors.get(name)) is not None:
+                rows.append((result.run.name, channel, corner, kind, *vars(error).values(), error.segment_rms / error.noise))
+    columns = ("run", "channel", "corner", "kind", "segment", "full", "unit", "noise", "ratio")
+    errors = pandas.DataFrame(rows, columns=columns)
+
+    def rms(values: Any) -> float:
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    def table(of: pandas.DataFrame, first: str, second: str) -> list[tuple[str, ...]]:
+        """Return the rms error in noise units, a row for each value of the first column, a cell for each of the second."""
+        columns = CORNERS if second == "corner" else of[second].unique()
+        values = of.groupby([first, second], sort=False)["ratio"].agg(rms).unstack()
+        values = values.reindex(index=of[first].unique(), columns=columns)
+        return [(str(name), *("-" if cell != cell else f"{cell:.1f}" for cell in row)) for name, *row in values.itertuples()]
+
+    shown = []
+    for channel, members in errors.groupby("channel", sort=False):
+        unit, noise = members[["unit", "noise"]].iloc[0]
+        both = rms(members["segment"]), rms(members["full"])
+        sizes = (f"{noise:.2g}", *(f"{one:.3g}" for one in both), *(f"{one / noise:.1f}" for one in both))
+        shown.append((str(channel), str(unit), *sizes))
     headings = ("channel", "unit", "noise", "segment", "full run", "segment / noise", "full run / noise")
-    print_table(console, headings, rows, title)
-
-
-def _print_joints(errors: Sequence[tuple[str, ChannelError]], console: Console) -> None:
-    from wlr_gym.data.format import COLUMNS
-
-    rows = [
-        (group, *(_in_noise_units([e for name, e in errors if name == f"{group}_{corner}"]) for corner in CORNERS))
-        for group in ("pos_leg", "vel_leg", "eff_leg", "pos_wheel", "vel_wheel", "eff_wheel")
-        if any(COLUMNS[name].group == group for name, _ in errors)
-    ]
-    print_table(console, ("channel", *CORNERS), rows, "Segment error of each joint, in units of sensor noise")
-
-
-def _print_runs(results: Sequence[ReplayResult], console: Console) -> None:
-    from wlr_gym.data.format import COLUMNS
-
-    def kind(name: str) -> str:
-        group = COLUMNS[name].group
-        return group.partition("_")[0] if group.startswith("cam") else group
-
-    kinds = list(dict.fromkeys(kind(name) for result in results for name in result.errors if name != "volt"))
-    rows = []
-    for result in results:
-        members = [[error for name, error in result.errors.items() if kind(name) == wanted] for wanted in kinds]
-        rows.append((result.run.name, *map(_in_noise_units, members)))
-    print_table(console, ("run", *kinds), rows, "Segment error of each run, in units of sensor noise")
+    runs = counted(len(results), "run")
+    print_table(console, headings, shown, f"Measured minus {other}, rms ({runs}, effects added: {patch.summary()})")
+    joints = table(errors[errors["corner"] != ""], "channel", "corner")
+    print_table(console, ("channel", *CORNERS), joints, "Segment error of each joint, in units of sensor noise")
+    if len(results) > 1:
+        known = errors[errors["kind"] != "volt"]
+        headings = ("run", *known["kind"].unique())
+        print_table(console, headings, table(known, "run", "kind"), "Segment error of each run, in units of sensor noise")

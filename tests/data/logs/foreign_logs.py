@@ -74,42 +74,21 @@ def joint_state(time, names, position, velocity=(), effort=()):
     )
 
 
-def vector(x, y, z):
-    return make("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
+def vector(values):
+    return dict(zip("xyz", map(float, values), strict=True))
 
 
 def turn(yaw):
-    return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2)))
+    return {"z": float(np.sin(yaw / 2)), "w": float(np.cos(yaw / 2))}
 
 
 def imu(time, gyro, acc):
-    empty = np.zeros(9)
-    return make(
-        IMU, header=header(time, "imu"), orientation=turn(0.0), orientation_covariance=empty, angular_velocity=vector(*gyro),
-        angular_velocity_covariance=empty, linear_acceleration=vector(*acc), linear_acceleration_covariance=empty,
-    )  # fmt: skip
+    readings = {"angular_velocity": vector(gyro), "linear_acceleration": vector(acc)}
+    return make(IMU, header=header(time, "imu"), orientation=turn(0.0), **readings)
 
 
 def pose(time, x, y, yaw):
-    point = make("geometry_msgs/msg/Point", x=float(x), y=float(y), z=0.2)
-    return make(POSE, header=header(time, "map"), pose=make("geometry_msgs/msg/Pose", position=point, orientation=turn(yaw)))
-
-
-def battery(time, volt):
-    nothing = dict.fromkeys(("temperature", "current", "charge", "capacity", "design_capacity", "percentage"), 0.0)
-    states = dict.fromkeys(("power_supply_status", "power_supply_health", "power_supply_technology"), 0)
-    cells = {"cell_voltage": np.zeros(0, np.float32), "cell_temperature": np.zeros(0, np.float32)}
-    return make(
-        BATTERY,
-        header=header(time, ""),
-        voltage=float(volt),
-        present=True,
-        location="",
-        serial_number="",
-        **nothing,
-        **states,
-        **cells,
-    )
+    return make(POSE, header=header(time, "map"), pose={"position": vector((x, y, 0.2)), "orientation": turn(yaw)})
 
 
 def lab_messages(table, offset=0.037, imu_axes=((0, 1), (1, 1), (2, 1)), names=NAMES, seed=0):
@@ -136,7 +115,7 @@ def lab_messages(table, offset=0.037, imu_axes=((0, 1), (1, 1), (2, 1)), names=N
             message = pose(ns(t), table["cam_x"][k], table["cam_y"][k], table["cam_yaw"][k])
             out.append((ns(t + 0.01 + 0.004 * rng.random()), "/mocap/base", POSE, message))
         if k % 40 == 0:
-            out.append((ns(t), "/power", BATTERY, battery(ns(t), table["volt"][k])))
+            out.append((ns(t), "/power", BATTERY, make(BATTERY, header=header(ns(t), ""), voltage=float(table["volt"][k]))))
     return sorted(out, key=lambda one: one[0])
 
 

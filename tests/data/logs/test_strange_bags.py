@@ -201,10 +201,7 @@ def test_setpoints_of_a_trajectory_go_by_the_names_beside_its_points_or_by_place
     for time, topic, of_log, message in messages:
         if topic == "/chassis/target":
             lists = {name: getattr(message, of) for name, of in (("positions", "position"), ("velocities", "velocity"))}
-            lists |= {"accelerations": np.zeros(0), "effort": np.zeros(0)}
-            start = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
-            points = [make("trajectory_msgs/msg/JointTrajectoryPoint", time_from_start=start, **lists)]
-            of_log, message = kind, make(kind, header=message.header, joint_names=list(message.name), points=points)
+            of_log, message = kind, make(kind, header=message.header, joint_names=list(message.name), points=[lists])
         changed.append((time, topic, of_log, message))
     path = write_mcap(tmp_path / "a.mcap", changed)
     found = lab_map(path)

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import overlay
-from wlr_gym.data.check import integral
 from wlr_gym.data.format import COLUMNS
 from wlr_gym.data.logs.fields import FieldCandidate, find_candidates, is_unnamed, may_be_pose
 from wlr_gym.data.logs.map import (
@@ -38,7 +37,7 @@ from wlr_gym.data.logs.map import (
 from wlr_gym.data.logs.rows import lost_frames, pose_angle
 from wlr_gym.data.logs.tables import TABLE
 from wlr_gym.data.logs.topics import Log
-from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameter_table import XYZ
 
 Array = NDArray[np.float64]
@@ -46,7 +45,7 @@ Series = tuple[Array, Array]
 
 #: Messages per topic that are looked at: 100 s of an IMU at 200 Hz.
 MOST = 20_000
-#: s over which motions are compared, and from the start on that count as rest.
+#: s over which a pose's speed is taken, and from the start on that count as rest.
 _WINDOW, _START = 0.5, 0.5
 #: s; a topic that is delivered so much earlier or later than the joints may have another clock.
 _LATE = 0.02
@@ -215,13 +214,6 @@ class _Proposer:
         origin = min(int(one.received[0]) for one in self.log.topics.values() if len(one.received))
         return np.asarray((at[once] - origin) * 1e-9 + clock.offset, np.float64), values[once]
 
-    def turned(self, column: str) -> Series:
-        """Return an angle, of a rate what it has turned by, as the log has them."""
-        t, values = self.raw(column)
-        return (
-            (t, integral(t, values) if len(t) else values) if column.startswith(("vel", "cmd_wheel", "gyro")) else (t, values)
-        )
-
     # ---- sections ---------------------------------------------------------------------------------------------------
 
     def _clocks(self) -> None:
@@ -265,7 +257,9 @@ class _Proposer:
             asked = [key for key in wanted if key not in said] if not set(columns) <= self.ours else []
             if asked:
                 entry |= dict.fromkeys(asked, OPEN)
-                self.note(f"joints.{joint}", self._joint_shown(joint))
+                found = [f"{kind}_{joint}" for kind in ("pos", "cmd") if f"{kind}_{joint}" in self.chosen]
+                shown = "; ".join(f"{column.partition('_')[0]} {_range(self.raw(column))}" for column in found)
+                self.note(f"joints.{joint}", shown or "no field of it is known")
             if asked or (joint in self.names and joint not in self.known.get("joints", {})):
                 self.content["joints"][joint] = entry
         if len(self.lines) > place:
@@ -311,8 +305,9 @@ class _Proposer:
         key, members = asked[0]
         question = f"{', '.join(units_of(members[0]))}?" if OPEN in [units[one] for one in members] else ""
         question += " sign: 1, or -1 where it turns clockwise?" if asks_sign else ""
-        shown = "; ".join(filter(None, (f"{count}{source}", self._range(columns), *self._compared(name, columns))))
-        self.note(f"channels.{key}", f"{question.strip()} {shown}. {_MATTERS[kind]}")
+        ranges = "; ".join(f"{column.partition('_')[2] or column} {_range(self.raw(column))}" for column in columns)
+        stall = f"; the motor stalls at {effort_range(columns[0], self.robot)[0]:.3g} N m" if kind == "eff" else ""
+        self.note(f"channels.{key}", f"{question.strip()} {count}{source}; {ranges}{stall}. {_MATTERS[kind]}")
 
     def _frames(self) -> None:
         given = self.known.get("frames", {})
@@ -374,7 +369,10 @@ class _Proposer:
     def _is_quick(self) -> bool:
         """Whether the pose moves as fast as the robot can in m: in cm it would crawl at a hundredth of that, or race."""
         fastest = self.robot.servo.wheel.no_load_speed * self.robot.wheel.radius
-        steps = [np.diff(_resampled(self.raw(f"cam_{axis}"))) for axis in XYZ if f"cam_{axis}" in self.chosen]
+        steps = []
+        for axis in (axis for axis in XYZ if f"cam_{axis}" in self.chosen):
+            t, values = self.raw(f"cam_{axis}")
+            steps.append(np.diff(np.interp(np.arange(t[0], t[-1], _WINDOW), t, values)) if len(t) else values)
         speed = np.sqrt(sum(step**2 for step in steps)) / _WINDOW
         return bool(len(speed)) and 0.05 < float(np.quantile(speed, 0.95)) / fastest < 1.5
 
@@ -388,53 +386,6 @@ class _Proposer:
         kind = self.log.topics[one.topic].kind
         topic = "" if kind == one.topic else f"topic '{one.topic}' ({kind}), "
         return f"{topic}'{self._field(column)}'"
-
-    def _range(self, columns: Sequence[str]) -> str:
-        return "; ".join(f"{column.partition('_')[2] or column} {_range(self.raw(column))}" for column in columns)
-
-    def _compared(self, name: str, columns: Sequence[str]) -> Iterable[str]:
-        """Yield how a set's numbers go with what they should go with."""
-        kind = name.partition("_")[0]
-        other = {"cmd": "pos", "vel": "pos"}.get(kind)
-        found = []
-        for column in columns:
-            if other and (angle := column.replace(kind, other)) in self.chosen:
-                found.append(_likeness(self.turned(column), self.turned(angle)))
-            elif kind == "gyro" and "cam_yaw" in self.chosen:
-                found.append(_likeness(self.turned(column), self.raw("cam_yaw")))
-        found = [one for one in found if one is not None]
-        if found and kind == "gyro":
-            ratio, correlation = max(found, key=lambda one: abs(one[1]))
-            yield f"at best it turns {abs(ratio):.3g} times as much as the pose (correlation {correlation:.2f})"
-        elif found:
-            ratio, correlation = (float(np.median(part)) for part in np.array(found).T)
-            what = "setpoints vary" if kind == "cmd" else "they turn"
-            yield f"{what} {abs(ratio):.3g} times as much as the angles (correlation {correlation:.2f})"
-        if kind == "eff":
-            yield f"the motor stalls at {effort_range(columns[0], self.robot)[0]:.3g} N m"
-
-    def _joint_shown(self, joint: str) -> str:
-        shown = []
-        for kind in ("pos", "cmd"):
-            if f"{kind}_{joint}" in self.chosen:
-                shown.append(f"{kind} {_range(self.raw(f'{kind}_{joint}'))}")
-        pair = [f"{kind}_{joint}" for kind in ("cmd", "pos")]
-        if all(column in self.chosen for column in pair) and (like := _likeness(*map(self.turned, pair))) is not None:
-            shown.append(f"setpoint and angle go together by {like[1]:.2f} (correlation)")
-        if joint in WHEELS and pair[1] in self.chosen and (like := self._rolls(pair[1])) is not None:
-            shown.append(f"with the pose's way forward by {like[1]:.2f}, {abs(like[0]):.3g} for 1 of the pose")
-        return "; ".join(shown) or "no field of it is known"
-
-    def _rolls(self, column: str) -> tuple[float, float] | None:
-        """Return how a wheel's angle goes with the way along the heading, where a pose shows it."""
-        if not all(f"cam_{axis}" in self.chosen for axis in ("x", "y", "yaw")) or self._unit("cam_yaw") != "rad":
-            return None
-        x, y, yaw = (self.raw(f"cam_{axis}") for axis in ("x", "y", "yaw"))
-        if min(len(one[0]) for one in (x, y, yaw)) < 10:
-            return None
-        heading = np.interp(x[0], *yaw)
-        steps = np.diff(x[1]) * np.cos(heading[1:]) + np.diff(np.interp(x[0], *y)) * np.sin(heading[1:])
-        return _likeness(self.turned(column), (x[0], np.concatenate([[0.0], np.cumsum(steps)])))
 
     def _imu_shown(self) -> Iterable[str]:
         if all(f"acc_{axis}" in self.chosen for axis in XYZ):
@@ -529,24 +480,3 @@ def _range(series: Series) -> str:
         return "has no values"
     start = float(np.median(values[t <= t[0] + _START]))
     return f"{values.min():.4g} to {values.max():.4g} ({start:.4g} at the start)"
-
-
-def _grid(*series: Series) -> Array:
-    """Return where windows begin that all signals cover, 0.1 s apart."""
-    begin, end = max(t[0] for t, _ in series), min(t[-1] for t, _ in series)
-    return np.arange(begin, end - _WINDOW, 0.1)
-
-
-def _resampled(series: Series) -> Array:
-    """Return a signal's values a window apart."""
-    t, values = series
-    return np.interp(np.arange(t[0], t[-1], _WINDOW), t, values) if len(t) else values
-
-
-def _likeness(first: Series, second: Series) -> tuple[float, float] | None:
-    """Return how many times as far one signal goes as another, window by window, and their correlation; None = it stands."""
-    if min(len(first[0]), len(second[0])) < 10 or len(grid := _grid(first, second)) < 10:
-        return None
-    a, b = (np.interp(grid + _WINDOW, *one) - np.interp(grid, *one) for one in (first, second))
-    sizes = float(a @ a), float(b @ b)
-    return None if min(sizes) < 1e-18 else (float(a @ b) / sizes[1], float(a @ b) / float(np.sqrt(sizes[0] * sizes[1])))
