@@ -10,8 +10,18 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Profile, Run, RunMeta
 from wlr_gym.data import comparison as module
-from wlr_gym.data.comparison import BOUNDS, ComparedPlant, Traces, compare, drive, parse_plant, resolutions, severe_patch
-from wlr_gym.data.comparison_report import markdown, summary_table
+from wlr_gym.data.comparison import (
+    BOUNDS,
+    ComparedPlant,
+    Traces,
+    compare,
+    drive,
+    markdown,
+    parse_plant,
+    resolutions,
+    severe_patch,
+    summary_table,
+)
 from wlr_gym.data.excitations import Motion, excite
 from wlr_gym.data.record import motion_of
 from wlr_gym.data.run_states import standing_at

@@ -25,8 +25,7 @@ from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
-    from wlr_gym.data.comparison import ComparedPlant, Comparison
-    from wlr_gym.data.comparison_report import ReportTable
+    from wlr_gym.data.comparison import ComparedPlant, Comparison, ReportTable
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
 
@@ -76,8 +75,7 @@ def run(options: CompareOptions) -> int:
     Raises:
         InputError: unknown plant, excitation, effect or robot, unreadable runs, numbers out of range.
     """
-    from wlr_gym.data.comparison import parse_plant
-    from wlr_gym.data.comparison_report import markdown, summary_table, tables
+    from wlr_gym.data.comparison import markdown, parse_plant, summary_table, tables
 
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if first == second:
@@ -162,7 +160,7 @@ def _compare_all(
 
 
 def _draw(found: Comparison, out: Path, tell: Callable[[str, float], None]) -> None:
-    from wlr_gym.data.comparison_report import save_map, save_motion_plot
+    from wlr_gym.data.comparison import save_map, save_motion_plot
 
     label = re.sub(r"[^\w]+", "_", found.effects)[-120:]  # file systems take names of 255 letters
     for index, motion in enumerate(found.motions):

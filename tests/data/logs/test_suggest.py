@@ -26,8 +26,8 @@ from json_logs import IMU, UPTIME, name_of, sign_of, write_json_mcap
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_dataset, read_run
 from wlr_gym.data.logs import import_log, suggest_map
-from wlr_gym.data.logs.fields import stated_unit
 from wlr_gym.data.logs.map import OPEN
+from wlr_gym.data.logs.suggest import stated_unit
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, load_robot
 
 NO_PROFILE = {"meta": {"profile": {}}}
