@@ -231,7 +231,7 @@ def test_bad_arguments_are_refused(tmp_path):
     run = read_run(DATA / "run_01.parquet")
     with pytest.raises(InputError, match=r"'gibbs_apell'.*did you mean 'gibbs_appell'"):
         replay(run, backend="gibbs_apell")
-    with pytest.raises(InputError, match=r"segment = 0\.05 s"):
+    with pytest.raises(InputError, match=r"segment = 0\.05: expected more than 0\.1 s"):
         replay(run, segment=0.05)
     with pytest.raises(InputError, match="too short"):
         replay(run, segment=20.0)

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +51,7 @@ class Finding:
     message: str
 
 
-@dataclass(frozen=True)
-class _UnitLimit:
+class _UnitLimit(NamedTuple):
     """``quantile`` of the magnitudes of a group above ``limit`` can only be ``looks_like``; ``rate`` tests time derivatives."""
 
     group: str
@@ -111,39 +111,31 @@ def check_table(table: Table, where: str) -> list[Finding]:
             where there must be one, or a unit mistake; the message names file, row and column.
     """
     check_names(list(table), where)
-    _check_lengths(table, where)
     _check_values(table, where)
     _check_clock(table["t"], where)
     _check_magnitudes(table, where)
-    _check_consistency(table, where)
-    return [
-        *_gaps(table["t"]),
-        *_missing(table),
-        *_duplicates(table),
-        *_constant(table),
-        *_clipped(table),
-    ]
+    pairs = [(f"vel_{joint}", f"pos_{joint}") for joint in JOINTS] + [(f"cmd_{wheel}", f"pos_{wheel}") for wheel in WHEELS]
+    for rate, angle in [*pairs, ("gyro_z", "cam_yaw"), ("gyro_y", "cam_pitch")]:
+        if rate in table and angle in table:
+            _check_pair(table, rate, angle, where)
+    return [*_gaps(table["t"]), *_missing(table), *_duplicates(table), *_constant(table), *_clipped(table)]
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------
 
 
-def _check_lengths(table: Table, where: str) -> None:
+def _check_values(table: Table, where: str) -> None:
     rows = len(table["t"])
     for name, values in table.items():
         if np.ndim(values) != 1 or len(values) != rows:
             raise InputError(f"{where}: column '{name}' has shape {np.shape(values)}, 't' has {rows} rows")
     if rows < 2:
         raise InputError(f"{where}: {rows} row{'s' if rows != 1 else ''}; a run has at least 2")
-
-
-def _check_values(table: Table, where: str) -> None:
     for name, values in table.items():
-        infinite = np.isinf(values)
+        infinite, nan = np.isinf(values), np.isnan(values)
         if infinite.any():
             row = int(np.argmax(infinite))
             raise InputError(f"{where}: {row_words(where, row)}, column '{name}': {values[row]:g}; expected a finite number")
-        nan = np.isnan(values)
         if nan.any() and COLUMNS[name].required and not COLUMNS[name].may_be_nan:
             place = f"{where}: {row_words(where, int(np.argmax(nan)))}, column '{name}'"
             raise InputError(f"{place}: no value, but this column must have one")
@@ -168,9 +160,12 @@ def _check_clock(t: Array, where: str) -> None:
 def _check_magnitudes(table: Table, where: str) -> None:
     for limit in _UNIT_LIMITS:
         for name in (name for name in table if COLUMNS[name].group == limit.group):
-            rows, magnitudes = _magnitudes(table, name, limit.rate)
-            if len(magnitudes) and np.quantile(magnitudes, limit.quantile) > limit.limit:
-                row = int(rows[np.argmax(magnitudes > limit.limit)])
+            rows = np.flatnonzero(np.isfinite(table[name]))
+            values = table[name][rows]
+            if limit.rate:
+                values, rows = np.diff(values) / np.diff(table["t"][rows]), rows[1:]
+            if len(values) and np.quantile(np.abs(values), limit.quantile) > limit.limit:
+                row = int(rows[np.argmax(np.abs(values) > limit.limit)])
                 raise _unit_mistake(where, row, name, table[name][row], limit.looks_like)
     if {"acc_x", "acc_y", "acc_z"} <= set(table):
         norm = np.sqrt(table["acc_x"] ** 2 + table["acc_y"] ** 2 + table["acc_z"] ** 2)
@@ -179,28 +174,13 @@ def _check_magnitudes(table: Table, where: str) -> None:
             raise _unit_mistake(where, 0, "acc_z", table["acc_z"][0], "multiples of g" if typical < 2.0 else "mm/s2 or cm/s2")
 
 
-def _magnitudes(table: Table, name: str, rate: bool) -> tuple[NDArray[np.intp], Array]:
-    rows = np.flatnonzero(np.isfinite(table[name]))
-    values = table[name][rows]
-    if not rate:
-        return rows, np.abs(values)
-    return rows[1:], np.abs(np.diff(values) / np.diff(table["t"][rows]))
-
-
 def _unit_mistake(where: str, row: int, name: str, value: float, looks_like: str) -> InputError:
     place = f"{where}: {row_words(where, row)}, column '{name}'"
     return InputError(f"{place}: {value:g}; expected {COLUMNS[name].unit}, looks like {looks_like}")
 
 
-def _check_consistency(table: Table, where: str) -> None:
-    """Compare each rate with the turn of its angle: 57 times too much or too little is degrees for radians."""
-    pairs = [(f"vel_{joint}", f"pos_{joint}") for joint in JOINTS] + [(f"cmd_{wheel}", f"pos_{wheel}") for wheel in WHEELS]
-    for rate, angle in [*pairs, ("gyro_z", "cam_yaw"), ("gyro_y", "cam_pitch")]:
-        if rate in table and angle in table:
-            _check_pair(table, rate, angle, where)
-
-
 def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
+    """Compare a rate with the turn of its angle: 57 times too much or too little is degrees for radians."""
     rows = np.flatnonzero(np.isfinite(table[angle]) & np.isfinite(table[rate]))
     if len(rows) < 20:
         return
@@ -217,9 +197,8 @@ def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
         raise _unit_mistake(where, row, rate, table[rate][row], f"degrees per second ({ratio:.0f} times the rate of '{angle}')")
     if _DEGREES / 2 < 1 / ratio < 2 * _DEGREES:
         row = int(rows[np.argmax(np.abs(table[angle][rows]))])
-        raise _unit_mistake(
-            where, row, angle, table[angle][row], f"degrees (it turns {1 / ratio:.0f} times faster than '{rate}')"
-        )
+        looks_like = f"degrees (it turns {1 / ratio:.0f} times faster than '{rate}')"
+        raise _unit_mistake(where, row, angle, table[angle][row], looks_like)
 
 
 def increments(t: Array, angle: Array, rate: Array) -> tuple[Array, Array]:
@@ -246,16 +225,13 @@ def _gaps(t: Array) -> Iterable[Finding]:
     if len(rows):
         lost = int(np.sum(np.round(steps[rows] / period) - 1))
         longest = int(rows[np.argmax(steps[rows])])
-        message = (
-            f"{len(rows)} gaps, about {lost} rows lost; the longest, after row {longest}, takes {1e3 * steps[longest]:.0f} ms"
-        )
+        where = f"the longest, after row {longest}, takes {1e3 * steps[longest]:.0f} ms"
+        message = f"{len(rows)} gaps, about {lost} rows lost; {where}"
         yield Finding("gap", "t", tuple(map(int, rows)), message)
 
 
 def _missing(table: Table) -> Iterable[Finding]:
-    for name in (*CHANNELS, *FLOW):
-        if name not in table:
-            continue
+    for name in (name for name in (*CHANNELS, *FLOW) if name in table):
         nan = np.isnan(table[name])
         if nan.all():
             yield Finding("missing", name, (0,), "no values at all")

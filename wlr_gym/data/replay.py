@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.plots import BLUE, GREY, ORANGE, new_figure, save, tidy
 from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, Profile
 from wlr_gym.data.run_states import euler_angles, measured_state, start_state, starts_at_rest
@@ -143,7 +143,11 @@ def replay(
     plant = make_plant(backend, robot, len(starts), options, patch.forces)
     pieces, _ = _simulate(run, plant, many, anchors, t[starts], duration)
     full_rows = {name: full.at(0, name, t) for name in CHANNELS if name in run}
-    segment_rows = {name: _join(pieces, name, t, starts, ends) for name in full_rows}
+    segment_rows = {name: np.full(len(t), np.nan) for name in full_rows}
+    for k, start in enumerate(starts):  # each from its lead on, until the lead of the next is over
+        rows = np.flatnonzero((t > t[start] + LEAD) & (t <= ends[k]))
+        for name, values in segment_rows.items():
+            values[rows] = pieces.at(k, name, t[rows])
     errors = channel_errors(run, full_rows, segment_rows, channel_noise(robot))
     return ReplayResult(run, full_rows, segment_rows, tuple(map(int, starts)), errors, robot, clock, physics_step)
 
@@ -155,13 +159,8 @@ def prepare(
     effects: Source = None,
     segment: float = 1.0,
 ) -> tuple[Robot, Parameters]:
-    """Check what :func:`replay` is given, without simulating; return the robot and its patched parameters.
-
-    Raises:
-        InputError: as :func:`replay`.
-    """
-    if not segment > LEAD:
-        raise InputError(f"segment = {segment:g} s: expected more than {LEAD:g} s")
+    """Check what :func:`replay` is given, without simulating; return the robot and its patched parameters."""
+    check_number("segment", segment, "s", above=LEAD)
     robot = robot_of(run, robot)
     parameters = Parameters.nominal(robot) if parameters is None else parameters
     parameters = apply_patch(load_patch(effects), profile_parameters(parameters, run.meta.profile))
@@ -304,15 +303,6 @@ def _stacked(states: list[PlantState]) -> PlantState:
 # ---- comparison ------------------------------------------------------------------------------------------------------
 
 
-def _join(pieces: _Traces, name: str, t: Array, starts: NDArray[np.intp], ends: Array) -> Array:
-    """Lay the segments end to end: each from its lead on, until the lead of the next is over."""
-    joined = np.full(len(t), np.nan)
-    for k, start in enumerate(starts):
-        rows = np.flatnonzero((t > t[start] + LEAD) & (t <= ends[k]))
-        joined[rows] = pieces.at(k, name, t[rows])
-    return joined
-
-
 def channel_errors(
     run: Run, full: Mapping[str, Array], segments: Mapping[str, Array], noise: Mapping[str, float]
 ) -> dict[str, ChannelError]:
@@ -320,7 +310,8 @@ def channel_errors(
     errors = {}
     for name in full:
         if np.isfinite(run[name] + segments[name]).any():
-            segment, whole = (_rms(difference(name, run[name], simulated[name])) for simulated in (segments, full))
+            gaps = (difference(name, run[name], simulated[name]) for simulated in (segments, full))
+            segment, whole = (float(np.sqrt(np.nanmean(gap**2))) for gap in gaps)
             errors[name] = ChannelError(segment, whole, COLUMNS[name].unit, noise[name])
     return errors
 
@@ -329,10 +320,6 @@ def difference(name: str, measured: Array, simulated: Array) -> Array:
     """Return measured minus simulated; angles of the body within half a turn."""
     error = measured - simulated
     return np.angle(np.exp(1j * error)) if name in ANGLES_OF_THE_BODY else error
-
-
-def _rms(error: Array) -> float:
-    return float(np.sqrt(np.nanmean(error**2)))
 
 
 def pooled(errors: Sequence[ChannelError], value: Callable[[ChannelError], float]) -> float:
@@ -377,7 +364,9 @@ def replayed_rows(
                 sensors = plant.step(setpoints[tick], torque_on[tick])
             if t[row] - t[begin] >= segment:
                 begin = row
-                state = measured_state(_near(run, row), t[row : row + 1], plant.mechanical_state(), parameters)
+                first, last = np.searchsorted(t, [t[row] - _AROUND, t[row] + _AROUND])
+                near = replace(run, table=run.table.iloc[int(first) : int(last)])
+                state = measured_state(near, t[row : row + 1], plant.mechanical_state(), parameters)
                 sensors = plant.reset(parameters=undelayed, state=replace(state, time=t[row : row + 1] - t[0]))
                 shift = state.joint_position[:, WHEEL_SLICE] - sensors.joint_position[:, WHEEL_SLICE]
             truth = plant.truth()
@@ -386,12 +375,6 @@ def replayed_rows(
             yield parameters, truth, channels[0, 0]
     finally:
         plant.close()
-
-
-def _near(run: Run, row: int) -> Run:
-    t = run["t"]
-    first, last = np.searchsorted(t, [t[row] - _AROUND, t[row] + _AROUND])
-    return replace(run, table=run.table.iloc[int(first) : int(last)])
 
 
 # ---- a run repeated on a robot: the same comparison ------------------------------------------------------------------
@@ -409,9 +392,6 @@ def compare_repeat(measured: Run, repeated: Run, robot: Robot | str | Path | Non
         repeated: what was logged then.
         robot: whose sensors' noise; None = the one the run's meta data name.
         segment: s.
-
-    Raises:
-        InputError: as :func:`wlr_gym.data.replay.replay`.
     """
     robot, _ = prepare(measured, robot, segment=segment)
     t = measured["t"]
@@ -426,18 +406,12 @@ def compare_repeat(measured: Run, repeated: Run, robot: Robot | str | Path | Non
             continue
         full[name] = np.interp(t - t[0], own[known], repeated[name][known], right=np.nan)
         full[name][t - t[0] > own[-1]] = np.nan
-        turns = name in {f"pos_{joint}" for joint in WHEELS}
-        pieces[name] = _from_each_start(measured[name], full[name], starts) if turns else full[name]
+        pieces[name] = full[name].copy()
+        if name in {f"pos_{joint}" for joint in WHEELS}:  # they begin where the measured ones do
+            for begin, end in zip(starts, [*starts[1:], len(t)], strict=True):
+                pieces[name][begin:end] += measured[name][begin] - full[name][begin]
     errors = channel_errors(measured, full, pieces, channel_noise(robot))
     return ReplayResult(measured, full, pieces, tuple(map(int, starts)), errors, robot, float(np.median(np.diff(own))), 0.0)
-
-
-def _from_each_start(measured: Array, repeated: Array, starts: NDArray[np.intp]) -> Array:
-    """Shift each segment of ``repeated`` so that it begins where ``measured`` does."""
-    shifted = repeated.copy()
-    for begin, end in zip(starts, [*starts[1:], len(measured)], strict=True):
-        shifted[begin:end] += measured[begin] - repeated[begin]
-    return shifted
 
 
 # ---- a simulated run once more, from its record, bit for bit ---------------------------------------------------------
@@ -479,10 +453,13 @@ def simulated_rows(run: Run, robot: Robot) -> Iterator[tuple[Parameters, Truth, 
     setpoints = np.stack([run[name] for name in COMMANDS], axis=1)
     parameters, columns = simulated_parameters(run, robot), sensed_columns(robot)
     changes = {change.row: change.parameters for change in record.changes}
-    forces = load_patch(record.formulas).forces
-    plant = make_plant(record.backend, robot, 1, options, forces)
     try:
-        sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=_state(record, run))
+        start = PlantState(**{name: np.array([value]) for name, value in record.start.items()})
+    except TypeError as error:
+        raise InputError(f"{simulation_path(run.path)}: start: {error}") from None
+    plant = make_plant(record.backend, robot, 1, options, load_patch(record.formulas).forces)
+    try:
+        sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=start)
         for row, wanted in enumerate(setpoints):
             yield parameters, plant.truth(), channels(sensors, 0, columns)
             if row in changes:
@@ -498,13 +475,6 @@ def _record_of(run: Run) -> Simulation:
     if run.simulation is None:
         raise InputError(f"{run.path}: no {simulation_path(run.path).name} beside it: not a simulated run, or not a whole one")
     return run.simulation
-
-
-def _state(record: Simulation, run: Run) -> PlantState:
-    try:
-        return PlantState(**{name: np.array([value]) for name, value in record.start.items()})
-    except TypeError as error:
-        raise InputError(f"{simulation_path(run.path)}: start: {error}") from None
 
 
 def _set(parameters: Parameters, values: Mapping[str, Any]) -> None:
@@ -528,12 +498,11 @@ _CALM = 6.0  # noise units; flat channels are not blown up beyond this
 
 def save_plots(result: ReplayResult, folder: Path) -> list[Path]:
     """Write ``<run>_joints.png`` and ``<run>_body.png`` and return their paths."""
-    return [
-        save(
-            _figure(result, grid, f"{result.run.name}: {name}, measured and replayed"), folder / f"{result.run.name}_{name}.png"
-        )
-        for name, grid in (("joints", _JOINTS), ("body", _BODY))
-    ]
+    paths = []
+    for name, grid in (("joints", _JOINTS), ("body", _BODY)):
+        figure = _figure(result, grid, f"{result.run.name}: {name}, measured and replayed")
+        paths.append(save(figure, folder / f"{result.run.name}_{name}.png"))
+    return paths
 
 
 def _figure(result: ReplayResult, grid: list[list[str]], title: str) -> Figure:

@@ -181,18 +181,15 @@ def _read_csv(path: Path) -> dict[str, Array]:
     for index, row in enumerate(rows[1:]):
         if len(row) != len(header):
             raise InputError(f"{path}: {row_words(path, index)} has {len(row)} values, the header {len(header)} columns")
-    cells = zip(*rows[1:], strict=True) if len(rows) > 1 else ([] for _ in header)
-    return {name: _numbers(column, name, path) for name, column in zip(header, cells, strict=True)}
-
-
-def _numbers(cells: tuple[str, ...] | list[str], name: str, path: Path) -> Array:
-    numbers = []
-    for row, cell in enumerate(cells):
-        try:
-            numbers.append(float(cell) if cell.strip() else np.nan)
-        except ValueError:
-            raise InputError(f"{path}: {row_words(path, row)}, column '{name}': '{cell}' is not a number") from None
-    return np.array(numbers, np.float64)
+    table = np.full((len(rows) - 1, len(header)), np.nan)
+    for index, row in enumerate(rows[1:]):
+        for column, cell in enumerate(row):
+            try:
+                table[index, column] = float(cell) if cell.strip() else np.nan
+            except ValueError:
+                place = f"{path}: {row_words(path, index)}, column '{header[column]}'"
+                raise InputError(f"{place}: '{cell}' is not a number") from None
+    return dict(zip(header, table.T.copy(), strict=True))
 
 
 def _read_parquet(path: Path) -> dict[str, Array]:

@@ -6,6 +6,7 @@ named; then the numbers of a robot file are read off, and what has no number the
 
 from __future__ import annotations
 
+import graphlib
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -173,13 +174,10 @@ def _check_names(tree: LinkTree) -> None:
         if joint.child in above:
             raise InputError(f"{tree.source}: link '{joint.child}' is the child of two joints: expected a tree")
         above[joint.child] = joint.parent
-    for name in tree.links:
-        seen, link = set(), name
-        while link in above:
-            if link in seen:
-                raise InputError(f"{tree.source}: link '{link}' is above itself: expected a tree")
-            seen.add(link)
-            link = above[link]
+    try:
+        graphlib.TopologicalSorter({child: [parent] for child, parent in above.items()}).prepare()
+    except graphlib.CycleError as error:
+        raise InputError(f"{tree.source}: link '{error.args[1][0]}' is above itself: expected a tree") from None
 
 
 def _merged(parent: RigidLink, child: RigidLink, placement: Placement) -> RigidLink:
@@ -188,16 +186,12 @@ def _merged(parent: RigidLink, child: RigidLink, placement: Placement) -> RigidL
     if child.mass == 0.0 and not child.inertia.any():
         return replace(parent, shapes=(*parent.shapes, *shapes))
     com = placement.point(child.com)
-    inertia = placement.rotation @ child.inertia @ placement.rotation.T
     mass = parent.mass + child.mass
     middle = (parent.mass * parent.com + child.mass * com) / mass if mass else parent.com
-    inertia = parent.inertia + inertia + _shift(parent.mass, parent.com - middle) + _shift(child.mass, com - middle)
+    inertia = parent.inertia + placement.rotation @ child.inertia @ placement.rotation.T
+    for one, offset in ((parent.mass, parent.com - middle), (child.mass, com - middle)):  # of mass points that are off it
+        inertia = inertia + one * (offset @ offset * np.eye(3) - np.outer(offset, offset))
     return RigidLink(parent.name, mass, middle, inertia, (*parent.shapes, *shapes))
-
-
-def _shift(mass: float, offset: Array) -> Array:
-    """Inertia (3, 3) of a mass point about a point that is ``offset`` away."""
-    return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
 
 
 # ---- topology --------------------------------------------------------------------------------------------------------
@@ -218,6 +212,8 @@ class Assembly:
         leg, wheel: links.
         leg_frame, wheel_frame: placements of the links.
         leg_sign, wheel_sign: 1 where the joint's axis is the body's +y axis, -1 where it is the opposite.
+        length: hip to wheel, m.
+        angle: of the leg here where the file's is 0, rad, in the turn in which the leg moves below the body.
     """
 
     leg_joint: LinkJoint
@@ -228,6 +224,8 @@ class Assembly:
     wheel_frame: Placement
     leg_sign: float
     wheel_sign: float
+    length: float
+    angle: float
 
     @property
     def wheel_centre(self) -> Array:
@@ -260,35 +258,33 @@ def find_assemblies(tree: LinkTree) -> tuple[RigidLink, list[Assembly]]:
 
 
 def _assembly(tree: LinkTree, hip: LinkJoint, below: dict[str, list[LinkJoint]]) -> Assembly:
-    axles = below[hip.child]
+    where, axles = tree.source, below[hip.child]
     if not axles:
-        raise InputError(f"{tree.source}: link '{hip.child}' of joint '{hip.name}' carries no wheel: {EXPECTED}")
+        raise InputError(f"{where}: link '{hip.child}' of joint '{hip.name}' carries no wheel: {EXPECTED}")
     if len(axles) > 1:
         names = ", ".join(f"'{joint.name}'" for joint in axles)
-        raise InputError(
-            f"{tree.source}: link '{hip.child}' carries {len(axles)} joints ({names}): expected one wheel; {EXPECTED}"
-        )
+        raise InputError(f"{where}: link '{hip.child}' carries {len(axles)} joints ({names}): expected one wheel; {EXPECTED}")
     (axle,) = axles
     if further := below[axle.child]:
-        raise InputError(
-            f"{tree.source}: leg '{hip.name}' has more than one hinge: '{further[0].name}' follows '{axle.name}': {EXPECTED}"
-        )
+        after = f"'{further[0].name}' follows '{axle.name}'"
+        raise InputError(f"{where}: leg '{hip.name}' has more than one hinge: {after}: {EXPECTED}")
     leg_frame = hip.placement
     wheel_frame = leg_frame @ axle.placement
-    signs = _sign(tree.source, hip, leg_frame), _sign(tree.source, axle, wheel_frame)
-    return Assembly(hip, axle, tree.links[hip.child], tree.links[axle.child], leg_frame, wheel_frame, *signs)
-
-
-def _sign(where: str, joint: LinkJoint, frame: Placement) -> float:
-    """Return whether a joint's axis is +y or -y of the body."""
-    axis = frame.rotation @ joint.axis
-    if np.hypot(axis[0], axis[2]) > AXIS_TOLERANCE:
-        text = ", ".join(f"{value:.4g}" for value in axis)
-        raise InputError(
-            f"{where}: joint '{joint.name}' turns about ({text}) of the body: expected its y axis, (0, 1, 0) or (0, -1, 0), "
-            "with x forward, y to the left and z up (REP-103)"
-        )
-    return float(np.sign(axis[1]))
+    signs = []
+    for joint, frame in ((hip, leg_frame), (axle, wheel_frame)):
+        axis = frame.rotation @ joint.axis
+        if np.hypot(axis[0], axis[2]) > AXIS_TOLERANCE:
+            text = ", ".join(f"{value:.4g}" for value in axis)
+            wanted = "expected its y axis, (0, 1, 0) or (0, -1, 0), with x forward, y to the left and z up (REP-103)"
+            raise InputError(f"{where}: joint '{joint.name}' turns about ({text}) of the body: {wanted}")
+        signs.append(float(np.sign(axis[1])))
+    x, _, z = wheel_frame.position - leg_frame.position
+    if math.hypot(x, z) == 0.0:
+        raise InputError(f"{where}: leg '{hip.name}': its wheel '{axle.name}' turns about the hip: length = 0 m")
+    angle, middle = math.atan2(-z, x) + 0.0, sum(hip.limits) / 2 if hip.limits else hip.home or 0.0
+    turns = round((signs[0] * middle + angle - math.pi / 2) / (2.0 * math.pi))
+    leg, wheel, angle = tree.links[hip.child], tree.links[axle.child], angle - 2.0 * math.pi * turns
+    return Assembly(hip, axle, leg, wheel, leg_frame, wheel_frame, signs[0], signs[1], math.hypot(x, z), angle)
 
 
 def _in_corner_order(assemblies: list[Assembly], where: str) -> list[Assembly]:
@@ -390,6 +386,12 @@ class _Reader:
             text = f"{what} = {value:.4g} {unit}: a robot file has no number for it"
             self._accept(share, f"{text}; left out ({100 * share:.2g} % of {scale:.4g} {unit})", text)
 
+    def leave_out_products(self, what: str, inertia: Array, scale: float | None = None) -> None:
+        """Note an inertia's products, beside the moments of both axes or ``scale``; ``{}`` in ``what`` is the axes."""
+        for (i, j), axes in (((0, 1), "xy"), ((0, 2), "xz"), ((1, 2), "yz")):
+            beside = scale or math.sqrt(abs(inertia[i, i] * inertia[j, j]))
+            self.leave_out(what.format(axes), float(inertia[i, j]), "kg m2", beside)
+
     def _accept(self, share: float, note: str, refusal: str) -> None:
         if share > SMALL and not self.idealise:
             raise InputError(
@@ -419,39 +421,21 @@ def recognise(tree: LinkTree, *, idealise: bool = False) -> ImportedRobot:
     reader = _Reader(tree.source, idealise)
     for key, value in tree.numbers.items():
         reader.put(key, value)
-    origin = _origin(body, assemblies, reader)
-    _read_body(body, origin, assemblies, reader)
-    directions = [_leg_geometry(one, tree.source) for one in assemblies]
-    _read_legs(assemblies, directions, reader)
+    for link in (body, *(link for one in assemblies for link in (one.leg, one.wheel))):
+        if link.mass <= 0.0:
+            raise InputError(f"{tree.source}: link '{link.name}': mass = {link.mass:g} kg: expected more than 0")
+    _read_body(body, assemblies, reader)
+    _read_legs(assemblies, reader)
     _read_wheels(assemblies, reader)
     _read_drives(assemblies, reader)
-    offsets = [_leg_offset(one, angle) for one, (_, angle) in zip(assemblies, directions, strict=True)]
-    _read_limits(assemblies, offsets, reader)
-    _read_home(assemblies, offsets, reader)
-    joints = [JointMapping(ours, one.leg_joint.name, one.leg_sign, rounded(angle))
-              for ours, one, angle in zip(LEGS, assemblies, offsets, strict=True)]  # fmt: skip
-    joints += [JointMapping(ours, one.wheel_joint.name, one.wheel_sign, 0.0)
-               for ours, one in zip(WHEELS, assemblies, strict=True)]  # fmt: skip
+    _read_limits(assemblies, reader)
+    legs, wheels = zip(LEGS, assemblies, strict=True), zip(WHEELS, assemblies, strict=True)
+    joints = [JointMapping(ours, one.leg_joint.name, one.leg_sign, rounded(one.angle)) for ours, one in legs]
+    joints += [JointMapping(ours, one.wheel_joint.name, one.wheel_sign, 0.0) for ours, one in wheels]
     return ImportedRobot(tree.name, nested(reader.numbers), joints, reader.notes)
 
 
 # ---- body ------------------------------------------------------------------------------------------------------------
-
-
-def _hips(assemblies: Sequence[Assembly]) -> Array:
-    """Hips (4, 3) in the plane of their wheels: the hinge has no other place along its axis."""
-    return np.array([[one.leg_frame.position[0], one.wheel_centre[1], one.leg_frame.position[2]] for one in assemblies])
-
-
-def _origin(body: RigidLink, assemblies: Sequence[Assembly], reader: _Reader) -> Array:
-    middle = _hips(assemblies).mean(axis=0)
-    box = _bounds(body.shapes)
-    height = 0.0 if box is None else float(box.mean(axis=0)[2])
-    origin = np.array([middle[0], middle[1], height])
-    if np.linalg.norm(origin) > SAME:
-        text = ", ".join(f"{value:.4g}" for value in origin)
-        reader.notes.append(f"body origin: put at ({text}) m of link '{body.name}': the middle of hips and body")
-    return origin
 
 
 def _bounds(shapes: Sequence[LinkShape]) -> Array | None:
@@ -475,88 +459,60 @@ def _corners(shape: LinkShape) -> Array:
     return np.array([placement.position - reach, placement.position + reach])
 
 
-def _read_body(body: RigidLink, origin: Array, assemblies: Sequence[Assembly], reader: _Reader) -> None:
-    hips = _hips(assemblies) - origin
-    _require_mass(body, reader.source)
-    reader.put("body.mass", body.mass)
+def _read_body(body: RigidLink, assemblies: Sequence[Assembly], reader: _Reader) -> None:
+    # A hip is in the plane of its wheel: a hinge has no other place along its axis.
+    hips = np.array([[one.leg_frame.position[0], one.wheel_centre[1], one.leg_frame.position[2]] for one in assemblies])
     box = _bounds(body.shapes)
+    origin = np.array([*hips.mean(axis=0)[:2], 0.0 if box is None else box.mean(axis=0)[2]])
+    if np.linalg.norm(origin) > SAME:
+        text = ", ".join(f"{value:.4g}" for value in origin)
+        reader.notes.append(f"body origin: put at ({text}) m of link '{body.name}': the middle of hips and body")
+    hips = hips - origin
+    reader.put("body.mass", body.mass)
     if box is not None:
         reader.put("body.size", list(box[1] - box[0]))
     else:
         reader.notes.append(f"body.size: link '{body.name}' has no box: taken from the base")
     reader.put("body.inertia", list(np.diag(body.inertia)))
-    for (i, j), axes in (((0, 1), "xy"), ((0, 2), "xz"), ((1, 2), "yz")):
-        scale = math.sqrt(abs(body.inertia[i, i] * body.inertia[j, j]))
-        reader.leave_out(f"body '{body.name}': product of inertia {axes}", float(body.inertia[i, j]), "kg m2", scale)
+    reader.leave_out_products(f"body '{body.name}': product of inertia {{}}", body.inertia)
     reader.put("body.com_offset", list(body.com - origin))
     signs = np.array(CORNER_SIGNS)
+    size = float(np.abs(hips[:, :2]).max())
     reader.put("hip_position.x", reader.one("hip_position.x", list(hips[:, 0] * signs[:, 0]), "m"))
     reader.put("hip_position.y", reader.one("hip_position.y", list(hips[:, 1] * signs[:, 1]), "m"))
-    size = float(np.abs(hips[:, :2]).max())
     reader.put("hip_position.z", reader.one("hip_position.z", list(hips[:, 2]), "m", scale=size))
-
-
-def _require_mass(link: RigidLink, source: str) -> None:
-    if link.mass <= 0.0:
-        raise InputError(f"{source}: link '{link.name}': mass = {link.mass:g} kg: expected more than 0")
 
 
 # ---- legs ------------------------------------------------------------------------------------------------------------
 
 
-def _leg_geometry(one: Assembly, source: str) -> tuple[float, float]:
-    """Length (m), and the leg's angle here where the file's is 0 (rad)."""
-    x, _, z = one.wheel_frame.position - one.leg_frame.position
-    if math.hypot(x, z) == 0.0:
-        raise InputError(
-            f"{source}: leg '{one.leg_joint.name}': its wheel '{one.wheel_joint.name}' turns about the hip: length = 0 m"
-        )
-    return math.hypot(x, z), math.atan2(-z, x) + 0.0
-
-
-def _read_legs(assemblies: Sequence[Assembly], geometry: Sequence[tuple[float, float]], reader: _Reader) -> None:
-    lengths = [length for length, _ in geometry]
+def _read_legs(assemblies: Sequence[Assembly], reader: _Reader) -> None:
+    lengths = [one.length for one in assemblies]
     reader.put("leg.length", reader.one("leg.length", lengths, "m"))
     rows = []
-    for one, (length, angle) in zip(assemblies, geometry, strict=True):
-        _require_mass(one.leg, reader.source)
-        axes = _leg_axes(angle)
+    for one in assemblies:
+        sine, cosine = (0.0 if abs(value) < 1e-15 else value for value in (math.sin(one.angle), math.cos(one.angle)))
+        axes = np.array(
+            [[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]]
+        )  # columns: along the leg, body's y, across
         com = axes.T @ (one.leg_frame.point(one.leg.com) - one.leg_frame.position)
         inertia = axes.T @ one.leg_frame.rotation @ one.leg.inertia @ one.leg_frame.rotation.T @ axes
         beside = float(com[1] + one.leg_frame.position[1] - one.wheel_centre[1])
         where = f"leg '{one.leg.name}'"
-        reader.leave_out(f"{where}: centre of mass off the line hip to wheel", float(com[2]), "m", length)
+        reader.leave_out(f"{where}: centre of mass off the line hip to wheel", float(com[2]), "m", one.length)
         reader.leave_out(f"{where}: centre of mass beside the wheel's plane", beside, "m", 2.0 * abs(one.wheel_centre[1]))
-        for (i, j), name in (((0, 1), "xy"), ((0, 2), "xz"), ((1, 2), "yz")):
-            scale = math.sqrt(abs(inertia[i, i] * inertia[j, j]))
-            reader.leave_out(f"{where}: product of inertia {name} in the leg's frame", float(inertia[i, j]), "kg m2", scale)
+        reader.leave_out_products(f"{where}: product of inertia {{}} in the leg's frame", inertia)
         rows.append((one.leg.mass, float(com[0]), *(float(inertia[k, k]) for k in (2, 1, 0))))  # straight down: x, y, own axis
     mass, com, *moments = zip(*rows, strict=True)
     reader.put("leg.mass", reader.one("leg.mass", mass, "kg"))
     along = reader.one("leg.com_along_leg", com, "m", scale=max(lengths))
     if along is not None and along < 0.0:
-        raise InputError(
-            f"{reader.source}: leg.com_along_leg = {along:.6g} m: the legs' mass is behind the hip: expected 0 or more"
-        )
+        where = f"{reader.source}: leg.com_along_leg = {along:.6g} m"
+        raise InputError(f"{where}: the legs' mass is behind the hip: expected 0 or more")
     reader.put("leg.com_along_leg", along)
     scale = max(map(max, moments))
     reader.put("leg.inertia", [reader.one(f"leg.inertia {axis}", values, "kg m2", scale=scale)
                                for axis, values in zip("xyz", moments, strict=True)])  # fmt: skip
-
-
-def _leg_offset(one: Assembly, angle: float) -> float:
-    """Return the leg's angle here where the file's is 0, in the turn in which the leg moves below the body (rad)."""
-    joint = one.leg_joint
-    middle = sum(joint.limits) / 2 if joint.limits else joint.home or 0.0
-    turns = round((one.leg_sign * middle + angle - math.pi / 2) / (2.0 * math.pi))
-    return angle - 2.0 * math.pi * turns
-
-
-def _leg_axes(angle: float) -> Array:
-    """Axes of a leg at an angle, as columns: along it, the body's y axis, and across."""
-    sine, cosine = math.sin(angle), math.cos(angle)
-    sine, cosine = (0.0 if abs(value) < 1e-15 else value for value in (sine, cosine))
-    return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
 
 
 # ---- wheels ----------------------------------------------------------------------------------------------------------
@@ -569,19 +525,16 @@ def _read_wheels(assemblies: Sequence[Assembly], reader: _Reader) -> None:
     reader.put("wheel.width", reader.one("wheel.width", widths, "m") if None not in widths else None)
     rows = []
     for one, (radius, _) in zip(assemblies, sizes, strict=True):
-        _require_mass(one.wheel, reader.source)
         where, frame = f"wheel '{one.wheel.name}'", one.wheel_frame
         inertia = frame.rotation @ one.wheel.inertia @ frame.rotation.T
         centre = one.wheel_centre - frame.position
         reader.leave_out(f"{where}: centre of mass off its axle", math.hypot(centre[0], centre[2]), "m", radius)
         across = float(inertia[0, 0] + inertia[2, 2]) / 2
         reader.leave_out(f"{where}: difference of its inertias across the axle", float(inertia[0, 0]) - across, "kg m2", across)
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            reader.leave_out(f"{where}: product of inertia", float(inertia[i, j]), "kg m2", across)
+        reader.leave_out_products(f"{where}: product of inertia", inertia, across)
         rows.append((one.wheel.mass, float(inertia[1, 1]), across))
-    for key, unit, values in zip(
-        ("mass", "spin_inertia", "transverse_inertia"), ("kg", "kg m2", "kg m2"), zip(*rows, strict=True), strict=True
-    ):
+    units = {"mass": "kg", "spin_inertia": "kg m2", "transverse_inertia": "kg m2"}
+    for (key, unit), values in zip(units.items(), zip(*rows, strict=True), strict=True):
         reader.put(f"wheel.{key}", reader.one(f"wheel.{key}", values, unit))
 
 
@@ -630,34 +583,33 @@ def _read_drives(assemblies: Sequence[Assembly], reader: _Reader) -> None:
             reader.put(f"servo.{group}.{key}", value)
 
 
-def _read_limits(assemblies: Sequence[Assembly], offsets: Sequence[float], reader: _Reader) -> None:
-    spans = []
-    for one, offset in zip(assemblies, offsets, strict=True):
-        if one.leg_joint.limits is None:
-            return
-        low, high = sorted(one.leg_sign * angle + offset for angle in one.leg_joint.limits)
-        spans.append((low, high))
-    if all(high <= low for low, high in spans):
-        return
-    lows, highs = zip(*spans, strict=True)
-    low, high = max(lows), min(highs)
-    if max(low - min(lows), max(highs) - high) > SAME:
-        texts = ", ".join(f"[{first:.4g}, {last:.4g}]" for first, last in spans)
-        reader.notes.append(f"leg_limits: legs move in {texts} rad: a robot file has one for all four; what all can is used")
-    if low >= high:
-        raise InputError(f"{reader.source}: leg_limits: no angle is allowed to all legs: [{low:.6g}, {high:.6g}] rad")
-    reader.put("leg_limits", [low, high])
-
-
-def _read_home(assemblies: Sequence[Assembly], offsets: Sequence[float], reader: _Reader) -> None:
-    """Take the legs' angle of the file's own pose, where it is one for all."""
-    angles = [one.leg_sign * (one.leg_joint.home or 0.0) + offset for one, offset in zip(assemblies, offsets, strict=True)]
-    if any(one.leg_joint.home is None for one in assemblies):
+def _read_limits(assemblies: Sequence[Assembly], reader: _Reader) -> None:
+    """Take the legs' limits, what all can, and their angle in the file's own pose, where it is one for all."""
+    limits = [one.leg_joint.limits for one in assemblies]
+    spans = [
+        sorted(one.leg_sign * angle + one.angle for angle in span)
+        for one, span in zip(assemblies, limits, strict=True)
+        if span is not None
+    ]
+    if len(spans) == len(limits) and any(high > low for low, high in spans):
+        lows, highs = zip(*spans, strict=True)
+        low, high = max(lows), min(highs)
+        if max(low - min(lows), max(highs) - high) > SAME:
+            texts = ", ".join(f"[{first:.4g}, {last:.4g}]" for first, last in spans)
+            reader.notes.append(
+                f"leg_limits: legs move in {texts} rad: a robot file has one for all four; what all can is used"
+            )
+        if low >= high:
+            raise InputError(f"{reader.source}: leg_limits: no angle is allowed to all legs: [{low:.6g}, {high:.6g}] rad")
+        reader.put("leg_limits", [low, high])
+    homes = [one.leg_joint.home for one in assemblies]
+    angles = [one.leg_sign * (home or 0.0) + one.angle for one, home in zip(assemblies, homes, strict=True)]
+    if None in homes:
         return
     if max(angles) - min(angles) > SAME:
         reader.notes.append(f"home.leg_angle: legs at {', '.join(f'{angle:.4g}' for angle in angles)} rad: taken from the base")
-        return
-    reader.put("home.leg_angle", angles[0])
+    else:
+        reader.put("home.leg_angle", angles[0])
 
 
 # ---- a robot file over a base ----------------------------------------------------------------------------------------
