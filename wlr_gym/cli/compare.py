@@ -7,7 +7,6 @@ says how to read them.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -25,13 +24,9 @@ from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
-    from wlr_gym.data.comparison import ComparedPlant, Comparison, ReportTable
+    from wlr_gym.data.comparison import ReportTable
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
-
-
-#: Share of the time that driving takes, about; drawing takes the rest.
-_DRIVES = 0.7
 
 
 @dataclass(frozen=True)
@@ -75,27 +70,42 @@ def run(options: CompareOptions) -> int:
     Raises:
         InputError: unknown plant, excitation, effect or robot, unreadable runs, numbers out of range.
     """
-    from wlr_gym.data.comparison import markdown, parse_plant, summary_table, tables
+    from wlr_gym.data.comparison import compare, markdown, parse_plant, save_map, save_motion_plot, summary_table, tables
 
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if first == second:
         raise InputError(f"--plants {' '.join(options.plants)}: the same plant twice; expected two that differ")
     motions, robot = _motions(options)
-    patches = _patches(options, motions, robot)
+    patches = _patches(options, robot)
     options.refuse_results(options.out, "compare.json")
     console, comparisons = Console(), []
-    with output_folder(options.out):
-        for comparison in _compare_all(options, motions, (first, second), robot, patches, console):
-            comparisons.append(comparison)
+    with output_folder(options.out), progress(console) as tell:
+        for done, patch in enumerate(patches):
+            of_them = f", effects: {patch.summary()}" if len(patches) > 1 else ""
+
+            def told(doing: str, share: float, done: int = done, of_them: str = of_them) -> None:
+                tell("", f"{doing}{of_them}", (done + share) / len(patches))
+
+            found = compare(
+                motions, (first, second), robot, None, patch, options.threshold, halve=options.halve, threads=options.threads,
+                tell=told,
+            )  # fmt: skip
+            comparisons.append(found)
+            if options.plots:
+                told("drawing", 1.0)
+                label = re.sub(r"[^\w]+", "_", found.effects)[-120:]  # file systems take names of 255 letters
+                for index, motion in enumerate(motions):
+                    save_motion_plot(found, index, options.out / f"{label}_{motion.name}.png")
+                save_map(found, options.out / f"{label}.png")
             if len(patches) == 1 and not options.json:
-                for table in tables(comparison):
+                for table in tables(found):
                     _print(console, table)
-    found = [comparison.as_dict() for comparison in comparisons]
+    content = [comparison.as_dict() for comparison in comparisons]
     if options.json:
-        print_json(found)
+        print_json(content)
     elif len(patches) > 1:
         _print(console, summary_table(comparisons))
-    write_json(options.out / "compare.json", found)
+    write_json(options.out / "compare.json", content)
     write_text(options.out / "report.md", markdown(comparisons, f"{first.label} and {second.label}"))
     driven = {"robot": robot.name, "motions": [motion.name for motion in motions], "effects": patches[0].content()["effects"]}
     record_provenance(options.out, settings_of(options) | driven)
@@ -118,55 +128,15 @@ def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
     return [motion_of(measured).cut(options.seconds) for measured in runs], robot_of(runs[0], options.robot)
 
 
-def _patches(options: CompareOptions, motions: Sequence[Motion], robot: Robot) -> list[Patch]:
-    """Return what to compare with, each tried on the parameters first so that a refusal leaves no folder behind."""
+def _patches(options: CompareOptions, robot: Robot) -> list[Patch]:
     from wlr_gym.data.comparison import severe_patch
     from wlr_gym.physics.effects import EFFECTS, apply_patch, compose
 
     given = options.patch()
-    patches = [given]
-    if options.every_effect:
-        patches += [compose(given, severe_patch(name)) for name in EFFECTS]
-    for patch in patches:
+    patches = [given, *(compose(given, severe_patch(name)) for name in EFFECTS if options.every_effect)]
+    for patch in patches:  # a refusal leaves no folder behind
         apply_patch(patch, Parameters.nominal(robot))
     return patches
-
-
-def _compare_all(
-    options: CompareOptions,
-    motions: Sequence[Motion],
-    plants: tuple[ComparedPlant, ComparedPlant],
-    robot: Robot,
-    patches: Sequence[Patch],
-    console: Console,
-) -> Iterator[Comparison]:
-    from wlr_gym.data.comparison import compare
-
-    with progress(console) as tell:
-        for done, patch in enumerate(patches):
-
-            def told(doing: str, share: float, done: int = done, patch: Patch = patch) -> None:
-                of_them = f", effects: {patch.summary()}" if len(patches) > 1 else ""
-                tell("", f"{doing}{of_them}", (done + share) / len(patches))
-
-            drives = _DRIVES if options.plots else 1.0
-            found = compare(
-                motions, plants, robot, None, patch, options.threshold, halve=options.halve, threads=options.threads,
-                tell=lambda doing, share, told=told, drives=drives: told(doing, drives * share),
-            )  # fmt: skip
-            if options.plots:
-                _draw(found, options.out, lambda doing, share, told=told: told(doing, _DRIVES + (1.0 - _DRIVES) * share))
-            yield found
-
-
-def _draw(found: Comparison, out: Path, tell: Callable[[str, float], None]) -> None:
-    from wlr_gym.data.comparison import save_map, save_motion_plot
-
-    label = re.sub(r"[^\w]+", "_", found.effects)[-120:]  # file systems take names of 255 letters
-    for index, motion in enumerate(found.motions):
-        tell("drawing", index / len(found.motions))
-        save_motion_plot(found, index, out / f"{label}_{motion.name}.png")
-    save_map(found, out / f"{label}.png")
 
 
 def _print(console: Console, table: ReportTable) -> None:
