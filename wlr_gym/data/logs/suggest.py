@@ -10,9 +10,9 @@ from __future__ import annotations
 import itertools
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,8 +104,7 @@ class FieldCandidate:
     unit: str | None = None
 
 
-@dataclass(frozen=True)
-class _NameFacts:
+class _NameFacts(NamedTuple):
     """What a name says, None where nothing: corner (lf, ...), part (leg, wheel), quantity (pos, ...), whether a setpoint."""
 
     corner: str | None
@@ -115,37 +114,26 @@ class _NameFacts:
 
 
 def read_name(name: str) -> _NameFacts:
-    """Return what a name of a field, joint or column says."""
+    """Return what a name of a field, joint or column says; its part is by the last word: ``leg_wheel_fl`` is a wheel."""
     found = words(name)
+    parts = [part for word in found for part, known in (("wheel", _WHEEL), ("leg", _LEG)) if word.startswith(known) or
+             word.endswith(known)]  # fmt: skip
+    part = "wheel" if "wheel" in parts or "w" in found else parts[0] if parts else None
     quantity = next((kind for word in found for kind, known in _QUANTITIES.items() if word in known), None)
-    return _NameFacts(_corner(found), _part(found), quantity, any(word in _COMMAND for word in found))
+    return _NameFacts(_corner(found), part, quantity, any(word in _COMMAND for word in found))
 
 
 def _corner(found: list[str]) -> str | None:
     for word in found:
-        if word in _CORNERS:
-            return _CORNERS[word]
-        for part in (*_WHEEL, *_LEG):  # flwheel, wheelfl
-            rest = word.replace(part, "", 1)
-            if rest != word and rest in _CORNERS:
-                return _CORNERS[rest]
+        for part in ("", *_WHEEL, *_LEG):  # fl, flwheel, wheelfl
+            if word.replace(part, "", 1) in _CORNERS:
+                return _CORNERS[word.replace(part, "", 1)]
     said = set(found)
     end = "f" if said & _FRONT else "r" if said & _REAR else None
     side = "l" if said & _LEFT else "r" if said & _RIGHT else None
     if "r" in said:  # the one of right and rear that is not said otherwise
         side, end = side or "r", end or "r"
     return f"{side}{end}" if side and end else None
-
-
-def _part(found: list[str]) -> str | None:
-    """Return leg or wheel, by the word that comes last: ``leg_wheel_fl`` is a wheel on a leg."""
-    part = None
-    for word in found:
-        if word.startswith(_WHEEL) or word.endswith(_WHEEL) or word == "w":
-            part = "wheel"
-        elif word.startswith(_LEG) or word.endswith(_LEG):
-            part = part or "leg"
-    return part
 
 
 def stated_unit(name: str, column: str) -> str | None:
@@ -170,13 +158,14 @@ def find_candidates(
     Raises:
         InputError: the log holds two robots, or two joints of one name, or nothing in the namespace.
     """
-    topics = [topic for name, topic in log.topics.items() if namespace is None or _in_namespace(name, namespace)]
+    begin = f"/{(namespace or '').strip('/')}/".replace("//", "/")  # /robot_10/imu is not in /robot_1
+    topics = [topic for name, topic in log.topics.items() if f"/{name.strip('/')}/".startswith(begin)]
     if not topics:
-        roots = ", ".join(dict.fromkeys(_root(name) for name in log.topics))
+        roots = ", ".join(dict.fromkeys(f"/{_root_and_rest(name)[0]}" for name in log.topics))
         raise InputError(f"{log.name}: namespace '{namespace}': no topic is in it; topics are in {roots}")
     found: dict[str, list[FieldCandidate]] = {}
     for topic in topics:
-        for candidate in _of_topic(topic, robot, names or {}):
+        for candidate in (*_joints(topic, robot, names or {}), *_vectors(topic), *_pose(topic), *_supply(topic)):
             found.setdefault(candidate.column, []).append(candidate)
 
     def rank(one: FieldCandidate) -> tuple[int, int]:
@@ -189,35 +178,29 @@ def find_candidates(
     return found
 
 
-def _of_topic(topic: Topic, robot: Robot, names: Mapping[str, str]) -> Iterator[FieldCandidate]:
-    for field in topic.fields:
-        if not re.search(r"(pose|position|orientation|twist|transform|linear|angular)[\w.]*\.[xyzw]$", field):
-            yield from _joint(topic, field, robot, names)
-    yield from _vectors(topic)
-    yield from _pose(topic)
-    for field in topic.fields:
-        if _says(field, _VOLTAGE) and _bracket(field) is None and read_name(field).corner is None:
-            yield FieldCandidate("volt", topic.name, field, unit=stated_unit(field, "volt"))
-
-
 # ---- joints ----------------------------------------------------------------------------------------------------------
 
 
-def _joint(topic: Topic, field: str, robot: Robot, names: Mapping[str, str]) -> Iterator[FieldCandidate]:
-    name = _bracket(field)
-    facts, of_topic = read_name(name or field), read_name(topic.name)
-    given = [joint for joint, known in names.items() if known == name]
-    joint = given[0] if len(given) == 1 else _which(facts, of_topic, None if is_unnamed(topic, field) else name, robot)
-    if joint is None or names.get(joint, "") not in field:  # the map has another name for this joint
-        return
-    text = field.replace(f"[{name}]", " ").strip() if name else field
-    outside = read_name(text)
-    quantity = outside.quantity or facts.quantity or of_topic.quantity
-    if outside.command or facts.command or of_topic.command:
-        quantity = "cmd" if quantity in (None, "pos" if joint in LEGS else "vel") else None
-    if quantity is not None:
-        column = f"{quantity}_{joint}"
-        yield FieldCandidate(column, topic.name, field, name, stated_unit(text, column) or stated_unit(name or "", column))
+def _joints(topic: Topic, robot: Robot, names: Mapping[str, str]) -> Iterator[FieldCandidate]:
+    of_topic = read_name(topic.name)
+    for field in topic.fields:
+        if re.search(r"(pose|position|orientation|twist|transform|linear|angular)[\w.]*\.[xyzw]$", field):
+            continue
+        name = _bracket(field)
+        facts = read_name(name or field)
+        given = [joint for joint, known in names.items() if known == name]
+        joint = given[0] if len(given) == 1 else _which(facts, of_topic, None if is_unnamed(topic, field) else name, robot)
+        if joint is None or names.get(joint, "") not in field:  # the map has another name for this joint
+            continue
+        text = field.replace(f"[{name}]", " ").strip() if name else field
+        outside = read_name(text)
+        quantity = outside.quantity or facts.quantity or of_topic.quantity
+        if outside.command or facts.command or of_topic.command:
+            quantity = "cmd" if quantity in (None, "pos" if joint in LEGS else "vel") else None
+        if quantity is not None:
+            column = f"{quantity}_{joint}"
+            unit = stated_unit(text, column) or stated_unit(name or "", column)
+            yield FieldCandidate(column, topic.name, field, name, unit)
 
 
 def is_unnamed(topic: Topic, field: str) -> bool:
@@ -243,7 +226,7 @@ def _bracket(field: str) -> str | None:
     return found[-1] if found and (len(found[-1]) == 1 or found[-1].lower() not in _UNITS) else None
 
 
-# ---- IMU and pose ----------------------------------------------------------------------------------------------------
+# ---- IMU, supply and pose ----------------------------------------------------------------------------------------------------
 
 
 def _vectors(topic: Topic) -> Iterator[FieldCandidate]:
@@ -256,6 +239,12 @@ def _vectors(topic: Topic) -> Iterator[FieldCandidate]:
         kind = next((kind for kind, known in _VECTORS.items() if _says(stem, known)), None) or _SHORT.get(stem)
         if kind is not None and axis is not None and _has(topic, field, "xyz"):
             yield FieldCandidate(f"{kind}_{axis}", topic.name, field, unit=stated_unit(field, f"{kind}_{axis}"))
+
+
+def _supply(topic: Topic) -> Iterator[FieldCandidate]:
+    for field in topic.fields:
+        if _says(field, _VOLTAGE) and _bracket(field) is None and read_name(field).corner is None:
+            yield FieldCandidate("volt", topic.name, field, unit=stated_unit(field, "volt"))
 
 
 def may_be_pose(field: str) -> bool:
@@ -280,16 +269,13 @@ def _pose(topic: Topic) -> Iterator[FieldCandidate]:
                 return
     turns = [field[:-1] for field in topic.fields if field.endswith("w") and _has(topic, f"{field[:-1]}x", "xyz")]
     named = [field for field in topic.fields if _says(field, _HEADING) or re.fullmatch(r"(.*\.)?theta", field)]
-    headings = [
-        field
-        for field in [*named, *(f"{turn.rstrip('._')}.yaw" for turn in turns)]
-        if not _says(field, _NOT_POSE) and not _of_other(field)
-    ]
-    places = [
-        field
-        for field in topic.fields
-        if _is_place(field) and _has(topic, field, "xy") and field[:-1] not in turns and not _of_other(field)
-    ]
+    headings = [*named, *(f"{turn.rstrip('._')}.yaw" for turn in turns)]
+    headings = [field for field in headings if not _says(field, _NOT_POSE) and not _of_other(field)]
+    places = []
+    for field in (field for field in topic.fields if field[:-1] not in turns and not _of_other(field)):
+        stem, axis = _axis_of(_bracket(field) or field)  # x or, as in pose.x or cam_x, the x of a place
+        if axis == "x" and (not stem or _says(stem, _PLACE)) and not _says(stem, _NOT_POSE) and _has(topic, field, "xy"):
+            places.append(field)
     if headings and places:
         heading = min(headings, key=lambda one: words(one)[0] != words(places[0])[0])
         for column, field in (("cam_x", places[0]), ("cam_y", _other(places[0], "y")), ("cam_yaw", heading)):
@@ -302,25 +288,16 @@ def _of_other(name: str) -> bool:
     return facts.command or facts.corner is not None
 
 
-def _is_place(field: str) -> bool:
-    """Whether a name is ``x`` or, as ``pose.x`` or ``cam_x``, the x of a place."""
-    stem, axis = _axis_of(_bracket(field) or field)
-    return axis == "x" and (not stem or _says(stem, _PLACE)) and not _says(stem, _NOT_POSE)
-
-
 def _axis_of(field: str) -> tuple[str, str | None]:
     """Return the name without its axis, and the axis: of ``gyro_x``, ``imu.acc.y``, ``gz``, ``x``, ``acc_x_mg``."""
     found = _split(field)
-    return (found.group(1).rstrip("._[ ").lower(), found.group(2).lower()) if found else (field.lower(), None)
+    return (found[1].rstrip("._[ ").lower(), found[2].lower()) if found else (field.lower(), None)
 
 
 def _other(field: str, axis: str) -> str:
     """Return a field's name with another axis."""
     found = _split(field)
-    if not found:
-        return field
-    letter = axis.upper() if found.group(2).isupper() else axis
-    return f"{found.group(1)}{letter}{found.group(3)}"
+    return f"{found[1]}{axis.upper() if found[2].isupper() else axis}{found[3]}" if found else field
 
 
 def _split(field: str) -> re.Match[str] | None:
@@ -341,34 +318,27 @@ def _says(name: str, known: set[str]) -> bool:
 
 
 def _check_one_robot(log: Log, found: Mapping[str, list[FieldCandidate]], namespace: str | None) -> None:
-    for joint in JOINTS:
-        candidates = found.get(f"pos_{joint}", [])
-        for first in candidates[:1]:
-            same = [one for one in candidates if one.topic == first.topic and one.field != first.field]
-            if same:
-                raise InputError(
-                    f"{log.name}: topic '{first.topic}': fields '{first.field}' and '{same[0].field}' are both the {joint}: "
-                    f"two robots in one topic, or two joints per leg? name the right one in the map: joints: {{{joint}: NAME}}"
-                )
-        twins = sorted({_root(one.topic) for one in candidates if _tail(one.topic) == _tail(candidates[0].topic)})
+    for joint in (joint for joint in JOINTS if f"pos_{joint}" in found):
+        first, *others = found[f"pos_{joint}"]
+        same = [one for one in others if one.topic == first.topic and one.field != first.field]
+        if same:
+            raise InputError(
+                f"{log.name}: topic '{first.topic}': fields '{first.field}' and '{same[0].field}' are both the {joint}: "
+                f"two robots in one topic, or two joints per leg? name the right one in the map: joints: {{{joint}: NAME}}"
+            )
+        topics = sorted({first.topic, *(one.topic for one in others)})
+        rest = _root_and_rest(first.topic)[1]
+        twins = [f"/{_root_and_rest(topic)[0]}" for topic in topics if _root_and_rest(topic)[1] == rest]
         if len(twins) > 1 and namespace is None:
             raise InputError(
-                f"{log.name}: two robots: topics {', '.join(sorted({one.topic for one in candidates}))} each have the {joint}; "
+                f"{log.name}: two robots: topics {', '.join(topics)} each have the {joint}; "
                 f"say which in the map: namespace: {twins[0]}  (or {', '.join(twins[1:])})"
             )
 
 
-def _in_namespace(topic: str, namespace: str) -> bool:
-    """Whether a topic is in a namespace: ``/robot_10/imu`` is not in ``/robot_1``."""
-    return f"/{topic.strip('/')}/".startswith(f"/{namespace.strip('/')}/")
-
-
-def _root(topic: str) -> str:
-    return "/" + topic.strip("/").split("/")[0]
-
-
-def _tail(topic: str) -> str:
-    return "/".join(topic.strip("/").split("/")[1:])
+def _root_and_rest(topic: str) -> tuple[str, str]:
+    root, _, rest = topic.strip("/").partition("/")
+    return root, rest
 
 
 # ---- the proposal ----------------------------------------------------------------------------------------------------
@@ -519,7 +489,10 @@ class _Proposer:
         for name, columns in _SETS.items():
             self._set(name, [column for column in columns if column in self.chosen])
         self._frames()
-        self._profile()
+        if "profile" not in self.known.get("meta", {}):
+            self.content["meta"]["profile"] = OPEN
+            text = "the servos' profile: {wheel_acceleration: rad/s2, leg_velocity: rad/s, leg_acceleration: rad/s2}, {} = none"
+            self.note("meta.profile", f"{text}. Without this line {NO_PROFILE.partition(': ')[2]}")
         order = ("rows", "every", "joints", "channels", "frames", "clocks", "namespace", "meta")
         content = overlay({key: self.content[key] for key in order if self.content.get(key)}, self.known)
         unused = tuple(name for name in self.log.topics if name not in self.topics)
@@ -655,7 +628,10 @@ class _Proposer:
             spread = [float(np.ptp(values)) if len(values) else 0.0 for _, values in map(self.raw, (f"cam_{a}" for a in XYZ))]
             shown = ", ".join(f"{axis} goes over {size:.3g}" for axis, size in zip(XYZ, spread, strict=True))
             shown += ": the one that hardly changes points up"
-            is_tilted = (tilt := self._tilt()) > _TILTED
+            chosen = self.chosen["cam_yaw"]
+            topic, stem = self.log.topics[chosen.topic], chosen.field.rpartition(".")[0]
+            _, tilts = pose_angle(topic, f"{stem}.tilt", self.clocks[chosen.topic].use, None, self.log.name)
+            is_tilted = (tilt := float(np.median(tilts))) > _TILTED  # off upright: no run begins on its side
             if is_tilted:
                 shown += f"; its quaternion tilts the robot by {np.degrees(tilt):.0f} deg: are its parts in another order?"
             if is_tilted or spread[2] > 0.3 * min(spread[:2]) or spread[2] == max(spread):
@@ -667,18 +643,6 @@ class _Proposer:
             text = f"not proposed: the poses of {', '.join(others)} are not known to be the body's, measured; name one if it is"
             self.note("channels.cam", text, asks=False)
 
-    def _tilt(self) -> float:
-        """Return how far the pose's quaternion tilts the robot off upright in the median, rad; no run begins on its side."""
-        chosen = self.chosen["cam_yaw"]
-        topic, field = self.log.topics[chosen.topic], f"{chosen.field.rpartition('.')[0]}.tilt"
-        return float(np.median(pose_angle(topic, field, self.clocks[chosen.topic].use, None, self.log.name)[1]))
-
-    def _profile(self) -> None:
-        if "profile" not in self.known.get("meta", {}):
-            self.content["meta"]["profile"] = OPEN
-            text = "the servos' profile: {wheel_acceleration: rad/s2, leg_velocity: rad/s, leg_acceleration: rad/s2}, {} = none"
-            self.note("meta.profile", f"{text}. Without this line {NO_PROFILE.partition(': ')[2]}")
-
     # ---- what is decided --------------------------------------------------------------------------------------------
 
     def _unit(self, column: str) -> str:
@@ -689,13 +653,15 @@ class _Proposer:
         if one.unit is not None:
             return one.unit
         kind = self.log.topics[one.topic].kind
-        tests: dict[str, Callable[[], bool]] = {"acc": self._reads_gravity, "cam": self._is_quick, "volt": self._is_supply}
-        standard = {"acc": r"sensor_msgs/.*Imu", "cam": r"geometry_msgs/.*Pose.*", "volt": r"sensor_msgs/.*BatteryState"}
-        name = column.partition("_")[0]
-        return si if name in tests and re.fullmatch(standard[name], kind) and tests[name]() else OPEN
-
-    def _reads_gravity(self) -> bool:
-        return abs(float(np.linalg.norm(self._gravity())) / 9.81 - 1.0) < 0.15
+        if column.startswith("acc") and re.fullmatch(r"sensor_msgs/.*Imu", kind):
+            is_right = abs(float(np.linalg.norm(self._gravity())) / 9.81 - 1.0) < 0.15
+        elif column.startswith("cam") and re.fullmatch(r"geometry_msgs/.*Pose.*", kind):
+            is_right = self._is_quick()
+        elif column == "volt" and re.fullmatch(r"sensor_msgs/.*BatteryState", kind):
+            is_right = 5.0 < float(np.median(self.raw("volt")[1])) < 60.0
+        else:
+            is_right = False
+        return si if is_right else OPEN
 
     def _gravity(self) -> Array:
         return np.array([np.median(self.raw(f"acc_{axis}")[1]) for axis in XYZ])
@@ -709,9 +675,6 @@ class _Proposer:
             steps.append(np.diff(np.interp(np.arange(t[0], t[-1], _WINDOW), t, values)) if len(t) else values)
         speed = np.sqrt(sum(step**2 for step in steps)) / _WINDOW
         return bool(len(speed)) and 0.05 < float(np.quantile(speed, 0.95)) / fastest < 1.5
-
-    def _is_supply(self) -> bool:
-        return 5.0 < float(np.median(self.raw("volt")[1])) < 60.0
 
     # ---- what is shown ----------------------------------------------------------------------------------------------
 
