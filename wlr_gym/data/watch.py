@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -47,7 +47,7 @@ VIEW = View(size=(480, 360), friction=False, slip=False)
 
 def film_length(run: Run) -> int:
     """Return the number of pictures in a run's film."""
-    return len(_times(run))
+    return len(_film_times(run))
 
 
 def replay_film(result: ReplayResult, parameters: Parameters, backend: str, view: View = VIEW) -> Iterator[Picture]:
@@ -62,7 +62,7 @@ def replay_film(result: ReplayResult, parameters: Parameters, backend: str, view
     from wlr_gym.render import side_by_side
 
     simulated = replace(result.run, table=result.run.table.assign(**result.full))
-    times = _times(result.run)
+    times = _film_times(result.run)
     many = Parameters(np.repeat(parameters.values, len(times), axis=0))
     truths = [truth_of(measured_state(run, times, standing_state(result.robot, many), many)) for run in (result.run, simulated)]
     titles = ("recorded: camera and encoders", f"simulated ({backend}): same commands, open loop")
@@ -93,7 +93,7 @@ def truth_of(state: PlantState) -> Truth:
     return truth
 
 
-def _times(run: Run) -> Array:
+def _film_times(run: Run) -> Array:
     t = run["t"]
     return np.arange(t[0], t[-1], 1.0 / FPS)
 
@@ -112,7 +112,6 @@ _TRUE = {
 }
 
 
-@dataclass(eq=False)
 class Track:
     """What a simulator knows of a run, row by row, as far as it has come.
 
@@ -124,11 +123,10 @@ class Track:
         trouble: why it does not go on; empty = all is well.
     """
 
-    truths: Array
-    channels: Array
-    parameters: list[tuple[int, Parameters]] = field(default_factory=list)
-    done: int = 0
-    trouble: str = ""
+    def __init__(self, rows: int, channels: int) -> None:
+        self.truths, self.channels = (np.full((rows, width), np.nan) for width in (TRUTH_LAYOUT.width, channels))
+        self.parameters: list[tuple[int, Parameters]] = []
+        self.done, self.trouble = 0, ""
 
     def moment(self, row: int) -> Moment | None:
         """Return the robot at a row; None = it has not come so far."""
@@ -166,8 +164,7 @@ class RunRecording:
         self._t = run["t"] - run["t"][0]
         self._rolled = rolled_poses(run, self.robot)
         rows = len(self._t)
-        self.ghost = Track(np.full((rows, TRUTH_LAYOUT.width), np.nan), np.full((rows, len(CHANNELS)), np.nan))
-        self.true = Track(np.full((rows, TRUTH_LAYOUT.width), np.nan), np.zeros((rows, 0)))
+        self.ghost, self.true = Track(rows, len(CHANNELS)), Track(rows, 0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="ghost", daemon=True)
         self._thread.start()
@@ -285,10 +282,14 @@ class RunRecording:
     def _replayed_channel(self, name: str) -> tuple[Array, Array]:
         """Return times and values; what the camera shows is older than the ghost's pose by its delay."""
         done = self.ghost.done
-        t, values = self._t[:done], self.ghost.channels[:done, CHANNELS.index(name)]
+        t, values, measured = self._t[:done], self.ghost.channels[:done, CHANNELS.index(name)], self.run[name][:done]
         if name.startswith("cam_"):
             t = t + float(self._model["camera.delay"][0])
-        return t, _turned_to(values, self.run[name][:done]) if name == "cam_yaw" else values
+        if name == "cam_yaw":  # continuous, and by whole turns next to the measured one
+            values, known = np.unwrap(values), np.isfinite(measured)
+            turns = np.median(measured[known] - values[known]) / (2.0 * np.pi) if known.any() else 0.0
+            values = values + 2.0 * np.pi * np.round(turns)
+        return t, values
 
     def _true_curves(self, name: str) -> list[Curve]:
         curves = []
@@ -299,22 +300,10 @@ class RunRecording:
         return curves
 
 
-def _turned_to(yaw: Array, measured: Array) -> Array:
-    """Return a heading, continuous, by the whole turns that bring it next to the measured one."""
-    known, turned = np.isfinite(measured), np.unwrap(yaw)
-    if not known.any():
-        return turned
-    return turned + 2.0 * np.pi * np.round(np.median(measured[known] - turned[known]) / (2.0 * np.pi))
-
-
 def open_recordings(
     runs: Sequence[Run], robot: str | Path | None, backend: str | None, patch: Patch, segment: float
 ) -> Callable[[int], RunRecording]:
-    """Return what opens each of some runs.
-
-    Raises:
-        InputError: what :class:`RunRecording` refuses of any of them.
-    """
+    """Return what opens each of some runs; what :class:`RunRecording` refuses of any of them is refused here."""
     for run in runs:
         prepare(run, robot, effects=patch)
     return lambda place: RunRecording(runs[place], robot, backend, patch, segment)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
-from wlr_gym.base.errors import InputError, nearest, unknown_name
+from wlr_gym.base.errors import InputError, check_name, nearest
 from wlr_gym.base.settings import nested
 from wlr_gym.robot.description import Motor, Robot
 from wlr_gym.robot.parameter_table import UNITS
@@ -51,9 +52,14 @@ class Question:
         Raises:
             InputError: no number, another dimension, or not positive; names key, text and what is expected.
         """
-        words = text.replace(",", " ").split()
-        split = next((index for index, word in enumerate(words) if not _is_number(word)), len(words))
-        values, unit = [float(word) for word in words[:split]], " ".join(words[split:])
+        words, values = text.replace(",", " ").split(), []
+        while words:
+            try:
+                values.append(float(words[0]))
+            except ValueError:
+                break
+            words.pop(0)
+        unit = " ".join(words)
         if unit and unit not in _UNITS:
             raise InputError(f"{self.key} = '{text}': unknown unit '{unit}'{nearest(unit, _UNITS)}; expected {self.expected}")
         size, dimension = _UNITS[unit] if unit else (1.0, self.unit)
@@ -76,19 +82,9 @@ class Question:
         return f"{' '.join(f'{one:.4g}' for one in values)} {self.unit}"
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
 def _of_base(key: str) -> Callable[[Answers, Robot], Any]:
     def default(_: Answers, base: Robot) -> Any:
-        value: Any = base
-        for name in key.split("."):
-            value = getattr(value, name)
+        value = attrgetter(key)(base)
         return list(value) if isinstance(value, tuple) else value
 
     return default
@@ -138,8 +134,7 @@ def question_of(key: str) -> Question:
     Raises:
         InputError: none is; names the nearest.
     """
-    if key not in _BY_KEY:
-        raise unknown_name("number of a new robot", key, _BY_KEY, "--set")
+    check_name("number of a new robot", key, _BY_KEY, "--set")
     return _BY_KEY[key]
 
 
@@ -160,15 +155,12 @@ def derived_numbers(answers: Mapping[str, Any], base: Robot) -> tuple[dict[str, 
     comments = {key: f"[given] {question.unit}; {question.words}" for key, question in _BY_KEY.items()}
     comments |= {key: _DERIVED[key.replace("servo.leg", "servo.*").replace("servo.wheel", "servo.*")]
                  for key in flat if key not in answers}  # fmt: skip
-    return nested({key: flat[key] for key in sorted(flat, key=_place)}), comments
+    order = sorted(flat, key=lambda key: (_ORDER.index(key.partition(".")[0]), key.count(".")))
+    return nested({key: flat[key] for key in order}), comments
 
 
+#: Groups as in the shipped files; the answers come first in each.
 _ORDER = ("body", "hip_position", "leg", "wheel", "leg_limits", "servo", "ground")
-
-
-def _place(key: str) -> tuple[int, ...]:
-    """Groups as in the shipped files; the answers first in each."""
-    return (_ORDER.index(key.partition(".")[0]), key.count("."))
 
 
 #: Why a number that nobody gave is what it is.

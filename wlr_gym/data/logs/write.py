@@ -38,7 +38,7 @@ from wlr_gym.data.logs.messages import (
     typestore,
 )
 from wlr_gym.data.logs.open import quiet, read_logs
-from wlr_gym.data.logs.topics import LOG, Log, Share
+from wlr_gym.data.logs.topics import LOG, Share
 from wlr_gym.data.runs import Run, Simulation, is_shipped, own_robot
 from wlr_gym.robot import Robot, load_robot
 
@@ -97,10 +97,18 @@ def export_run(run: Run, path: Path, form: str = "mcap") -> Path:
     """
     if form not in FORMATS:
         raise InputError(f"format '{form}': expected {' or '.join(FORMATS)}")
-    if form == "mcap":
-        replace_file(path, lambda temporary: _write_mcap(temporary, run))
-    else:
+    if form == "rosbag2":
         _write_rosbag(path, run)
+        return path
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            sink = McapSink(file)
+            for message in messages_of(run):
+                sink.add(message)
+            sink.finish()
+
+    replace_file(path, write)
     return path
 
 
@@ -124,14 +132,6 @@ def messages_of(run: Run) -> Iterator[Sent]:
     for at, row in zip(times, values, strict=True):
         yield from row_messages(dict(zip(names, row, strict=True)), at)
         yield from shown.get(at, ())
-
-
-def _write_mcap(path: Path, run: Run) -> None:
-    with path.open("wb") as file:
-        sink = McapSink(file)
-        for message in messages_of(run):
-            sink.add(message)
-        sink.finish()
 
 
 def _write_rosbag(path: Path, run: Run) -> None:
@@ -205,7 +205,7 @@ class McapStream:
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
         self._sink = McapSink(self._file)
-        self._thread = threading.Thread(target=self._write_all, name="mcap", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="mcap", daemon=True)
 
     def __enter__(self) -> McapStream:
         self._thread.start()
@@ -227,45 +227,28 @@ class McapStream:
         except queue.Full:
             self.left_out += 1
 
-    def _write_all(self) -> None:
+    def _work(self) -> None:
         try:
-            self._write_rows()
+            while True:
+                over = self._over.is_set()  # asked first: what came before is in the queue
+                try:
+                    self._write(*self._rows.get(timeout=0.05))
+                except queue.Empty:
+                    if over:
+                        break
+            self._sink.finish()
         except Exception as error:  # whatever it is, it stops no robot
             self.trouble = f"{self.path}: {error or type(error).__name__}"
-
-    def _write_rows(self) -> None:
-        try:
-            while (row := self._next()) is not None:
-                self._write(*row)
-            self._sink.finish()
         finally:
             self._file.close()
             if self._offset is None:  # no row came: there is no run
                 self.path.unlink(missing_ok=True)
 
-    def _next(self) -> tuple[float, list[float]] | None:
-        """Wait for a row and return it; None = the run is over, and all its rows are written."""
-        while True:
-            over = self._over.is_set()  # asked first: what came before is in the queue
-            try:
-                return self._rows.get(timeout=0.05)
-            except queue.Empty:
-                if over:
-                    return None
-
     def _write(self, t: float, values: Sequence[float]) -> None:
         if self._offset is None:
-            self._offset = clock_offset(t)
-            self._sink.add(
-                run_message(
-                    ["t", *self.columns],
-                    nanoseconds(t, self._offset),
-                    self._offset,
-                    self.meta,
-                    name=self.path.stem,
-                    robot=self._robot,
-                )
-            )
+            self._offset = offset = clock_offset(t)
+            columns, begin = ["t", *self.columns], nanoseconds(t, offset)
+            self._sink.add(run_message(columns, begin, offset, self.meta, name=self.path.stem, robot=self._robot))
         for message in row_messages(dict(zip(self.columns, values, strict=True)), nanoseconds(t, self._offset)):
             self._sink.add(message)
         if time.monotonic() - self._flushed > FLUSH:
@@ -311,23 +294,16 @@ def read_exported(path: str | Path, tell: Share = quiet) -> ExportedRun:
         raise InputError(f"{log.name}: no message on '{JOINT_STATES}': the run has no row")
     times = log.topics[JOINT_STATES].clock(LOG)
     table = {"t": np.array([seconds(int(time), content["clock_offset"]) for time in times])}
-    for column in content["columns"]:
-        if column != "t":
-            table[column] = _column(log, column, times)
+    for column in (name for name in content["columns"] if name != "t"):
+        topic, field = PLACES[column]
+        table[column] = np.full(len(times), np.nan)
+        if topic in log.topics and field in log.topics[topic].fields:
+            at, found = log.topics[topic].series(field, LOG, log.name)
+            rows = np.minimum(np.searchsorted(times, at), len(times) - 1)
+            mine = times[rows] == at  # of a file that was cut off, a row may lack some of its messages
+            table[column][rows[mine]] = found[mine]
     meta = parse_config(RunMeta, content["meta"], f"{log.name}, topic '{RUN}', meta")
     record = content["simulation"]
     simulation = parse_config(Simulation, record, f"{log.name}, topic '{RUN}', simulation") if record else None
     robot = load_robot(content["robot"]) if content.get("robot") else None
     return ExportedRun(table, meta, simulation, robot, log.notes)
-
-
-def _column(log: Log, column: str, times: NDArray[np.int64]) -> Array:
-    """Values at the rows' times; NaN where a row's message is not there."""
-    topic, field = PLACES[column]
-    values = np.full(len(times), np.nan)
-    if topic in log.topics and field in log.topics[topic].fields:
-        at, found = log.topics[topic].series(field, LOG, log.name)
-        rows = np.minimum(np.searchsorted(times, at), len(times) - 1)
-        mine = times[rows] == at  # of a file that was cut off, a row may lack some of its messages
-        values[rows[mine]] = found[mine]
-    return values
