@@ -26,6 +26,7 @@ from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from wlr_gym.data.logs import ImportedRun, Proposal
+    from wlr_gym.data.logs.rows import ChannelFact
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,7 @@ class ImportOptions(JsonOption):
     out: Path | None = None
     """Folder for the runs; made if it is not there."""
     split: Seconds | None = None
-    """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those of more than 600 s,
-    or of 2 million numbers."""
+    """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those over 600 s."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the one that the map's meta names, else the nominal one."""
     format: Literal["parquet", "csv"] = "parquet"
@@ -56,7 +56,13 @@ def run(options: ImportOptions) -> int:
     from wlr_gym.data.logs import import_log, read_map
     from wlr_gym.data.logs.importing import MAP_FILE, require_own
 
-    _check(options)
+    if not options.log:
+        raise InputError("expected logs to import")
+    for log in options.log:
+        if not log.exists():
+            raise InputError(f"{log}: no such file or folder")
+    if options.out is None and not options.suggest:
+        raise InputError("--out: expected a folder for the runs")
     console = Console(soft_wrap=True, highlight=False)
     given: Path | dict[str, Any] | None = options.map
     if options.suggest:
@@ -83,16 +89,6 @@ def run(options: ImportOptions) -> int:
     if options.json:
         print_json({"runs": runs})
     return OK
-
-
-def _check(options: ImportOptions) -> None:
-    if not options.log:
-        raise InputError("expected logs to import")
-    for log in options.log:
-        if not log.exists():
-            raise InputError(f"{log}: no such file or folder")
-    if options.out is None and not options.suggest:
-        raise InputError("--out: expected a folder for the runs")
 
 
 @contextmanager
@@ -141,24 +137,18 @@ def _report(imported: Sequence[ImportedRun], console: Console) -> None:
     for source, note in dict.fromkeys((one.source, note) for one in imported for note in one.notes):
         console.print(f"{source}: {note}", style="yellow", markup=False)
     if first.facts:
-        _print_facts(first, console)
+        groups: dict[tuple[str, ...], list[ChannelFact]] = {}
+        for fact in first.facts:
+            groups.setdefault((fact.column.partition("_")[0], fact.topic, fact.unit, fact.how), []).append(fact)
+        rows = []
+        for (kind, topic, unit, how), facts in groups.items():
+            columns = facts[0].column if len(facts) == 1 else f"{kind} ({len(facts)})"
+            moved, known = max(fact.moved for fact in facts), min(fact.known for fact in facts)
+            rows.append((columns, topic, unit, f"{facts[0].rate:.0f}", how, f"{1e3 * moved:.1f}", f"{100 * known:.0f} %"))
+        headings = ("channels", "topic", "unit", "samples/s", "rows", "moved, ms rms", "rows with a value")
+        print_table(console, headings, rows)
         _print_costs({fact.column for fact in first.facts}, console)
     for one in imported:
         console.print(f"written: {one.path}", markup=False)
         for finding in one.findings:
             console.print(f"  {finding.kind} in '{finding.column}': {finding.message}", style="yellow", markup=False)
-
-
-def _print_facts(one: ImportedRun, console: Console) -> None:
-    rows = []
-    groups: dict[tuple[Any, ...], list[Any]] = {}
-    for fact in one.facts:
-        key = (fact.column.partition("_")[0], fact.topic, fact.unit, fact.how)
-        groups.setdefault(key, []).append(fact)
-    for (kind, topic, unit, how), facts in groups.items():
-        columns = facts[0].column if len(facts) == 1 else f"{kind} ({len(facts)})"
-        moved = max(fact.moved for fact in facts)
-        known = min(fact.known for fact in facts)
-        rows.append((columns, topic, unit, f"{facts[0].rate:.0f}", how, f"{1e3 * moved:.1f}", f"{100 * known:.0f} %"))
-    headings = ("channels", "topic", "unit", "samples/s", "rows", "moved, ms rms", "rows with a value")
-    print_table(console, headings, rows)

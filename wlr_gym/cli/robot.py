@@ -5,7 +5,7 @@ Exit code 0: done, nothing stands against the robot; 1: it cannot stand, drive o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -124,9 +124,14 @@ def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> i
     try:
         robot = robot_over(options.base, name, numbers, options.out, check=False)
     except InputError as error:
-        why = "; ".join([*_unusual(answers), str(error)])
-        kept = "" if options.yes else f"; your answers: {_as_options(answers)}"
-        raise InputError(f"{why}{kept}") from None
+        lists = {key: value if isinstance(value, list) else [value] for key, value in answers.items()}
+        why = [str(finding) for key, values in lists.items() for finding in unusual(key, values)]
+        words = [
+            f"{key}={' '.join(map(str, values))!r}" if len(values) > 1 else f"{key}={values[0]}"
+            for key, values in lists.items()
+        ]
+        kept = "" if options.yes else f"; your answers: --set {' '.join(words)}"  # none is lost
+        raise InputError(f"{'; '.join([*why, str(error)])}{kept}") from None
     title = (
         f"Written by wlr robot new. SI units, radians; what is not here is as in '{options.base}'.",
         "[given] an answer or its default; [derived] computed from the answers and the base.",
@@ -152,20 +157,6 @@ def _asked(question: Question, default: Any, ask: Callable[[str], str]) -> Any:
             return question.read(answer)
         except InputError as error:
             print(error)
-
-
-def _unusual(answers: Mapping[str, Any]) -> list[str]:
-    """Return what is outside the usual, in words."""
-    lists = {key: value if isinstance(value, list) else [value] for key, value in answers.items()}
-    return [str(finding) for key, values in lists.items() for finding in unusual(key, values)]
-
-
-def _as_options(answers: Mapping[str, Any]) -> str:
-    """Return answers as words of ``--set``, so that none is lost."""
-    return "--set " + " ".join(
-        f"{key}={' '.join(map(str, value))!r}" if isinstance(value, list) else f"{key}={value}"
-        for key, value in answers.items()
-    )
 
 
 def print_findings(robot: Robot, findings: Sequence[RobotFinding]) -> None:
@@ -196,7 +187,11 @@ def show_robot(options: ShowOptions) -> int:
     if options.picture is not None:
         check_new_file(options.picture, options.force, "--picture", PICTURES, any_case=True)
     robot = load_robot(options.robot)
-    numbers = _numbers(robot)
+    can = capability_of(robot)
+    numbers: dict[str, dict[str, Any]] = {}
+    for name, (unit, doc) in ENTRIES.items():
+        value = getattr(can, name)
+        numbers[name] = {"value": 0.0 if abs(value) < ROUNDING else value, "unit": unit, "meaning": doc}
     if options.json:
         print_json({"robot": robot.name, "fingerprint": robot_hash(robot), "numbers": numbers})
     else:
@@ -209,15 +204,6 @@ def show_robot(options: ShowOptions) -> int:
         draw_portrait(options.picture, robot)
         print(f"written: {options.picture}")
     return OK
-
-
-def _numbers(robot: Robot) -> dict[str, dict[str, Any]]:
-    can = capability_of(robot)
-    values = {name: getattr(can, name) for name in ENTRIES}
-    return {
-        name: {"value": 0.0 if abs(values[name]) < ROUNDING else values[name], "unit": unit, "meaning": doc}
-        for name, (unit, doc) in ENTRIES.items()
-    }
 
 
 def import_robot(options: RobotImportOptions) -> int:
