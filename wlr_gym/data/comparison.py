@@ -9,6 +9,7 @@ the models.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -144,11 +145,7 @@ class ComparedPlant:
 
 
 def parse_plant(text: str, physics_step: float = 0.001) -> ComparedPlant:
-    """Read ``BACKEND`` or ``BACKEND:option=value,...`` with the options ``physics_step`` (s) and ``precision``.
-
-    Raises:
-        InputError: unknown backend or option, a step that does not divide the control period, an unknown precision.
-    """
+    """Read ``BACKEND`` or ``BACKEND:option=value,...`` with the options ``physics_step`` (s) and ``precision``."""
     backend, _, options = text.partition(":")
     check_simulator(backend, f"plant '{text}'")  # a real robot has no truth to compare, nor the guards of wlr record here
     plant = ComparedPlant(backend, physics_step)
@@ -211,41 +208,32 @@ def drive(
         threads: of the plant.
         tell: called with the share that is done.
     """
+    import pandas
+
     patch = patch or Patch()
     one = Parameters.nominal(robot) if parameters is None else parameters
     rows = [apply_patch(patch, profile_parameters(one, motion.profile)).values for motion in motions]
-    batch = Parameters(np.concatenate(rows))
-    setpoints, torque_on = _setpoints(motions)
+    batch, count = Parameters(np.concatenate(rows)), len(motions)
+    ticks = max(len(motion.setpoints) for motion in motions)
+    goals = np.stack([np.pad(one.setpoints, ((0, ticks - len(one.setpoints)), (0, 0)), mode="edge") for one in motions], axis=1)
+    torque_on = np.isfinite(goals)
+    held = pandas.DataFrame(goals.reshape(ticks, -1)).ffill()  # a motor that is off keeps its last setpoint
+    held = held.fillna(pandas.Series(np.tile(np.repeat([np.pi / 2, 0.0], 4), count)))
+    setpoints = held.to_numpy().reshape(ticks, count, 8)
     options = PlantOptions(motions[0].period, plant.physics_step, plant.precision, threads, sensor_noise=False)
-    simulator = make_plant(plant.backend, robot, len(motions), options, patch.forces)
     sensors, truth = [], []
-    try:
-        readings = simulator.reset(
-            np.arange(len(motions), dtype=np.uint64), batch, state=standing_at(setpoints[0], robot, batch)
-        )
+    with closing(make_plant(plant.backend, robot, count, options, patch.forces)) as simulator:
+        readings = simulator.reset(np.arange(count, dtype=np.uint64), batch, state=standing_at(setpoints[0], robot, batch))
         for _ in range(round(SETTLE / motions[0].period)):
             readings = simulator.step(setpoints[0], torque_on[0])
-        for tick in range(len(setpoints) + 1):
+        for tick in range(ticks + 1):
             sensors.append(readings.values.copy())
             truth.append(simulator.truth().values.copy())
             if tick % 50 == 0:
-                tell(tick / len(setpoints))
-            if tick < len(setpoints):
+                tell(tick / ticks)
+            if tick < ticks:
                 readings = simulator.step(setpoints[tick], torque_on[tick])
-    finally:
-        simulator.close()
     return Traces(plant, robot, np.array(sensors), np.array(truth))
-
-
-def _setpoints(motions: Sequence[Motion]) -> tuple[Array, NDArray[np.bool_]]:
-    """Setpoints (ticks, motions, 8) and torque switches; a motor that is off keeps its last setpoint."""
-    ticks = max(len(motion.setpoints) for motion in motions)
-    setpoints = np.stack([np.pad(m.setpoints, ((0, ticks - len(m.setpoints)), (0, 0)), mode="edge") for m in motions], axis=1)
-    torque_on = np.isfinite(setpoints)
-    for tick in range(1, ticks):
-        setpoints[tick] = np.where(torque_on[tick], setpoints[tick], setpoints[tick - 1])
-    setpoints[..., LEG_SLICE] = np.where(np.isnan(setpoints[..., LEG_SLICE]), np.pi / 2, setpoints[..., LEG_SLICE])
-    return np.nan_to_num(setpoints), torque_on
 
 
 # ---- their differences -----------------------------------------------------------------------------------------------
@@ -347,6 +335,11 @@ class Comparison:
     own: tuple[tuple[MotionComparison, ...], tuple[MotionComparison, ...]] | None = None
 
     @property
+    def labels(self) -> tuple[str, str]:
+        """Of both plants."""
+        return self.first.plant.label, self.second.plant.label
+
+    @property
     def broken(self) -> bool:
         """Whether any motion breaks a bound; at half the steps where that was run."""
         return any(case.agreement.broken for case in self.half or self.cases)
@@ -402,10 +395,10 @@ def compare(
     driven = [*plants, *(plant.halved for plant in plants if halve)]
 
     def traces(k: int) -> Traces:
-        doing = f"driving {driven[k].label}"
-        return drive(
-            driven[k], motions, robot, parameters, patch, threads, lambda share: tell(doing, (k + share) / len(driven))
-        )
+        def told(share: float) -> None:
+            tell(f"driving {driven[k].label}", (k + share) / len(driven))
+
+        return drive(driven[k], motions, robot, parameters, patch, threads, told)
 
     def between(a: Traces, b: Traces) -> tuple[MotionComparison, ...]:
         return tuple(_case(motion, k, a, b, signals, robot, threshold) for k, motion in enumerate(motions))
@@ -427,35 +420,27 @@ def difference(first: Traces, second: Traces, name: str, signal: ComparedSignal,
 def _case(
     motion: Motion, k: int, a: Traces, b: Traces, signals: Mapping[str, ComparedSignal], robot: Robot, threshold: float
 ) -> MotionComparison:
+    errors = {name: difference(a, b, name, signal, motion, k) for name, signal in signals.items()}
     differences = {}
     for name, signal in signals.items():
-        error = np.abs(difference(a, b, name, signal, motion, k))
-        beyond = (error > threshold * signal.resolution).any(axis=1)
+        size = np.abs(errors[name])
+        beyond = (size > threshold * signal.resolution).any(axis=1)
         parted = float(np.argmax(beyond) * motion.period) if beyond.any() else None
-        differences[name] = Difference(_rms(error), float(error.max()), signal.unit, signal.resolution, parted)
-    parted = [
-        (found.parted, name) for name, found in differences.items() if found.parted is not None and not signals[name].shared
-    ]
-    first = min(parted)[::-1] if parted else None
-    return MotionComparison(motion.name, _agreement(motion, k, a, b, signals, robot), differences, first)
-
-
-def _agreement(motion: Motion, k: int, a: Traces, b: Traces, signals: Mapping[str, ComparedSignal], robot: Robot) -> Agreement:
+        differences[name] = Difference(_rms(size), float(size.max()), signal.unit, signal.resolution, parted)
+    parted = [(one.parted, name) for name, one in differences.items() if one.parted is not None and not signals[name].shared]
     rows = len(motion.setpoints) + 1
     horizon = min(round(HORIZON / motion.period), rows - 1)
     path = a.signals["true_xy"][: horizon + 1, k]
     travel = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     apart = float(np.linalg.norm(b.signals["true_xy"][horizon, k] - path[-1]))
-    yaw = float(np.abs(difference(a, b, "true_yaw", signals["true_yaw"], motion, k)[horizon, 0]))
-    torque = {}
+    yaw = float(np.abs(errors["true_yaw"][horizon, 0]))
+    torques = []
     for kind in ("leg", "wheel"):
-        own, other = (traces.signals[f"motor_torque_{kind}"][:rows, k] for traces in (a, b))
-        torque[f"{kind}_torque"] = _ratio(_rms(other - own), max(_rms(own), getattr(robot.servo, kind).coulomb_friction))
-    return Agreement(travel, apart, apart / max(travel, signals["true_xy"].resolution), yaw, **torque)
-
-
-def _ratio(a: float, b: float) -> float:
-    return a / b if b > 0.0 else 0.0 if a == 0.0 else float("inf")
+        error, own = _rms(errors[f"motor_torque_{kind}"]), _rms(a.signals[f"motor_torque_{kind}"][:rows, k])
+        beside = max(own, getattr(robot.servo, kind).coulomb_friction)
+        torques.append(error / beside if beside > 0.0 else 0.0 if error == 0.0 else float("inf"))
+    agreement = Agreement(travel, apart, apart / max(travel, signals["true_xy"].resolution), yaw, *torques)
+    return MotionComparison(motion.name, agreement, differences, min(parted)[::-1] if parted else None)
 
 
 def _rms(error: Array) -> float:
@@ -477,17 +462,7 @@ def severe_patch(name: str) -> Patch:
     return load_patch({"name": name, "where": chosen or list(effect.where), "parameters": values})
 
 
-# --- what a comparison of plants looks like: tables for screen and Markdown, a figure per motion, a map of all differen
-
-
-#: Panels of a motion's figure: signals drawn together.
-_PANELS = (
-    ("true_xy",), ("true_yaw", "true_tilt"), ("pos_leg",), ("vel_wheel",), ("motor_torque_leg",), ("motor_torque_wheel",),
-    ("normal_force",), ("total_along", "total_across"), ("total_turn",), ("slip_along", "slip_across"), ("gyro",),
-    ("friction_across",),
-)  # fmt: skip
-# Colours of the first and the second plant.
-_FIRST, _SECOND = BLUE, ORANGE
+# ---- report: tables for screen and Markdown --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -506,35 +481,32 @@ class ReportTable:
 
 def tables(comparison: Comparison) -> list[ReportTable]:
     """Return the tables of one comparison: agreement, differences by signal, and what becomes of them at half the steps."""
-    plants = " against ".join(traces.plant.label for traces in (comparison.second, comparison.first))
-    note = f"{plants}; effects: {comparison.effects}"
-    found = [_agreement_table(f"Agreement, {note}", comparison.cases)]
+
+    def sizes(cases: Sequence[MotionComparison], name: str) -> list[float]:
+        return [case.differences[name].rms_in_noise for case in cases]
+
+    first, second = comparison.labels
+    found = [_agreement_table(f"Agreement, {second} against {first}; effects: {comparison.effects}", comparison.cases)]
     if comparison.half:
         found.append(_agreement_table("The same at half of both steps", comparison.half))
-    rows = [
-        (
-            _starred(comparison, name),
-            signal.unit,
-            f"{signal.resolution:.2g}",
-            *(_noise(case.differences[name].rms_in_noise) for case in comparison.cases),
-        )
-        for name, signal in comparison.signals.items()
-    ]
-    motions = tuple(case.motion for case in comparison.cases)
-    found.append(
-        ReportTable(
-            "Rms difference in units of sensor noise; *: how wheels that stick share a load is open",
-            ("signal", "unit", "noise", *motions),
-            tuple(rows),
-        )
-    )
+    title = "Rms difference in units of sensor noise; *: how wheels that stick share a load is open"
+    headings, rows = ("signal", "unit", "noise", *(case.motion for case in comparison.cases)), []
+    for name, signal in comparison.signals.items():
+        cells = map(_noise, sizes(comparison.cases, name))
+        rows.append((_starred(comparison, name), signal.unit, f"{signal.resolution:.2g}", *cells))
+    found.append(ReportTable(title, headings, tuple(rows)))
     if comparison.half and comparison.own:
-        found.append(_convergence_table(comparison, comparison.half, *comparison.own))
+        title = "Does it shrink with the step? All motions, rms in units of sensor noise"
+        headings, rows = ("signal", "apart", "at half the steps", *(f"own step of {one}" for one in comparison.labels)), []
+        for name in comparison.signals:
+            sets = (sizes(cases, name) for cases in (comparison.cases, comparison.half, *comparison.own))
+            rows.append((_starred(comparison, name), *(_noise(_rms(np.array(one))) for one in sets)))
+        found.append(ReportTable(title, headings, tuple(rows)))
     return found
 
 
 def _agreement_table(title: str, cases: Sequence[MotionComparison]) -> ReportTable:
-    """Return the figures that :data:`wlr_gym.data.comparison.BOUNDS` bounds, one row per case; ``!`` marks a broken bound."""
+    """Return the figures that :data:`BOUNDS` bounds, one row per case; ``!`` marks a broken bound."""
     headings = (
         "motion", "travel m", f"apart after {HORIZON:g} s mm", "% of travel", "yaw deg", "leg torque %", "wheel torque %",
         "diverges first in", "at s",
@@ -571,22 +543,6 @@ def _figures(values: dict[str, float]) -> tuple[str, ...]:
     return tuple(f"{scale[name] * values[name]:.2f}{'' if values[name] <= bound else ' !'}" for name, bound in BOUNDS.items())
 
 
-def _convergence_table(
-    comparison: Comparison,
-    half: Sequence[MotionComparison],
-    first: Sequence[MotionComparison],
-    second: Sequence[MotionComparison],
-) -> ReportTable:
-    def pooled(cases: Sequence[MotionComparison], name: str) -> str:
-        return _noise(float(np.sqrt(np.mean([case.differences[name].rms_in_noise ** 2 for case in cases]))))
-
-    sets = (comparison.cases, half, first, second)
-    labels = [traces.plant.label for traces in (comparison.first, comparison.second)]
-    headings = ("signal", "apart", "at half the steps", *(f"own step of {label}" for label in labels))
-    rows = tuple((_starred(comparison, name), *(pooled(cases, name) for cases in sets)) for name in comparison.signals)
-    return ReportTable("Does it shrink with the step? All motions, rms in units of sensor noise", headings, rows)
-
-
 def _starred(comparison: Comparison, name: str) -> str:
     """Name of a signal; with a star where rigid bodies do not determine it."""
     return f"{name} *" if comparison.signals[name].shared else name
@@ -609,11 +565,20 @@ def markdown(comparisons: Sequence[Comparison], heading: str) -> str:
 # ---- figures ---------------------------------------------------------------------------------------------------------
 
 
+#: Panels of a motion's figure: signals drawn together.
+_PANELS = (
+    ("true_xy",), ("true_yaw", "true_tilt"), ("pos_leg",), ("vel_wheel",), ("motor_torque_leg",), ("motor_torque_wheel",),
+    ("normal_force",), ("total_along", "total_across"), ("total_turn",), ("slip_along", "slip_across"), ("gyro",),
+    ("friction_across",),
+)  # fmt: skip
+
+
 def save_motion_plot(comparison: Comparison, index: int, path: Path) -> Path:
     """Write one motion's figure: both plants over each other, and below each panel their difference in noise units."""
     columns = 3
-    figure = new_figure(6.0 * columns, 3.3 * -(-len(_PANELS) // columns))
-    outer = figure.add_gridspec(-(-len(_PANELS) // columns), columns)
+    rows = -(-len(_PANELS) // columns)
+    figure = new_figure(6.0 * columns, 3.3 * rows)
+    outer = figure.add_gridspec(rows, columns)
     for number, names in enumerate(_PANELS):
         inner = outer[number // columns, number % columns].subgridspec(2, 1, height_ratios=(2, 1), hspace=0.05)
         above = figure.add_subplot(inner[0])
@@ -621,9 +586,8 @@ def save_motion_plot(comparison: Comparison, index: int, path: Path) -> Path:
         _draw_panel(comparison, index, names, above, below)
         if number >= len(_PANELS) - columns:
             below.set_xlabel("time (s)", fontsize=9)
-    labels = [traces.plant.label for traces in (comparison.first, comparison.second)]
-    handles = [figure.axes[0].plot([], [], color=colour)[0] for colour in (_FIRST, _SECOND)]
-    figure.legend(handles, labels, loc="outside upper right", ncols=2, frameon=False)
+    handles = [figure.axes[0].plot([], [], color=colour)[0] for colour in (BLUE, ORANGE)]
+    figure.legend(handles, comparison.labels, loc="outside upper right", ncols=2, frameon=False)
     figure.suptitle(f"{comparison.motions[index].name}, effects: {comparison.effects}", fontsize=13)
     return save(figure, path)
 
@@ -631,13 +595,10 @@ def save_motion_plot(comparison: Comparison, index: int, path: Path) -> Path:
 def _draw_panel(comparison: Comparison, index: int, names: Sequence[str], above: Axes, below: Axes) -> None:
     motion = comparison.motions[index]
     t = motion.period * np.arange(len(motion.setpoints) + 1)
-    for traces, colour, style in ((comparison.first, _FIRST, "-"), (comparison.second, _SECOND, "--")):
-        for name in names:
+    for name, signal in ((name, comparison.signals[name]) for name in names):
+        for traces, colour, style in ((comparison.first, BLUE, "-"), (comparison.second, ORANGE, "--")):
             values = traces.signals[name][: len(t), index]
-            values = np.unwrap(values, axis=0) if comparison.signals[name].turns else values
-            above.plot(t, values, color=colour, linestyle=style, linewidth=0.9)
-    for name in names:
-        signal = comparison.signals[name]
+            above.plot(t, np.unwrap(values, axis=0) if signal.turns else values, style, color=colour, linewidth=0.9)
         error = np.abs(difference(comparison.first, comparison.second, name, signal, motion, index))
         below.plot(t, np.maximum(error.max(axis=1) / signal.resolution, 1e-3), linewidth=0.9, color="#444444")
     below.axhline(comparison.threshold, color=GREEN, linewidth=0.8)
@@ -660,19 +621,15 @@ def save_map(comparison: Comparison, path: Path) -> Path:
     figure = new_figure(2.2 + 0.56 * len(comparison.cases), 1.5 + 0.21 * len(names))
     axes = figure.subplots()
     image = axes.imshow(np.maximum(values, 1e-2), norm=LogNorm(1e-2, 1e2), cmap="RdYlBu_r", aspect="auto")
-    axes.set_xticks(
-        range(len(comparison.cases)), [case.motion for case in comparison.cases], rotation=40, ha="right", fontsize=8
-    )
+    motions = [case.motion for case in comparison.cases]
+    axes.set_xticks(range(len(motions)), motions, rotation=40, ha="right", fontsize=8)
     axes.set_yticks(range(len(names)), [_starred(comparison, name) for name in names], fontsize=8)
     colours = image.to_rgba(np.maximum(values, 1e-2))
     for row, column in np.ndindex(*values.shape):
         colour = text_colour(colours[row, column].tolist())
         axes.text(column, row, _noise(float(values[row, column])), ha="center", va="center", fontsize=7, color=colour)
-    axes.set_title(
-        f"{comparison.second.plant.label} minus {comparison.first.plant.label}\n"
-        f"rms in units of sensor noise; effects: {comparison.effects}",
-        fontsize=10,
-    )
+    first, second = comparison.labels
+    axes.set_title(f"{second} minus {first}\nrms in units of sensor noise; effects: {comparison.effects}", fontsize=10)
     axes.set_xlabel("motion", fontsize=9)
     axes.set_ylabel("signal", fontsize=9)
     figure.colorbar(image, ax=axes, shrink=0.8, format="%g", label="rms difference (1 = sensor noise)")
