@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from wlr_gym.data.run_states import standing_at
 from wlr_gym.data.runs import Run, Simulation, departures, read_meta, start_of, write_csv, write_meta, write_run
 from wlr_gym.data.sensors import channels, sensed_columns
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
-from wlr_gym.physics.plants import SIMULATORS, make_plant
+from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -71,9 +72,7 @@ def read_commands(path: Path) -> Motion:
             raise InputError(f"{path}: column '{missing[0]}' is missing{hint}; found: {found}")
         columns = table[list(wanted)].to_numpy(np.float64)
     except (OSError, UnicodeDecodeError, TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be read: {error}") from None
+        raise error if isinstance(error, InputError) else InputError(f"{path}: cannot be read: {error}") from None
     t, setpoints = columns[:, 0], columns[:, 1:]
     if len(t) < 2 or not (np.isfinite(t).all() and (np.diff(t) > 0.0).all()):
         raise InputError(f"{path}: column 't': expected two rows or more, finite and increasing")
@@ -127,18 +126,15 @@ def record_simulation(
     Raises:
         InputError: unknown backend, a seed that is out of range, or a folder whose ``meta.yaml`` says something else.
     """
-    if backend not in SIMULATORS:
-        raise InputError(f"backend '{backend}' is no simulator; expected {', '.join(SIMULATORS)}")
+    check_simulator(backend)
     require_seed("seed =", seed, LARGEST_NOISE_SEED)
     patch = patch or load_patch(None)
     parameters = apply_patch(patch, profile_parameters(Parameters.nominal(robot), motion.profile))
     options, seeds = PlantOptions(control_period=motion.period), np.array([seed], np.uint64)
     torque_on = np.isfinite(motion.setpoints)
-    plant = make_plant(backend, robot, 1, options, patch.forces)
-    columns = sensed_columns(robot)
+    columns, stand = sensed_columns(robot), motion.start(robot)[None]
     rows = np.empty((len(motion.setpoints), len(columns)))
-    try:
-        stand = motion.start(robot)[None]
+    with closing(make_plant(backend, robot, 1, options, patch.forces)) as plant:
         plant.reset(seeds, parameters, state=standing_at(stand, robot, parameters))
         for _ in range(round(SETTLE / motion.period)):
             plant.step(stand, torque_on[:1])
@@ -148,14 +144,9 @@ def record_simulation(
             rows[tick] = channels(sensors, 0, columns)
             on = torque_on[tick : tick + 1]
             sensors = plant.step(np.nan_to_num(setpoints)[None], None if on.all() else on)
-    finally:
-        plant.close()
     record = Simulation(
         backend=backend,
-        control_period=options.control_period,
-        physics_step=options.physics_step,
-        precision=options.precision,
-        sensor_noise=options.sensor_noise,
+        **{name: getattr(options, name) for name in ("control_period", "physics_step", "precision", "sensor_noise")},
         seed=seed,
         parameters=departures(parameters.values[0], Parameters.nominal(robot).values[0]),
         formulas=[effect.content() for effect in patch.effects if effect.name not in EFFECTS],

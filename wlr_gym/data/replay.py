@@ -12,6 +12,7 @@ times. Command delays shift the measured times of the setpoints, so a segment st
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,7 @@ from wlr_gym.physics.effects import Patch, Source, apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
+from wlr_gym.robot import LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -219,7 +220,7 @@ def _simulate(
     wheels = state.joint_position[:, WHEEL_SLICE]
     offset = np.asarray(run.meta.marker_offset)
     values = np.empty((ticks + 1, plant.count, len(CHANNELS)))
-    try:
+    with closing(plant):
         sensors = plant.reset(parameters=parameters, state=replace(state, time=begin - run["t"][0]))
         first_reading = sensors.joint_position[:, WHEEL_SLICE].copy()
         for tick in range(ticks + 1):
@@ -227,8 +228,6 @@ def _simulate(
             values[tick] = readings(sensors, plant.truth(), wheels - first_reading, offset)
             if tick < ticks:
                 sensors = plant.step(setpoints[tick], torque_on[tick])
-    finally:
-        plant.close()
     camera_frame(values, parameters)
     return _Traces(begin, clock, values, float(parameters["camera.delay"][0])), _stacked(states)
 
@@ -259,11 +258,10 @@ def held_setpoints(run: Run) -> Array:
     import pandas
 
     commands = pandas.DataFrame({name: run[name] for name in COMMANDS}).ffill().bfill().to_numpy()
-    measured = np.stack([run[f"pos_{joint}"] for joint in JOINTS], axis=1)
     stay = np.zeros(8)
-    for joint in np.flatnonzero(np.isnan(commands[:, LEG_SLICE]).all(axis=0)):
-        angles = measured[np.isfinite(measured[:, joint]), joint]
-        stay[joint] = angles[0] if angles.size else 0.0
+    for joint, leg in enumerate(LEGS):
+        angles = run[f"pos_{leg}"]
+        stay[joint] = next(iter(angles[np.isfinite(angles)]), 0.0)
     return np.where(np.isnan(commands), stay, commands)
 
 
@@ -354,9 +352,9 @@ def replayed_rows(
     setpoints, torque_on = tick_setpoints(run, parameters, t[:1], int(ticks[-1]), CLOCK)
     undelayed = parameters.copy()
     undelayed["command.delay"] = 0.0  # the setpoints come delayed
-    plant = make_plant(backend, robot, 1, PlantOptions(control_period=CLOCK, sensor_noise=False), patch.forces if patch else ())
     state, begin = start_state(run, robot, parameters), 0
-    try:
+    options = PlantOptions(control_period=CLOCK, sensor_noise=False)
+    with closing(make_plant(backend, robot, 1, options, patch.forces if patch else ())) as plant:
         sensors = plant.reset(parameters=undelayed, state=replace(state, time=np.zeros(1)))
         shift = state.joint_position[:, WHEEL_SLICE] - sensors.joint_position[:, WHEEL_SLICE]
         for row in range(len(t)):
@@ -373,8 +371,6 @@ def replayed_rows(
             channels = readings(sensors, truth, shift, offset)[None]
             camera_frame(channels, parameters)
             yield parameters, truth, channels[0, 0]
-    finally:
-        plant.close()
 
 
 # ---- a run repeated on a robot: the same comparison ------------------------------------------------------------------
@@ -457,8 +453,7 @@ def simulated_rows(run: Run, robot: Robot) -> Iterator[tuple[Parameters, Truth, 
         start = PlantState(**{name: np.array([value]) for name, value in record.start.items()})
     except TypeError as error:
         raise InputError(f"{simulation_path(run.path)}: start: {error}") from None
-    plant = make_plant(record.backend, robot, 1, options, load_patch(record.formulas).forces)
-    try:
+    with closing(make_plant(record.backend, robot, 1, options, load_patch(record.formulas).forces)) as plant:
         sensors = plant.reset(np.array([record.seed], np.uint64), parameters, state=start)
         for row, wanted in enumerate(setpoints):
             yield parameters, plant.truth(), channels(sensors, 0, columns)
@@ -467,8 +462,6 @@ def simulated_rows(run: Run, robot: Robot) -> Iterator[tuple[Parameters, Truth, 
                 plant.set_parameters(parameters)
             torque_on = np.isfinite(wanted)
             sensors = plant.step(np.nan_to_num(wanted)[None], None if torque_on.all() else torque_on[None])
-    finally:
-        plant.close()
 
 
 def _record_of(run: Run) -> Simulation:
