@@ -20,7 +20,7 @@ from wlr_gym.data.run_states import standing_at
 from wlr_gym.data.runs import Run, Simulation, departures, read_meta, start_of, write_csv, write_meta, write_run
 from wlr_gym.data.sensors import channels, sensed_columns
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
-from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants import check_simulator, make_plant
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameters import Parameters

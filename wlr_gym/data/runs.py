@@ -20,7 +20,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_folder, unknown_name
 from wlr_gym.base.files import make_output_folder, replace_file, write_text
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
@@ -119,8 +119,7 @@ def some_runs(folder: Path) -> list[Path]:
     Raises:
         InputError: there are none.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+    check_folder(folder, of="runs")
     paths = run_files(folder)
     if not paths:
         inside = sorted(child.name for child in folder.iterdir() if child.is_dir() and run_files(child))
@@ -130,11 +129,7 @@ def some_runs(folder: Path) -> list[Path]:
 
 
 def read_runs(path: str | Path) -> tuple[Run, ...]:
-    """Read a run, or every run of a folder.
-
-    Raises:
-        InputError: no such file or folder; see :func:`read_run` and :func:`read_dataset`.
-    """
+    """Read a run, or every run of a folder."""
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
@@ -264,16 +259,14 @@ def check_meta(folder: str | Path, meta: RunMeta) -> None:
     """
     path = Path(folder) / META_FILE
     there = read_meta(folder) if path.is_file() else meta
-    differ = [key for key in RunMeta.model_fields if getattr(there, key) != getattr(meta, key)]
-    if differ:
-        told = "; ".join(f"{key} is {_said(there, key)} there, {_said(meta, key)} for the new run" for key in differ)
-        raise InputError(f"{path}: says something else than the meta data of the new run: {told}; write it to another folder")
-
-
-def _said(meta: RunMeta, key: str) -> str:
-    """A value of meta data as its file says it."""
-    value = meta.model_dump(mode="json")[key]
-    return "not stated" if value is None else repr(value)
+    told = []
+    for key in (key for key in RunMeta.model_fields if getattr(there, key) != getattr(meta, key)):
+        values = (one.model_dump(mode="json")[key] for one in (there, meta))
+        old, new = ("not stated" if value is None else repr(value) for value in values)
+        told.append(f"{key} is {old} there, {new} for the new run")
+    if told:
+        what = "says something else than the meta data of the new run"
+        raise InputError(f"{path}: {what}: {'; '.join(told)}; write it to another folder")
 
 
 def write_csv(path: Path, columns: Mapping[str, NDArray[np.float64]]) -> None:
@@ -308,22 +301,15 @@ def convert(source: str | Path, target: str | Path, suffix: str | None = None) -
     """
     source, target = Path(source), Path(target)
     if source.is_file():
-        run = read_run(source)
-        meta = _moved(run.meta, source.parent, target.parent) if (source.parent / META_FILE).is_file() else None
-        return [write_run(target, run.table, meta, run.simulation)]
-    if suffix not in SUFFIXES:
+        here, there, paths = source.parent, target.parent, [target]
+    elif suffix in SUFFIXES:
+        here, there, paths = source, target, [target / f"{path.stem}{suffix}" for path in some_runs(source)]
+    else:
         raise InputError(f"convert {source}: the format of a data set is {' or '.join(SUFFIXES)}, not {suffix!r}")
-    data = read_dataset(source)
-    written = [write_run(target / f"{run.name}{suffix}", run.table, simulation=run.simulation) for run in data.runs]
-    if (source / META_FILE).is_file():
-        write_meta(target, _moved(data.meta, source, target))
-    return written
-
-
-def _moved(meta: RunMeta, source: Path, target: Path) -> RunMeta:
-    """Return meta data for another folder; a robot file that stands beside the runs goes with them."""
-    robot = own_robot(meta, source) if target.resolve() != source.resolve() else None
-    return meta if robot is None else note_robot(target, robot, meta)
+    runs = read_runs(source)
+    meta = runs[0].meta if (here / META_FILE).is_file() else None
+    robot = own_robot(meta, here) if meta is not None and there.resolve() != here.resolve() else None
+    return [write_run(path, run.table, meta, run.simulation, robot) for path, run in zip(paths, runs, strict=True)]
 
 
 # ---- the robot of runs -----------------------------------------------------------------------------------------------
@@ -383,11 +369,7 @@ def names_file(robot: str | None) -> bool:
 
 
 def own_robot(meta: RunMeta, folder: Path) -> Robot | None:
-    """Return the robot that has to go with meta data to another folder; None = they name one that ships, or none.
-
-    Raises:
-        InputError: see :func:`robot_of_meta`.
-    """
+    """Return the robot that has to go with meta data to another folder; None = they name one that ships, or none."""
     return robot_of_meta(meta, folder) if names_file(meta.robot) else None
 
 
@@ -418,11 +400,7 @@ def robot_of_meta(meta: RunMeta, folder: Path, file: str = META_FILE) -> Robot:
 
 
 def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
-    """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one.
-
-    Raises:
-        InputError: see :func:`robot_of_meta`.
-    """
+    """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one."""
     return robot_of_meta(run.meta, run.path.parent) if robot is None else load_robot(robot)
 
 
