@@ -119,17 +119,10 @@ def test_unknown_column_names_the_nearest(tmp_path, table, suffix):
     refused(write_raw(tmp_path / f"run_01{suffix}", table), "unknown column 'gyro_zz'", "did you mean 'gyro_z'")
 
 
-def test_repeated_column(tmp_path, table):
-    path = write_raw(tmp_path / "run_01.csv", table)
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([lines[0] + ",volt", *[line + ",12.0" for line in lines[1:]]]))
-    refused(path, "'volt' occurs twice")
-
-
-@pytest.mark.parametrize(("value", "word"), [(0.0, "does not come after"), (-1.0, "does not come after")])
-def test_clock_that_does_not_increase(tmp_path, table, value, word):
-    table["t"][17] = table["t"][16] + value
-    refused(write_raw(tmp_path / "run_01.csv", table), "row 17", "'t'", word)
+@pytest.mark.parametrize("step", [0.0, -1.0])
+def test_clock_that_does_not_increase(tmp_path, table, step):
+    table["t"][17] = table["t"][16] + step
+    refused(write_raw(tmp_path / "run_01.csv", table), "row 17", "'t'", "does not come after")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
@@ -145,12 +138,18 @@ def test_missing_value_in_a_required_column(tmp_path, table, column):
     refused(write_raw(tmp_path / "run_01.csv", table), "row 9", f"'{column}'", "no value")
 
 
-def test_short_row(tmp_path, table):
+def test_broken_lines_of_a_csv_file(tmp_path, table):
     path = write_raw(tmp_path / "run_01.csv", table)
     lines = path.read_text().splitlines()
-    lines[4] = lines[4].rpartition(",")[0]
-    path.write_text("\n".join(lines))
+    path.write_text("\n".join([lines[0] + ",volt", *[line + ",12.0" for line in lines[1:]]]))
+    refused(path, "'volt' occurs twice")
+    path.write_text("\n".join([*lines[:4], lines[4].rpartition(",")[0], *lines[5:]]))
     refused(path, "row 3", "44 values", "45 columns")
+    cells = lines[6].split(",")
+    path.write_text("\n".join([*lines[:6], ",".join([*cells[:3], "n/a", *cells[4:]]), *lines[7:]]))
+    refused(path, "row 5 (line 7)", "'cmd_leg_lr'", "'n/a' is not a number")
+    path.write_text(lines[0])
+    refused(path, "0 rows")
 
 
 def test_unequal_columns(tmp_path, table):
@@ -159,38 +158,18 @@ def test_unequal_columns(tmp_path, table):
         write_run(tmp_path / "run_01.csv", table)
 
 
-def test_text_in_a_cell(tmp_path, table):
-    path = write_raw(tmp_path / "run_01.csv", table)
-    lines = path.read_text().splitlines()
-    cells = lines[6].split(",")
-    cells[3] = "n/a"
-    lines[6] = ",".join(cells)
-    path.write_text("\n".join(lines))
-    refused(path, "row 5 (line 7)", "'cmd_leg_lr'", "'n/a' is not a number")
-
-
 def test_text_column_in_parquet(tmp_path, table):
     table["volt"] = np.array(["twelve"] * 300)
     refused(write_raw(tmp_path / "run_01.parquet", table), "'volt'", "string")
 
 
+@pytest.mark.parametrize("name", ["run_01.csv", "run_01.parquet"])
 @pytest.mark.parametrize("content", [b"", b"\xff\xfe\x00junk"])
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_not_a_table_at_all(tmp_path, content, suffix):
-    path = tmp_path / f"run_01{suffix}"
-    path.write_bytes(content)
-    refused(path)
-
-
-def test_header_without_rows(tmp_path):
-    path = tmp_path / "run_01.csv"
-    path.write_text(",".join(COLUMNS))
-    refused(path, "0 rows")
-
-
-@pytest.mark.parametrize("path", ["run_01.txt", "nothing_here.csv"])
-def test_file_that_is_no_run(tmp_path, path):
-    refused(tmp_path / path)
+def test_not_a_table_at_all(tmp_path, content, name):
+    (tmp_path / name).write_bytes(content)
+    refused(tmp_path / name)
+    refused(tmp_path / "nothing_here.csv")
+    refused(tmp_path / "run_01.txt")
 
 
 # --- unit mistakes ----------------------------------------------------------------------------------------------------
@@ -223,24 +202,17 @@ def test_wrong_unit_in_one_column(tmp_path, table, column, factor, looks_like, s
     refused(write_raw(tmp_path / f"run_01{suffix}", table), f"'{column}'", "row ", looks_like)
 
 
-@pytest.mark.parametrize("kind", ["pos", "vel", "cmd"])
+@pytest.mark.parametrize("kind", ["pos_", "vel_", "cmd_", ""])
 def test_wrong_unit_in_a_whole_kind(tmp_path, table, kind):
-    for joint in JOINTS:
-        table[f"{kind}_{joint}"] = table[f"{kind}_{joint}"] * DEGREES
-    refused(write_raw(tmp_path / "run_01.csv", table), f"'{kind}_", "degrees")
+    for name in (name for name in table if name.startswith(kind) and COLUMNS[name].unit.startswith("rad")):
+        table[name] = table[name] * DEGREES
+    refused(write_raw(tmp_path / "run_01.csv", table), f"'{kind}", "degrees")
 
 
 @pytest.mark.parametrize("column", ["cmd_wheel_lf", "vel_wheel_lf", "vel_leg_rr"])
 def test_one_value_of_a_rate_does_not_tell_degrees_from_rpm(tmp_path, table, column):
     table[column] = np.full(len(table["t"]), 30.0)
     refused(write_raw(tmp_path / "run_01.csv", table), f"'{column}': 30", "degrees per second (57.3 times) or rpm (9.55 times)")
-
-
-def test_everything_in_degrees(tmp_path, table):
-    for name in table:
-        if COLUMNS[name].unit.startswith("rad"):
-            table[name] = table[name] * DEGREES
-    refused(write_raw(tmp_path / "run_01.csv", table), "degrees")
 
 
 def test_acceleration_in_g(tmp_path, table):
