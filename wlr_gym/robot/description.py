@@ -355,20 +355,15 @@ def physical_faults(robot: Robot) -> list[str]:
                 f"body.inertia {axis} = {value:g} kg m2 is impossible for {robot.body.mass:g} kg in a body of {x:g} x {y:g} x "
                 f"{z:g} m: a uniform box has {uniform:.4g}, {uniform / value:.0f} times more"
             )
-    faults += _triangle_faults("body.inertia", robot.body.inertia)
-    faults += _triangle_faults("leg.inertia", robot.leg.inertia)
+    for name, inertia in (("body.inertia", robot.body.inertia), ("leg.inertia", robot.leg.inertia)):
+        values = [float(value) for value in inertia if value is not None]
+        if len(values) == len(inertia) and (min(values) <= 0 or 2 * max(values) > sum(values) * (1 + 1e-9)):
+            faults.append(f"{name} = {values} breaks the triangle inequality every rigid body obeys")
     if not robot.leg_limits[0] <= robot.home.leg_angle <= robot.leg_limits[1]:
         faults.append(f"home.leg_angle = {robot.home.leg_angle:g} rad is outside leg_limits {list(robot.leg_limits)}")
     if robot.joints != JOINTS:
         faults.append(f"joints must be {list(JOINTS)} in this order, not {list(robot.joints)}")
     return faults
-
-
-def _triangle_faults(name: str, inertia: tuple[float | None, ...]) -> list[str]:
-    values = [float(value) for value in inertia if value is not None]
-    if len(values) < len(inertia) or (min(values) > 0 and 2 * max(values) <= sum(values) * (1 + 1e-9)):
-        return []
-    return [f"{name} = {values} breaks the triangle inequality every rigid body obeys"]
 
 
 #: Name in ``configs/robot/``, path of a YAML file, content of such a file, or a :class:`Robot`.
@@ -396,9 +391,6 @@ def robot_content(source: RobotSource) -> dict[str, Any]:
     """Return a robot as plain JSON types, which :func:`load_robot` takes: how it travels in run folders and contracts.
 
     Every number is in it, those of its bases and defaults too.
-
-    Raises:
-        InputError: see :func:`load_robot`.
     """
     return load_robot(source).model_dump(mode="json")
 
@@ -451,8 +443,8 @@ def servo_hash(robot: Robot) -> str:
 
 
 def _fingerprint(title: str, model: BaseModel) -> str:
-    lines = [f"{title} {HASH_FORM}", *sorted(_lines(model, ""))]
-    return f"{HASH_FORM}-{hashlib.sha256(chr(10).join(lines).encode()).hexdigest()[:16]}"
+    text = "\n".join([f"{title} {HASH_FORM}", *sorted(_lines(model, ""))])
+    return f"{HASH_FORM}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
 def _lines(model: BaseModel, above: str) -> Iterator[str]:

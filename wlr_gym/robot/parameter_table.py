@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from wlr_gym.base.errors import InputError, nearest, unknown_name
+from wlr_gym.base.errors import InputError, check_name, nearest, unknown_name
 
 #: Names and order of the joints: the four legs, then the four wheels, each lf, rf, lr, rr (left/right, front/rear).
 CORNERS = ("lf", "rf", "lr", "rr")
@@ -90,7 +90,8 @@ class ParameterSpec:
 
     def nominal(self, robot: Any) -> list[float | None]:
         """Return the values (size) for a :class:`wlr_gym.robot.Robot`; None where its file has none."""
-        values = [value for source in self.sources for value in _values(robot, source)]
+        found = (attrgetter(source)(robot) if isinstance(source, str) else source for source in self.sources)
+        values = [value for one in found for value in (one if isinstance(one, tuple) else (one,))]
         whole = values * (self.size // len(values))
         if not robot.individual:
             return whole
@@ -101,11 +102,6 @@ class ParameterSpec:
         """Whether a robot's file may state it of a single leg, wheel or servo."""
         single = self.labels in (LEGS, WHEELS, JOINTS, LEG_INERTIA_LABELS) and isinstance(self.sources[0], str)
         return single and not self.name.startswith("ground.")
-
-
-def _values(robot: Any, source: str | float) -> list[float | None]:
-    found = attrgetter(source)(robot) if isinstance(source, str) else source
-    return list(found) if isinstance(found, tuple) else [found]
 
 
 def stated(
@@ -262,21 +258,10 @@ def unknown_parameter(name: str) -> InputError:
 
 #: Symbol -> its size in SI, and the SI symbol of that dimension.
 UNITS = {
-    "m": (1.0, "m"),
-    "cm": (1e-2, "m"),
-    "mm": (1e-3, "m"),
-    "s": (1.0, "s"),
-    "ms": (1e-3, "s"),
-    "rad": (1.0, "rad"),
-    "mrad": (1e-3, "rad"),
-    "deg": (math.radians(1.0), "rad"),
-    "kg": (1.0, "kg"),
-    "g": (1e-3, "kg"),
-    "N": (1.0, "N"),
-    "mN": (1e-3, "N"),
-    "V": (1.0, "V"),
-    "mV": (1e-3, "V"),
-}
+    "m": (1.0, "m"), "cm": (1e-2, "m"), "mm": (1e-3, "m"), "s": (1.0, "s"), "ms": (1e-3, "s"),
+    "rad": (1.0, "rad"), "mrad": (1e-3, "rad"), "deg": (math.radians(1.0), "rad"), "kg": (1.0, "kg"), "g": (1e-3, "kg"),
+    "N": (1.0, "N"), "mN": (1e-3, "N"), "V": (1.0, "V"), "mV": (1e-3, "V"),
+}  # fmt: skip
 #: Unit of an amount that is relative -> what it is divided by.
 RELATIVE = {"": 1.0, "%": 100.0}
 #: Tolerances of a robot file, and the rows of the parameter table that each is about.
@@ -331,8 +316,7 @@ def read_tolerances(stated: Any) -> dict[str, ParameterTolerance]:
 
 
 def _read(key: Any, value: Any) -> ParameterTolerance:
-    if key not in KEYS:
-        raise unknown_name("tolerance", str(key), KEYS)
+    check_name("tolerance", key, KEYS)
     place = f"tolerances.{key} = {value!r}"
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise InputError(f"{place}: expected {_expected(key)}")
@@ -360,20 +344,14 @@ def _part(key: str, text: str, place: str) -> tuple[float, bool, str]:
         raise InputError(f"{place}: expected a finite amount of 0 or more, {_expected(key)}")
     if unit in RELATIVE:
         return number / RELATIVE[unit], True, group
-    return number * _size(key, unit, place), False, group
-
-
-def _size(key: str, unit: str, place: str) -> float:
-    """Return the size in SI of a unit that has the dimension of the parameter."""
-    expected = KEYS[key][0].unit
     try:
         size, dimension = _parsed(unit)
     except KeyError as error:
         symbol = error.args[0]
         raise InputError(f"{place}: unknown unit '{symbol}'{nearest(symbol, UNITS)}; expected {_expected(key)}") from None
-    if dimension != _parsed(expected)[1]:
+    if dimension != _parsed(KEYS[key][0].unit)[1]:
         raise InputError(f"{place}: '{unit}' is not a unit of {key}; expected {_expected(key)}")
-    return size
+    return number * size, False, group
 
 
 def _parsed(unit: str) -> tuple[float, Counter[str]]:

@@ -23,7 +23,7 @@ from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.format import CAMERA, COLUMNS, RunMeta
 from wlr_gym.data.runs import names_file
 from wlr_gym.physics.servo import current_law, effort_counts
-from wlr_gym.robot import JOINTS, LEGS, Robot
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 
 _TURN = 2.0 * math.pi
 _RPM = _TURN / 60.0
@@ -123,14 +123,12 @@ def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
 
 # ---- the map ---------------------------------------------------------------------------------------------------------
 
+_KINDS = ("cmd", "pos", "vel", "eff")
 #: Names that stand for several channels.
 GROUPS: dict[str, tuple[str, ...]] = {
-    **{kind: tuple(f"{kind}_{joint}" for joint in JOINTS) for kind in ("cmd", "pos", "vel", "eff")},
-    **{
-        f"{kind}_{part}": tuple(f"{kind}_{joint}" for joint in JOINTS if joint.startswith(part))
-        for kind in ("cmd", "pos", "vel", "eff")
-        for part in ("leg", "wheel")
-    },
+    **{kind: tuple(f"{kind}_{joint}" for joint in JOINTS) for kind in _KINDS},
+    **{f"{kind}_leg": tuple(f"{kind}_{leg}" for leg in LEGS) for kind in _KINDS},
+    **{f"{kind}_wheel": tuple(f"{kind}_{wheel}" for wheel in WHEELS) for kind in _KINDS},
     **{kind: tuple(f"{kind}_{axis}" for axis in "xyz") for kind in ("gyro", "acc")},
     "cam": CAMERA[:3],
 }
@@ -138,12 +136,6 @@ GROUPS: dict[str, tuple[str, ...]] = {
 OPEN = "open"
 #: Axes of a frame, as one of the log's.
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
-_MAP_KEYS = (*(name for name in COLUMNS if name != "t"), *GROUPS)
-
-
-def _check_names(kind: str, names: Iterable[Any], valid: Iterable[str]) -> None:
-    for name in names:
-        check_name(kind, name, valid)
 
 
 class ChannelSource(SettingsModel):
@@ -220,20 +212,22 @@ class LogMap(SettingsModel):
     def _plain_names(cls, value: Any) -> Any:
         if not isinstance(value, Mapping):
             return value
-        _check_names("joint", value, JOINTS)
+        for joint in value:
+            check_name("joint", joint, JOINTS)
         return {joint: {"name": one} if isinstance(one, str | int) else one for joint, one in value.items()}
 
     @field_validator("channels")
     @classmethod
     def _known_channels(cls, value: dict[str, ChannelSource]) -> dict[str, ChannelSource]:
-        _check_names("channel", value, _MAP_KEYS)
+        for channel in value:
+            check_name("channel", channel, (*(name for name in COLUMNS if name != "t"), *GROUPS))
         return value
 
     @field_validator("frames")
     @classmethod
     def _right_handed(cls, value: dict[str, tuple[Axis, Axis, Axis]]) -> dict[str, tuple[Axis, Axis, Axis]]:
-        _check_names("frame", value, ("imu", "cam"))
         for name, axes in value.items():
+            check_name("frame", name, ("imu", "cam"))
             order, flipped = "".join(axis[-1] for axis in axes), sum(axis.startswith("-") for axis in axes) % 2 == 1
             if sorted(order) != ["x", "y", "z"] or (order in ("xyz", "yzx", "zxy")) == flipped:
                 raise InputError(f"frames.{name} = {list(axes)}: expected x, y and z once each, right-handed")
@@ -386,9 +380,8 @@ def _resolve(found: LogMap, column: str, source: ChannelSource, robot: Robot, wh
     take = source.take or ("hold" if kind == "cmd" else "frames" if kind == "cam" else "interpolate")
     angle_of_pose = column in ("cam_yaw", "cam_pitch") and source.unit in ("mm", "cm", "m")
     unit = None if angle_of_pose else source.unit
-    return Resolved(
-        column, source.topic, field, factor(column, unit, robot, where), sign, zero, unit or COLUMNS[column].unit, take
-    )
+    size = factor(column, unit, robot, where)
+    return Resolved(column, source.topic, field, size, sign, zero, unit or COLUMNS[column].unit, take)
 
 
 # ---- what a run lacks ------------------------------------------------------------------------------------------------
@@ -417,7 +410,6 @@ def costs(columns: Collection[str]) -> list[tuple[str, str]]:
     found = []
     for group, in_words, cost in _COSTS:
         members = GROUPS.get(group, (group,))
-        missing = [name for name in members if name not in columns]
-        if missing:
+        if missing := [name for name in members if name not in columns]:
             found.append((in_words if len(missing) == len(members) else ", ".join(missing), cost))
     return found
