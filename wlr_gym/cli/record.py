@@ -64,8 +64,9 @@ def run(options: RecordOptions) -> int:
     Raises:
         InputError: unknown motion, backend, robot or patch, options that make no sense, ports that cannot be opened.
     """
+    from wlr_gym.data.excitations import excite
     from wlr_gym.data.format import RunMeta
-    from wlr_gym.data.record import meta_of, same_profile, write_commands
+    from wlr_gym.data.record import meta_of, read_commands, same_profile, write_commands
     from wlr_gym.physics.plants import REAL, check_backend
 
     console = Console(soft_wrap=True, highlight=False)
@@ -81,83 +82,63 @@ def run(options: RecordOptions) -> int:
         options.refuse_robot_options(f"leave --backend {options.backend} out")
     if options.out is None:
         raise InputError("--out: expected a folder for the runs")
-    motions = read_motions(options, robot)
-    same_profile(motions)
-    if options.commands_only:
-        for motion in motions:
-            refuse_existing(options.out / f"{motion.name}.csv", options.force)
-        written = [write_commands(options.out, motion) for motion in motions]
-        for path in written:
-            console.print(f"written: {path}")
-        _results(options, [{"motion": motion.name, "commands": path} for motion, path in zip(motions, written, strict=True)])
-        return OK
-    meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
-    if options.backend in REAL:
-        return _record_robot(options, motions, robot, meta, console)
-    return _record_simulations(options, motions, robot, meta, console)
-
-
-def read_motions(options: RecordOptions, robot: Robot) -> Sequence[Motion]:
-    """Return the chosen motions.
-
-    Raises:
-        InputError: none, or one that cannot be read.
-    """
-    from wlr_gym.data.excitations import excite
-    from wlr_gym.data.record import read_commands
-
     motions = [excite(name, options.seed or 0, robot, seconds=options.seconds) for name in options.excitation]
     motions += [read_commands(path).cut(options.seconds) for path in options.commands]
     if not motions:
         raise InputError("nothing to drive: name excitations (--excitation straight turns; see --list) or files (--commands)")
-    return motions
+    same_profile(motions)
+    meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
+    code = OK
+    if options.commands_only:
+        for motion in motions:
+            refuse_existing(options.out / f"{motion.name}.csv", options.force)
+        found = [{"motion": motion.name, "commands": write_commands(options.out, motion)} for motion in motions]
+        for one in found:
+            console.print(f"written: {one['commands']}")
+    elif options.backend in REAL:
+        found, code = _record_robot(options, options.out, motions, robot, meta, console)
+    else:
+        found = _record_simulations(options, options.out, motions, robot, meta, console)
+    if options.json:
+        print_json(found)
+    return code
 
 
 # ---- the robot -------------------------------------------------------------------------------------------------------
 
 
-def _record_robot(options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console) -> int:
+def _record_robot(
+    options: RecordOptions, out: Path, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console
+) -> tuple[list[dict[str, object]], int]:
     """Limited and logged; between the motions the operator carries the robot back."""
     from wlr_gym.hardware.deployment import drive_robot
 
-    assert options.out is not None
     found: list[dict[str, object]] = []
     code = OK
     for motion in motions:
         if not (options.emulated or options.yes):
             confirm(motion, robot, options.load_hardware(), console)
-        seed = noise_seed(options.out, options.seed) if options.noise_seed is None else options.noise_seed
-        with closing(options.plant_of(options.load()[0], options.out, meta, options.patch(), seed)) as plant:
+        seed = noise_seed(out, options.seed) if options.noise_seed is None else options.noise_seed
+        with closing(options.plant_of(options.load()[0], out, meta, options.patch(), seed)) as plant:
             drive = drive_robot(plant, motion)
         _report(motion, drive, console)
-        found.append(
-            {"motion": motion.name, "run": drive.run, "reason": drive.reason, "well": drive.well, "steps": drive.ticks}
-        )
+        ended = {"reason": drive.reason, "well": drive.well, "steps": drive.ticks}
+        found.append({"motion": motion.name, "run": drive.run, **ended})
         if drive.reason or not drive.well:
             code = INTERRUPTED if drive.well else FAILED
             break
     if left := [motion.name for motion in motions[len(found) :]]:
         console.print(f"not driven: {', '.join(left)}", style="red")
     found += [{"motion": name, "run": None, "reason": "not driven", "well": False, "steps": 0} for name in left]
-    _results(options, found)
-    return code
-
-
-def _results(options: RecordOptions, found: Sequence[dict[str, object]]) -> None:
-    if options.json:
-        print_json(found)
+    return found, code
 
 
 def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
     from wlr_gym.data import read_run
 
-    ended = drive.reason or "to its end"
-    console.print(
-        f"{motion.name}: {drive.ticks} of {len(motion.setpoints)} steps driven; {ended}",
-        style="" if not drive.reason else "red",
-    )
-    changed = drive.statistics["interventions"]
-    if changed:
+    driven = f"{drive.ticks} of {len(motion.setpoints)} steps driven"
+    console.print(f"{motion.name}: {driven}; {drive.reason or 'to its end'}", style="red" if drive.reason else "")
+    if changed := drive.statistics["interventions"]:
         limited = ", ".join(f"{rule} in {counted(count, 'step')}" for rule, count in changed.items())
         console.print(f"  command limiter: {limited}")
     if drive.run is not None:
@@ -170,23 +151,21 @@ def _report(motion: Motion, drive: DriveResult, console: Console) -> None:
 
 
 def _record_simulations(
-    options: RecordOptions, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console
-) -> int:
+    options: RecordOptions, out: Path, motions: Sequence[Motion], robot: Robot, meta: RunMeta, console: Console
+) -> list[dict[str, object]]:
     from wlr_gym.base.random import spawn_seeds
     from wlr_gym.data.record import record_simulation
     from wlr_gym.data.runs import next_run
 
-    assert options.out is not None
     patch, found = options.patch(), []
-    make_output_folder(options.out)
+    make_output_folder(out)
     for motion in motions:
-        path = next_run(options.out)
+        path = next_run(out)
         seed = int(spawn_seeds(options.seed or 0, 1, path.stem)[0])  # no two runs of a folder have the same noise
         record_simulation(path, motion, robot, options.backend, seed, patch, meta)
         console.print(f"{motion.name}: {motion.duration:.1f} s on {options.backend}; written: {path}")
         found.append({"motion": motion.name, "run": path})
-    _results(options, found)
-    return OK
+    return found
 
 
 def _list(console: Console, robot: Robot, as_json: bool) -> None:

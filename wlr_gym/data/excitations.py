@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name, check_number
 from wlr_gym.base.random import generator
 from wlr_gym.data.format import Profile
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot, load_robot
@@ -112,11 +112,10 @@ def excite(
     Raises:
         InputError: unknown name, negative seed, or a period or length that is not positive.
     """
-    if name not in EXCITATIONS:
-        raise unknown_name("excitation", name, EXCITATIONS)
-    for option, value in (("period", period), ("seconds", seconds)):
-        if value is not None and not value > 0.0:
-            raise InputError(f"{option} = {value!r}: expected more than 0 s")
+    check_name("excitation", name, EXCITATIONS)
+    check_number("period", period, "s", above=0.0)
+    if seconds is not None:
+        check_number("seconds", seconds, "s", above=0.0)
     if seed < 0:
         raise InputError(f"seed = {seed}: expected 0 or more")
     excitation, robot = EXCITATIONS[name], robot or load_robot()
@@ -139,12 +138,6 @@ def _holds(pieces: Iterable[tuple[float, Sequence[float] | Array]]) -> Course:
     seconds, rows = zip(*pieces, strict=True)
     ends, table = np.cumsum(seconds), np.array(rows)
     return lambda t: table[np.minimum(np.searchsorted(ends, t, side="right"), len(table) - 1)], float(ends[-1])
-
-
-def _ramps(points: Iterable[tuple[float, Sequence[float] | Array]]) -> Course:
-    """Rows of eight setpoints at given times, straight lines between them; a NaN makes all of its column NaN."""
-    times, rows = (np.array(column) for column in zip(*points, strict=True))
-    return lambda t: np.stack([np.interp(t, times, column) for column in rows.T], axis=1), float(times[-1])
 
 
 def _posture(front: float, rear: float, left: float = 0.0, right: float = 0.0) -> Array:
@@ -258,13 +251,13 @@ def _swing_over(rng: np.random.Generator, robot: Robot, *, turning_front: bool) 
     front = (margin, np.pi - margin) if turning_front else (margin, margin)
     up = rng.uniform(4.6, 5.2)
 
-    def row(time: float) -> Array:
-        share = min(time / turned, 1.0)
-        legs = [pair[0] + share * (pair[1] - pair[0]) for pair in (front, rear)]
-        pull = speed * min(time / up, 1.0)
-        return np.array([legs[0], legs[0], legs[1], legs[1], pull, pull, np.nan, np.nan])
-
-    return _ramps((time, row(time)) for time in (0.0, min(up, turned), max(up, turned), 15.5))
+    length = 15.5
+    times = np.array([0.0, min(up, turned), max(up, turned), length])
+    share = np.minimum(times / turned, 1.0)
+    legs = [pair[0] + share * (pair[1] - pair[0]) for pair in (front, rear)]
+    pull = speed * np.minimum(times / up, 1.0)
+    columns = [legs[0], legs[0], legs[1], legs[1], pull, pull, *[np.full(4, np.nan)] * 2]
+    return lambda t: np.stack([np.interp(t, times, column) for column in columns], axis=1), length
 
 
 def _random(rng: np.random.Generator, robot: Robot) -> Course:
