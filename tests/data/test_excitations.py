@@ -93,8 +93,8 @@ def test_torque_switches():
     [
         ({"name": "strait"}, "did you mean 'straight'"),
         ({"name": "turns", "seed": -1}, "seed = -1"),
-        ({"name": "turns", "period": 0.0}, "period = 0.0"),
-        ({"name": "turns", "seconds": -2.0}, "seconds = -2.0"),
+        ({"name": "turns", "period": 0.0}, "period = 0: expected more than 0 s"),
+        ({"name": "turns", "seconds": -2.0}, "seconds = -2: expected more than 0 s"),
     ],
 )
 def test_bad_input_is_named(arguments, words):
