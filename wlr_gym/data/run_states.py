@@ -221,17 +221,15 @@ def camera_pose(run: Run) -> Array:
 
 
 def _wheel_tension(run: Run, robot: Robot, parameters: Parameters) -> Array:
-    """Distance of the wheels' reference from their angle (1, 4) that gives the measured effort at rest."""
-    still = _rows_before_motion(run)
-    effort = [np.mean(run[f"eff_{joint}"][still]) if f"eff_{joint}" in run else 0.0 for joint in WHEELS]
-    return np.nan_to_num(effort) * reference_per_effort(robot, parameters)[:, WHEEL_SLICE]
+    """Distance of the wheels' reference from their angle (1, 4) that gives the measured effort at rest.
 
-
-def _rows_before_motion(run: Run) -> NDArray[np.bool_]:
-    """Rows of the first tenths of a second that were read before any setpoint asked a wheel to turn; the first one at least."""
+    At rest are the rows of the first tenths of a second that were read before any setpoint asked a wheel to turn.
+    """
     asked = np.any([np.nan_to_num(run[f"cmd_{joint}"]) != 0.0 for joint in WHEELS], axis=0)
     before = np.concatenate([[False], np.logical_or.accumulate(asked)[:-1]])
-    return (run["t"] <= run["t"][0] + CAMERA_WINDOW) & ~before
+    still = (run["t"] <= run["t"][0] + CAMERA_WINDOW) & ~before
+    effort = [np.mean(run[f"eff_{joint}"][still]) if f"eff_{joint}" in run else 0.0 for joint in WHEELS]
+    return np.nan_to_num(effort) * reference_per_effort(robot, parameters)[:, WHEEL_SLICE]
 
 
 # ---- odometry --------------------------------------------------------------------------------------------------------

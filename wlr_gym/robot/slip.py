@@ -116,7 +116,8 @@ def contact_slip_velocity(
         angular_velocity_in_body: (N, 3) rad/s.
         joint_position, joint_velocity: (N, 8) true angles (rad) and rates (rad/s) in joint order.
     """
-    normal = _floor_normal_in_body(quaternion)
+    w, x, y, z = quaternion.T
+    normal = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)  # the world's z axis
     down = normal - normal[:, 1:2] * _AXLE
     down = down / -np.linalg.norm(down, axis=1, keepdims=True)
     heading = np.cross(down, _AXLE)
@@ -135,9 +136,3 @@ def contact_slip_velocity(
         + joint_velocity[:, WHEEL_SLICE, None] * np.cross(_AXLE, to_contact)
     )
     return np.stack([np.einsum("nwk,nk->nw", velocity, axis) for axis in (heading, left)], axis=-1)
-
-
-def _floor_normal_in_body(quaternion: Array) -> Array:
-    """Return the world's z axis in the body frame (N, 3): the last row of the rotation matrix."""
-    w, x, y, z = quaternion.T
-    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)

@@ -312,22 +312,17 @@ def _motion(run: Run, robot: Robot, rows: NDArray[np.intp], times: list[int]) ->
         many, state.quaternion, state.linear_velocity_in_body, state.angular_velocity_in_body, state.joint_position,
         state.joint_velocity,
     )  # fmt: skip
-    feet, yaw = _feet(many, state.position, state.quaternion, state.joint_position[:, LEG_SLICE])
+    yaw, _, _ = euler_angles(state.quaternion)
+    legs, level = state.joint_position[:, LEG_SLICE], rotation(yaw, np.zeros_like(yaw), np.zeros_like(yaw))
+    along = np.stack([np.cos(legs), np.zeros_like(legs), -np.sin(legs)], axis=-1) * many["leg.length"][:, :, None]
+    hips = many["hip.position"][:, None, :] * np.array([(*sign, 1.0) for sign in CORNER_SIGNS])
+    feet = state.position[:, None, :2] + np.einsum("nij,nwj->nwi", level, hips + along)[..., :2]  # where they touch the floor
     headings = np.stack([np.stack([np.cos(yaw), np.sin(yaw)], -1), np.stack([-np.sin(yaw), np.cos(yaw)], -1)], axis=1)
     over_floor = np.einsum("nwk,nkj->nwj", slip, headings)
     return [
         [_transforms(time, [_transform(time, FLOOR, BODY, position, turn)]), _markers(time, foot, arrow)]
         for time, position, turn, foot, arrow in zip(times, state.position, state.quaternion, feet, over_floor, strict=True)
     ]
-
-
-def _feet(parameters: Parameters, position: Array, turn: Array, legs: Array) -> tuple[Array, Array]:
-    """Return where the wheels touch the floor (N, 4, 2), m, and the heading (N,), rad."""
-    yaw, _, _ = euler_angles(turn)
-    along = np.stack([np.cos(legs), np.zeros_like(legs), -np.sin(legs)], axis=-1) * parameters["leg.length"][:, :, None]
-    hips = parameters["hip.position"][:, None, :] * np.array([(*sign, 1.0) for sign in CORNER_SIGNS])
-    level = rotation(yaw, np.zeros_like(yaw), np.zeros_like(yaw))
-    return position[:, None, :2] + np.einsum("nij,nwj->nwi", level, hips + along)[..., :2], yaw
 
 
 def _quaternion(turn: Array) -> dict[str, float]:

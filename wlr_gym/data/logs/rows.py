@@ -208,18 +208,13 @@ def without_wraps(series: Mapping[str, Series], joint: str) -> tuple[Array, str]
         return values, ""
     if not ((steps > _JUMP) & (gaps <= hole(at))).any():
         return values, f"'pos_{joint}': {(steps > np.pi).sum()} jumps of more than half a turn are left in"
-    rate = max(_fastest(series, f"{kind}_{joint}") for kind in ("cmd", "vel")) if joint in WHEELS else 0.0
+    rates = [np.abs(series[name][1]) for name in (f"cmd_{joint}", f"vel_{joint}") if name in series and joint in WHEELS]
+    rate = max((float(one[np.isfinite(one)].max(initial=0.0)) for one in rates), default=0.0)
     unsure = gaps[rate * gaps * 1e-9 > np.pi]
     if not len(unsure):
         return np.unwrap(values), ""
     where = f"between {len(unsure)} pairs of samples, up to {unsure.max() * 1e-9:.2g} s apart"
     return np.unwrap(values), f"'pos_{joint}': turns are a guess {where}: at {rate:.3g} rad/s that may be more than half a turn"
-
-
-def _fastest(series: Mapping[str, Series], channel: str) -> float:
-    """Return the highest rate of a channel, rad/s; 0 where it is not known."""
-    rates = np.abs(series[channel][1]) if channel in series else np.zeros(0)
-    return float(rates[np.isfinite(rates)].max(initial=0.0))
 
 
 # ---- one run ---------------------------------------------------------------------------------------------------------

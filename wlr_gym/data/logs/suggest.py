@@ -622,8 +622,14 @@ class _Proposer:
         have = [column for column in imu if column in self.chosen]
         if have and not set(have) <= self.ours and "imu" not in given:
             self.content["frames"]["imu"] = OPEN
-            axes = "the log's axes that our x (forward), y (left) and z (up) are: [x, y, z] where it is mounted so"
-            self.note("frames.imu", f"{axes}. {'; '.join(self._imu_shown())}. {_MATTERS['frames']}")
+            shown = ["the log's axes that our x (forward), y (left) and z (up) are: [x, y, z] where it is mounted so"]
+            if "acc_x" in self.chosen:
+                gravity = ", ".join(f"{value:.3g}" for value in self._gravity())
+                shown.append(f"acc reads {gravity} in the median (up is where it is positive)")
+            if "gyro_x" in self.chosen:
+                sizes = ", ".join(f"{np.std(self.raw(f'gyro_{axis}')[1]):.3g}" for axis in XYZ)
+                shown.append(f"gyro varies by {sizes} (a robot that drives turns about up)")
+            self.note("frames.imu", f"{'. '.join(shown)}. {_MATTERS['frames']}")
         if "cam_z" in self.chosen and "cam_x" in self.chosen and "cam" not in given:
             spread = [float(np.ptp(values)) if len(values) else 0.0 for _, values in map(self.raw, (f"cam_{a}" for a in XYZ))]
             shown = ", ".join(f"{axis} goes over {size:.3g}" for axis, size in zip(XYZ, spread, strict=True))
@@ -683,14 +689,6 @@ class _Proposer:
         kind = self.log.topics[one.topic].kind
         topic = "" if kind == one.topic else f"topic '{one.topic}' ({kind}), "
         return f"{topic}'{self._field(column)}'"
-
-    def _imu_shown(self) -> Iterable[str]:
-        if all(f"acc_{axis}" in self.chosen for axis in XYZ):
-            gravity = self._gravity()
-            yield f"acc reads {', '.join(f'{value:.3g}' for value in gravity)} in the median (up is where it is positive)"
-        if all(f"gyro_{axis}" in self.chosen for axis in XYZ):
-            sizes = [float(np.std(self.raw(f"gyro_{axis}")[1])) for axis in XYZ]
-            yield f"gyro varies by {', '.join(f'{size:.3g}' for size in sizes)} (a robot that drives turns about up)"
 
     def _unnamed(self) -> str:
         """Return which lists have as many elements as a robot has joints of a kind, but no names; and a table's columns."""

@@ -438,12 +438,6 @@ def recognise(tree: LinkTree, *, idealise: bool = False) -> ImportedRobot:
 # ---- body ------------------------------------------------------------------------------------------------------------
 
 
-def _bounds(shapes: Sequence[LinkShape]) -> Array | None:
-    """Lowest and highest corner (2, 3) of all shapes in the link's frame, m; None: there are none."""
-    corners = [corner for shape in shapes for corner in _corners(shape)]
-    return np.array([np.min(corners, axis=0), np.max(corners, axis=0)]) if corners else None
-
-
 def _corners(shape: LinkShape) -> Array:
     """Points (N, 3) in the link's frame between which a shape lies."""
     placement = shape.placement
@@ -462,7 +456,8 @@ def _corners(shape: LinkShape) -> Array:
 def _read_body(body: RigidLink, assemblies: Sequence[Assembly], reader: _Reader) -> None:
     # A hip is in the plane of its wheel: a hinge has no other place along its axis.
     hips = np.array([[one.leg_frame.position[0], one.wheel_centre[1], one.leg_frame.position[2]] for one in assemblies])
-    box = _bounds(body.shapes)
+    corners = [corner for shape in body.shapes for corner in _corners(shape)]
+    box = np.array([np.min(corners, axis=0), np.max(corners, axis=0)]) if corners else None
     origin = np.array([*hips.mean(axis=0)[:2], 0.0 if box is None else box.mean(axis=0)[2]])
     if np.linalg.norm(origin) > SAME:
         text = ", ".join(f"{value:.4g}" for value in origin)

@@ -185,7 +185,10 @@ def _read_joint(element: ElementTree.Element, rotors: dict[str, float], source: 
         raise InputError(f"{where}: mimics another joint: expected legs and wheels that are driven one by one")
     ends = [element.find(role) for role in ("parent", "child")]
     parent, child = (end.get("link", "") if end is not None else "" for end in ends)
-    axis = _unit(_numbers(element.find("axis"), "xyz", where, (1.0, 0.0, 0.0)), where)
+    direction = _numbers(element.find("axis"), "xyz", where, (1.0, 0.0, 0.0))
+    if not any(direction):
+        raise InputError(f"{where}: axis = {direction}: expected a direction")
+    axis = np.array(direction) / float(np.linalg.norm(direction))
     limit, dynamics = element.find("limit"), element.find("dynamics")
     span = None
     if kind == "revolute":
@@ -232,13 +235,6 @@ def rotation_of(roll: float, pitch: float, yaw: float) -> Array:
             [-sp, cp * sr, cp * cr],
         ]
     )
-
-
-def _unit(axis: list[float], where: str) -> Array:
-    length = float(np.linalg.norm(axis))
-    if length == 0.0:
-        raise InputError(f"{where}: axis = {axis}: expected a direction")
-    return np.array(axis) / length
 
 
 def _numbers(element: ElementTree.Element | None, key: str, where: str, default: tuple[float, ...]) -> list[float]:
