@@ -24,24 +24,9 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run
 from wlr_gym.data.format import COLUMNS
 from wlr_gym.data.logs import import_log, read_logs, suggest_map
-from wlr_gym.data.logs.map import content, factor
+from wlr_gym.data.logs.map import factor
 from wlr_gym.physics.servo import current_law
 from wlr_gym.robot import JOINTS, load_robot
-
-
-@pytest.fixture(scope="module")
-def messages():
-    return lab_messages(made_up(6.0))
-
-
-@pytest.fixture(scope="module")
-def mcap(messages, tmp_path_factory):
-    return write_mcap(tmp_path_factory.mktemp("mcap") / "lab.mcap", messages)
-
-
-@pytest.fixture(scope="module")
-def known(mcap):
-    return content(lab_map(mcap))
 
 
 def test_no_such_file(tmp_path):
@@ -63,20 +48,20 @@ def test_noise_is_no_log(tmp_path, name):
         list(read_logs(tmp_path / name))
 
 
-def test_an_mcap_file_that_is_cut_off_is_read_up_to_there(mcap, known, tmp_path):
+def test_an_mcap_file_that_is_cut_off_is_read_up_to_there(mcap, answered, tmp_path):
     whole = mcap.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
-    (imported,) = import_log(tmp_path / "cut.mcap", tmp_path / "runs", known)
+    (imported,) = import_log(tmp_path / "cut.mcap", tmp_path / "runs", answered)
     assert "cut off or broken near byte" in imported.notes[0]
     assert imported.path.is_file()
 
 
-def test_a_broken_chunk_is_left_out(mcap, known, tmp_path):
+def test_a_broken_chunk_is_left_out(mcap, answered, tmp_path):
     whole = bytearray(mcap.read_bytes())
     place = len(whole) // 2
     whole[place : place + 40] = b"\xff" * 40
     (tmp_path / "broken.mcap").write_bytes(whole)
-    (imported,) = import_log(tmp_path / "broken.mcap", tmp_path / "runs", known)
+    (imported,) = import_log(tmp_path / "broken.mcap", tmp_path / "runs", answered)
     assert any("broken" in note for note in imported.notes)
 
 
@@ -106,18 +91,21 @@ def test_a_bag_without_its_file(messages, tmp_path):
         list(read_logs(bag))
 
 
-def test_a_topic_or_field_that_is_not_there(mcap, known, tmp_path):
-    wrong = {**known, "channels": {**known["channels"], "volt": {"topic": "/powr", "field": "voltage"}}}
+def test_a_topic_or_field_that_is_not_there(mcap, answered, tmp_path):
+    wrong = {**answered, "channels": {**answered["channels"], "volt": {"topic": "/powr", "field": "voltage"}}}
     with pytest.raises(InputError, match=r"lab.mcap: unknown topic '/powr' \(did you mean '/power'\?\)"):
         import_log(mcap, tmp_path / "runs", wrong)
-    wrong = {**known, "channels": {**known["channels"], "volt": {"topic": "/power", "field": "volts"}}}
+    wrong = {**answered, "channels": {**answered["channels"], "volt": {"topic": "/power", "field": "volts"}}}
     with pytest.raises(InputError, match=r"lab.mcap: channel 'volt': topic '/power': unknown field 'volts'"):
         import_log(mcap, tmp_path / "runs", wrong)
     assert not list((tmp_path / "runs").glob("run_*"))
 
 
-def test_a_wrong_unit_is_said_with_topic_and_field(mcap, known, tmp_path):
-    wrong = {**known, "channels": {**known["channels"], "pos_leg": {"topic": "/chassis/joints", "field": "position[{joint}]"}}}
+def test_a_wrong_unit_is_said_with_topic_and_field(mcap, answered, tmp_path):
+    wrong = {
+        **answered,
+        "channels": {**answered["channels"], "pos_leg": {"topic": "/chassis/joints", "field": "position[{joint}]"}},
+    }
     message = (
         r"lab.mcap: row \d+, column 'pos_leg_lf': .* looks like degrees \(from topic '/chassis/joints', field 'position\[FL_h"
     )
@@ -198,18 +186,18 @@ def test_a_type_without_a_definition_is_left_out_and_said(messages, tmp_path):
     ("topic", "kind", "message"),
     [("target", "cmd", "the setpoints that drove the robot"), ("joints", "pos", "the joints' angles")],
 )
-def test_what_every_run_needs_is_asked_and_a_map_without_it_is_refused(messages, known, tmp_path, topic, kind, message):
+def test_what_every_run_needs_is_asked_and_a_map_without_it_is_refused(messages, answered, tmp_path, topic, kind, message):
     bag = write_mcap(tmp_path / "a.mcap", [one for one in messages if one[1] != f"/chassis/{topic}"])
     assert {f"channels.{kind}_{part}.topic" for part in ("leg", "wheel")} <= set(suggest_map(bag).open)
-    less = {**known, "channels": {key: one for key, one in known["channels"].items() if not key.startswith(kind)}}
+    less = {**answered, "channels": {key: one for key, one in answered["channels"].items() if not key.startswith(kind)}}
     with pytest.raises(InputError, match=rf"a.mcap: no source for {kind}_leg_lf, .*: {message}"):
         import_log(bag, tmp_path / "runs", less)
 
 
-def test_a_log_is_imported_once(mcap, known, tmp_path):
-    import_log(mcap, tmp_path / "runs", known)
+def test_a_log_is_imported_once(mcap, answered, tmp_path):
+    import_log(mcap, tmp_path / "runs", answered)
     with pytest.raises(InputError, match=r"run_01 comes from it already"):
-        import_log(mcap, tmp_path / "runs", known)
+        import_log(mcap, tmp_path / "runs", answered)
 
 
 @pytest.mark.parametrize(

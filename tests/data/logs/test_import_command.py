@@ -4,36 +4,26 @@ import shutil
 from pathlib import Path
 
 import pytest
-from foreign_logs import lab_map, lab_messages, made_up, rows_of, write_mcap
+from foreign_logs import lab_messages, made_up, rows_of, write_mcap
 
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import BAD_INPUT, OK, main
 from wlr_gym.data import read_dataset, read_run, write_run
-from wlr_gym.data.logs.map import content, map_text
+from wlr_gym.data.logs.map import map_text
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory):
-    return write_mcap(tmp_path_factory.mktemp("mcap") / "lab.mcap", lab_messages(made_up(12.0)))
-
-
-@pytest.fixture(scope="module")
-def answered(bag):
-    return content(lab_map(bag))
-
-
-def test_suggest_answer_import(bag, answered, tmp_path, monkeypatch, capsys):
+def test_suggest_answer_import(mcap, answered, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
-    assert main(["import", str(bag), "--suggest"]) == OK
+    assert main(["import", str(mcap), "--suggest"]) == OK
     said = capsys.readouterr().out
     assert "decided" in said
     assert "rad, deg, turn, count? topic '/chassis/joints'" in said
     assert "meta.profile" in said
-    assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == BAD_INPUT
+    assert main(["import", str(mcap), "--map", "map.yaml", "--out", "runs"]) == BAD_INPUT
     assert "map.yaml: still open: joints.leg_lf.sign, joints.leg_lf.zero" in capsys.readouterr().err
     Path("map.yaml").write_text(map_text(answered))
-    assert main(["import", str(bag), "--map", "map.yaml", "--out", "runs"]) == OK
+    assert main(["import", str(mcap), "--map", "map.yaml", "--out", "runs"]) == OK
     said = capsys.readouterr().out
     assert "as recorded" in said
     assert "interpolated" in said
@@ -47,50 +37,50 @@ def test_suggest_answer_import(bag, answered, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("profile", ["{leg_velocity: 1.4}", "{}"], ids=["one", "none"])
 def test_what_the_map_states_is_not_asked_and_a_complete_one_is_used_at_once(
-    bag, answered, tmp_path, monkeypatch, capsys, profile
+    mcap, answered, tmp_path, monkeypatch, capsys, profile
 ):
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(map_text(answered) + f"meta: {{profile: {profile}}}\n")
-    assert main(["import", str(bag), "--suggest", "--map", "mine.yaml", "--out", "runs"]) == OK
+    assert main(["import", str(mcap), "--suggest", "--map", "mine.yaml", "--out", "runs"]) == OK
     assert "meta.profile" not in capsys.readouterr().out
     assert read_dataset("runs").meta.states_profile
 
 
-def test_with_a_folder_the_map_is_written_there_and_runs_wait_for_its_answers(bag, tmp_path, monkeypatch, capsys):
+def test_with_a_folder_the_map_is_written_there_and_runs_wait_for_its_answers(mcap, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(["import", str(bag), "--suggest", "--out", "runs"]) == BAD_INPUT
+    assert main(["import", str(mcap), "--suggest", "--out", "runs"]) == BAD_INPUT
     said = capsys.readouterr().err
     assert "runs/map.yaml: no run is made, 24 entries of the map are open: joints.leg_lf.sign, " in said
-    assert said.rstrip().endswith(f"replace each 'open', then: wlr import {bag} --out runs")
+    assert said.rstrip().endswith(f"replace each 'open', then: wlr import {mcap} --out runs")
     assert [path.name for path in Path("runs").iterdir()] == ["map.yaml"]
     assert "# rad, deg, turn, count? topic" in Path("runs/map.yaml").read_text()
 
 
-def test_a_map_that_is_there_is_not_overwritten(bag, answered, tmp_path, monkeypatch, capsys):
+def test_a_map_that_is_there_is_not_overwritten(mcap, answered, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("map.yaml").write_text("every: 2  # mine\n")
     for words in ([], ["--map", "map.yaml"]):
-        assert main(["import", str(bag), "--suggest", *words]) == BAD_INPUT
+        assert main(["import", str(mcap), "--suggest", *words]) == BAD_INPUT
         assert "map.yaml: is there already, and is another map: import with it" in capsys.readouterr().err
     assert Path("map.yaml").read_text() == "every: 2  # mine\n"
     Path("mine.yaml").write_text(map_text(answered | {"every": 2}))
-    assert main(["import", str(bag), "--map", "mine.yaml", "--out", "runs"]) == OK
+    assert main(["import", str(mcap), "--map", "mine.yaml", "--out", "runs"]) == OK
     assert read_yaml("runs/map.yaml")["every"] == 2
-    assert len(read_run("runs/run_01.parquet")["t"]) == pytest.approx(300, abs=10)
+    assert len(read_run("runs/run_01.parquet")["t"]) == pytest.approx(200, abs=10)
 
 
-def test_a_map_in_the_folder_of_runs_stands(bag, answered, tmp_path, monkeypatch, capsys):
+def test_a_map_in_the_folder_of_runs_stands(mcap, answered, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("runs").mkdir()
     kept = "# mine\n" + map_text(answered | {"every": 2})
     Path("runs/map.yaml").write_text(kept)
-    assert main(["import", str(bag), "--suggest", "--out", "runs"]) == BAD_INPUT
+    assert main(["import", str(mcap), "--suggest", "--out", "runs"]) == BAD_INPUT
     assert "runs/map.yaml: is there already" in capsys.readouterr().err
-    assert main(["import", str(bag), "--out", "runs"]) == OK
-    shutil.copy(bag, "other.mcap")
+    assert main(["import", str(mcap), "--out", "runs"]) == OK
+    shutil.copy(mcap, "other.mcap")
     assert main(["import", "other.mcap", "--out", "runs"]) == OK
     assert Path("runs/map.yaml").read_text() == kept
-    assert len(read_run("runs/run_02.parquet")["t"]) == pytest.approx(300, abs=10)
+    assert len(read_run("runs/run_02.parquet")["t"]) == pytest.approx(200, abs=10)
 
 
 def test_exports_overwrite_nothing(tmp_path, capsys):
@@ -108,23 +98,23 @@ def test_exports_overwrite_nothing(tmp_path, capsys):
     assert (out / "run_01.mcap").read_bytes() == first
 
 
-def test_our_own_runs_come_back_whole(bag, tmp_path, capsys):
+def test_our_own_runs_come_back_whole(mcap, tmp_path, capsys):
     run = write_run(tmp_path / "run_01.csv", rows_of(made_up(1.0)))
     assert main(["export", str(run), "--to", "mcap"]) == OK
     own, out = str(tmp_path / "run_01.mcap"), ["--out", str(tmp_path / "back")]
     for words in (["--split", "3"], ["--robot", "nominal"]):
         assert main(["import", own, *words, *out]) == BAD_INPUT
         assert "takes neither split nor robot" in capsys.readouterr().err
-    assert main(["import", own, str(bag), *out]) == BAD_INPUT
-    assert f"{bag.name}: another program's log" in capsys.readouterr().err
+    assert main(["import", own, str(mcap), *out]) == BAD_INPUT
+    assert f"{mcap.name}: another program's log" in capsys.readouterr().err
     assert not (tmp_path / "back").exists()
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_what_no_map_helps_is_said_at_once(bag, tmp_path, capsys, suffix):
+def test_what_no_map_helps_is_said_at_once(mcap, tmp_path, capsys, suffix):
     run = write_run(tmp_path / f"run_01{suffix}", rows_of(made_up(1.0)))
     (tmp_path / "cut.parquet").write_bytes(b"PAR1" + bytes(3000))
-    (tmp_path / "cut.mcap").write_bytes(bag.read_bytes()[:3000])
+    (tmp_path / "cut.mcap").write_bytes(mcap.read_bytes()[:3000])
     for name in ("empty.csv", "empty.mcap"):
         (tmp_path / name).touch()
     for name, words in {
@@ -173,16 +163,16 @@ def test_a_run_goes_out_and_comes_back_without_a_map(tmp_path, capsys):
         (["export", "runs", "--to", "mcap", "--robot", "nominal"], "--robot: it is of policies; --to mcap writes runs"),
     ],
 )
-def test_bad_words(bag, tmp_path, monkeypatch, capsys, words, message):
+def test_bad_words(mcap, tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
-    assert main([str(bag) if word == "LAB" else word for word in words]) == BAD_INPUT
+    assert main([str(mcap) if word == "LAB" else word for word in words]) == BAD_INPUT
     assert message in capsys.readouterr().err
 
 
-def test_missing_packages_are_named_with_the_extra(bag, monkeypatch, capsys, tmp_path):
+def test_missing_packages_are_named_with_the_extra(mcap, monkeypatch, capsys, tmp_path):
     import importlib.util
 
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "rosbags" else find(name, *rest))
-    assert main(["import", str(bag), "--suggest", "--out", str(tmp_path / "runs")]) == BAD_INPUT
+    assert main(["import", str(mcap), "--suggest", "--out", str(tmp_path / "runs")]) == BAD_INPUT
     assert "pip install 'wlr-gym[logs]'" in capsys.readouterr().err

@@ -10,7 +10,6 @@ from foreign_logs import (
     imu,
     joint_state,
     lab_map,
-    lab_messages,
     made_up,
     ns,
     pose,
@@ -25,16 +24,6 @@ from wlr_gym.data import read_run, write_run
 from wlr_gym.data.logs import export_run, import_log, suggest_map
 from wlr_gym.data.logs.messages import definition, make, typestore
 from wlr_gym.robot import JOINTS, LEGS
-
-
-@pytest.fixture(scope="module")
-def messages():
-    return lab_messages(made_up(8.0))
-
-
-@pytest.fixture(scope="module")
-def known(messages, tmp_path_factory):
-    return lab_map(write_mcap(tmp_path_factory.mktemp("whole") / "a.mcap", messages))
 
 
 @pytest.fixture(scope="module")
