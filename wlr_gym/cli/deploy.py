@@ -340,8 +340,6 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
     from wlr_gym.hardware.config import load_hardware
 
     hardware = load_hardware(options.hardware)
-    if hardware.flow is not None and hardware.flow.driver == "spi":
-        raise InputError(f"{options.hardware}: flow: driver = spi: no emulated port is one: add --stepped")
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
         links = Path(folder) / "ports"
         words = ["--links", str(links), "--hardware", options.hardware, "--seed", str(options.seed)]

@@ -296,18 +296,16 @@ FlowAxis = Literal["x", "-x", "y", "-y"]
 
 
 class FlowPort(SettingsModel):
-    """The optical-flow sensor: frames from a microcontroller's serial port (``stream``), or the chip on SPI (``spi``).
-
-    Its numbers stand in the robot's file (``sensors.flow``).
+    """The optical-flow sensor: frames from a microcontroller's serial port. Its numbers stand in the robot's file.
 
     Attributes:
-        port: serial device, or SPI device (``/dev/spidev0.0``).
-        baud_rate: of the stream, bit/s.
+        port: serial device.
+        baud_rate: bit/s.
         axes: which of the chip's axes count up when the robot drives along body +x, and along body +y.
     """
 
     port: str
-    driver: Literal["stream", "spi"] = "stream"
+    driver: Literal["stream"] = "stream"
     baud_rate: int = Field(default=115200, gt=0)
     axes: tuple[FlowAxis, FlowAxis] = ("-y", "-x")
     calibration: FlowCalibration = FlowCalibration()

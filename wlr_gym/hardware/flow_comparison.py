@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.runs import Run
 from wlr_gym.hardware.config import FlowCalibration
-from wlr_gym.hardware.flow import Flow, FlowReading
+from wlr_gym.hardware.flow import FlowReading, FlowStream
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 
 Array = NDArray[np.float64]
@@ -67,7 +67,7 @@ class FlowSupervision:
         robot: whose it is.
     """
 
-    def __init__(self, flow: Flow, robot: Robot) -> None:
+    def __init__(self, flow: FlowStream, robot: Robot) -> None:
         self._flow, self._robot = flow, robot
         assert robot.sensors.flow is not None
         self._lens = np.array(robot.sensors.flow.position)

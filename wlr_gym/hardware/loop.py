@@ -31,14 +31,13 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import Profile, RunMeta
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
-from wlr_gym.hardware.link import Link
+from wlr_gym.hardware.link import Link, Sensing
 from wlr_gym.hardware.log import RunRecorder, sensors_of
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.preflight import NotReadyError
 from wlr_gym.hardware.safety.rules import REQUESTS, Decision, Level, RobotStatus, Verdict, resting
 from wlr_gym.hardware.safety.watchdog import Guard
-from wlr_gym.hardware.sensing import Sensing
 from wlr_gym.hardware.timing import Clock, Pacer
 from wlr_gym.physics.plants.base import RobotOptions, Sensors
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEELS, Robot

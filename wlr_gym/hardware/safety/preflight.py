@@ -24,7 +24,7 @@ from wlr_gym.hardware.camera.reading import CameraFile, CameraReader, CameraRead
 from wlr_gym.hardware.config import FIXED_REGISTERS, Bus, FlowPort, Hardware, ImuPort
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import error_names, load_table
-from wlr_gym.hardware.flow import Flow
+from wlr_gym.hardware.flow import FlowStream
 from wlr_gym.hardware.imu import STANDARD_GRAVITY, Imu, ImuGoneError
 from wlr_gym.hardware.safety.camera import LARGEST_AGE, LARGEST_SIGMA
 from wlr_gym.hardware.serial_frames import PortInUseError, is_pseudo_terminal
@@ -139,7 +139,7 @@ class Check(NamedTuple):
 # ---- ports ----
 
 
-def open_ports(servos: Servos, imu: Imu, hardware: Hardware, flow: Flow | None = None) -> list[Check]:
+def open_ports(servos: Servos, imu: Imu, hardware: Hardware, flow: FlowStream | None = None) -> list[Check]:
     """Open every port that can be opened, and say which could not: a check per port. Who called closes them."""
     checks = []
     ports = {name: (group.open, hardware.buses[name].port) for name, group in servos.groups.items()}
@@ -490,7 +490,7 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
     return checks + _check_rest(samples)
 
 
-def check_flow(flow: Flow, port: FlowPort, clock: Clock) -> list[Check]:
+def check_flow(flow: FlowStream, port: FlowPort, clock: Clock) -> list[Check]:
     """Listen to the optical-flow sensor of a robot that stands still on its floor.
 
     Args:
