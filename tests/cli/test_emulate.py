@@ -12,7 +12,7 @@ import pytest
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import emulate, main
 from wlr_gym.hardware.calibration import find_sign
-from wlr_gym.hardware.emulator.machine import run_command
+from wlr_gym.hardware.emulator.server import run_command
 from wlr_gym.robot import JOINTS, LEGS
 
 pytest.importorskip("termios")

@@ -35,7 +35,7 @@ from wlr_gym.hardware.dynamixel import tables
 from wlr_gym.hardware.emulator import MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
-from wlr_gym.hardware.emulator.machine import EmulatedStand
+from wlr_gym.hardware.emulator.stand import EmulatedStand
 
 NOMINAL = load_hardware()
 ROBOT = load_robot(NOMINAL.robot or "nominal")

@@ -13,7 +13,7 @@ from wlr_gym.hardware.dynamixel import protocol
 from wlr_gym.hardware.dynamixel.protocol import BROADCAST, Error, Instruction, Packet, Parser, Status, word
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
-from wlr_gym.hardware.emulator.machine import run_command
+from wlr_gym.hardware.emulator.server import run_command
 from wlr_gym.hardware.imu import IMU_FRAMES, accel_per_count
 from wlr_gym.hardware.serial_frames import FrameParser
 from wlr_gym.physics.plants import make_plant
@@ -73,7 +73,6 @@ def test_read_write_and_errors_on_the_line(machine):
     assert statuses(machine, protocol.read(2, 65, 1)) == [Status(2, 0, b"\1")]
     assert statuses(machine, protocol.write(2, 65, b"\2"))[0].fault == Error.DATA_RANGE
     assert statuses(machine, protocol.encode(2, 0x77))[0].fault == Error.INSTRUCTION
-    assert statuses(machine, protocol.encode(2, Instruction.ACTION))[0].fault == Error.INSTRUCTION
     assert statuses(machine, protocol.encode(2, Instruction.READ, b"\1"))[0].fault == Error.DATA_LENGTH
 
 
@@ -88,14 +87,6 @@ def test_broadcasts_act_without_answer(machine):
     assert ask(machine, protocol.write(BROADCAST, 65, b"\1")) == []
     assert all(machine.servos[joint]["led"] == 1 for joint in JOINTS[:4])
     assert ask(machine, protocol.read(BROADCAST, 65, 1)) == []
-
-
-def test_reg_write_and_action_by_broadcast_move_all_at_once(machine):
-    for id in LEG_IDS:
-        statuses(machine, protocol.encode(id, Instruction.REG_WRITE, b"\x41\0\1"))
-    assert not any(machine.servos[joint]["led"] for joint in JOINTS[:4])
-    assert ask(machine, protocol.encode(BROADCAST, Instruction.ACTION)) == []
-    assert all(machine.servos[joint]["led"] for joint in JOINTS[:4])
 
 
 def test_sync_and_bulk_writes_are_silent_even_when_refused(machine):
@@ -139,17 +130,10 @@ def test_old_firmware_knows_no_fast_reads():
 
 def test_reboot_takes_its_time(machine):
     write(machine, "leg_lf", led=1)
-    assert statuses(machine, protocol.reboot(2)) == [Status(2, 0, b"")]
+    assert statuses(machine, protocol.encode(2, Instruction.REBOOT)) == [Status(2, 0, b"")]
     assert statuses(machine, protocol.ping(2)) == []
     machine.advance(0.35)
     assert statuses(machine, protocol.read(2, 65, 1)) == [Status(2, 0, b"\0")]
-
-
-def test_factory_reset_of_all_is_refused_for_everything(machine):
-    assert statuses(machine, protocol.encode(BROADCAST, Instruction.FACTORY_RESET, b"\xff")) == []
-    assert machine.servos["leg_lf"]["id"] == 2
-    assert statuses(machine, protocol.encode(2, Instruction.FACTORY_RESET, b"\xff"))[0].fault == Error.NONE
-    assert machine.servos["leg_lf"]["id"] == 1
 
 
 def test_shadow_id_obeys_without_answer(machine):
@@ -342,13 +326,6 @@ def test_pwm_mode_gives_the_speed_of_that_voltage(machine):
     assert machine.servos["wheel_lf"]["present_pwm"] == pytest.approx(442, abs=15)
 
 
-def test_current_mode_gives_that_current_at_rest(machine):
-    write(machine, "leg_lf", operating_mode=0, torque_enable=1)
-    write(machine, "leg_lf", goal_current=12)  # 0.07 N m, less than the gear's dry friction
-    machine.advance(0.1)
-    assert machine.servos["leg_lf"]["present_current"] == pytest.approx(12, abs=1)
-
-
 def test_current_mode_in_motion_lags_by_the_back_emf_of_one_tick(machine):
     write(machine, "leg_lf", operating_mode=0, torque_enable=1, goal_current=100)
     machine.advance(0.05)
@@ -457,20 +434,20 @@ def test_probability_is_kept(machine):
 
 
 def test_noise_echo_delay_and_deaf(machine):
+    raw, receive = protocol.ping(2), machine.lines["legs"].receive
     machine.inject("noise value=8")
-    (emission,) = machine.lines["legs"].receive(protocol.ping(2), 0.0)
+    (emission,) = receive(raw, 0.0)
     assert len(emission.data) == 8 + 14
     machine.clear()
     machine.inject("echo legs")
-    raw = protocol.ping(2)
     assert ask(machine, raw) == [Packet(2, Instruction.PING, b""), Packet(2, Instruction.STATUS, b"\0\x6a\x04\x2d")]
     machine.clear()
     machine.inject("late value=0.07")
-    assert machine.lines["legs"].receive(raw, 0.0)[0].time == pytest.approx(0.07)
+    assert receive(raw, 0.0)[0].time == pytest.approx(0.07)
     machine.clear()
     machine.inject("deaf leg_lf")
-    assert machine.lines["legs"].receive(raw, 0.0) == []
-    assert machine.lines["legs"].receive(protocol.ping(3), 0.0)
+    assert receive(raw, 0.0) == []
+    assert receive(protocol.ping(3), 0.0)
 
 
 def test_brownout_reboots_the_servos_named(machine):

@@ -16,13 +16,7 @@ MANUAL = {
     "read": (protocol.read(1, 132, 4), "FF FF FD 00 01 07 00 02 84 00 04 00 1D 15"),
     "write": (protocol.write(1, 116, b"\x00\x02\x00\x00"), "FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89"),
     "write status": (protocol.encode_status(1, 0), "FF FF FD 00 01 04 00 55 00 A1 0C"),
-    "reg write": (
-        protocol.encode(1, Instruction.REG_WRITE, b"\x68\x00\xc8\x00\x00\x00"),
-        "FF FF FD 00 01 09 00 04 68 00 C8 00 00 00 AE 8E",
-    ),
-    "action": (protocol.encode(1, Instruction.ACTION), "FF FF FD 00 01 03 00 05 02 CE"),
-    "factory reset": (protocol.encode(1, Instruction.FACTORY_RESET, b"\x01"), "FF FF FD 00 01 04 00 06 01 A1 E6"),
-    "reboot": (protocol.reboot(1), "FF FF FD 00 01 03 00 08 2F 4E"),
+    "reboot": (protocol.encode(1, Instruction.REBOOT), "FF FF FD 00 01 03 00 08 2F 4E"),
     "clear": (protocol.encode(1, Instruction.CLEAR, protocol.CLEAR_TURNS), "FF FF FD 00 01 08 00 10 01 44 58 4C 22 B1 DC"),
     "sync read": (protocol.sync_read(132, 4, (1, 2)), "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA"),
     "sync write": (

@@ -76,18 +76,6 @@ def test_row(model, name):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_factory_reset_keeps_what_it_is_told_to(model):
-    for keep, id, baud in ((0x02, 9, 3), (0x01, 9, 1), (0xFF, 1, 1)):
-        servo = make(model)
-        for name, count in (("id", 9), ("baud_rate", 3), ("return_delay_time", 0)):
-            write(servo, name, count)
-        assert servo.factory_reset(keep) == Error.NONE
-        assert not servo.answers
-        assert (servo["id"], servo["baud_rate"], servo["return_delay_time"]) == (id, baud, 250)
-    assert make(model).factory_reset(0x07) == Error.DATA_RANGE
-
-
-@pytest.mark.parametrize("model", MODELS)
 def test_reads_across_gaps_give_zeros_and_end_at_the_table(model):
     servo = make(model)
     assert servo.read(14, 6) == (Error.NONE, bytes(6))
@@ -158,11 +146,6 @@ def carry_out(servo, step):
         assert servo[rest[0]] == int(rest[2]), step
     elif verb == "write":
         assert write(servo, rest[0], int(rest[1])) == wanted, step
-    elif verb == "register":
-        item = servo.table[rest[0]]
-        assert servo.register(item.address, item.encode(int(rest[1]))) == wanted, step
-    elif verb == "action":
-        assert servo.action() == wanted, step
     elif verb == "clear":
         assert servo.clear(bytes([0x01, 0x44, 0x58, 0x4C, 0x22])) == wanted, step
     elif verb == "alert":

@@ -162,7 +162,7 @@ def _robot(options: CommissionOptions, robot: Robot, hardware: Hardware, ask: Ca
     from wlr_gym.hardware.commissioning.runner import EmulatedPerson
     from wlr_gym.hardware.commissioning.stand import TerminalPerson
     from wlr_gym.hardware.emulator.link import emulated_link
-    from wlr_gym.hardware.emulator.machine import EmulatedStand
+    from wlr_gym.hardware.emulator.stand import EmulatedStand
 
     if not options.emulated:
         options.refuse_effects(options.patch())

@@ -6,6 +6,7 @@ Prints the ports and runs until Ctrl-C. Type a fault (``drop wheels probability=
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,6 @@ from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import PatchOption, Seconds, Seed
 from wlr_gym.robot import load_robot
-from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     from wlr_gym.hardware.emulator import Machine, Server
@@ -70,16 +70,19 @@ def run(options: EmulateOptions) -> int:
     with Server(machine, real_time=not options.stepped, links=options.links, control=options.control) as server:
         if options.poses is not None:
             machine.watchers.append(FeedWriter(machine, options.poses, lambda: server.origin))
-        _print_ports(server, options.links)
+        for name, path in server.ports.items():
+            bus, sensor = machine.hardware.buses.get(name), "the IMU" if name == "imu" else name
+            text = f"{bus.model}, {bus.baud_rate} bit/s: {', '.join(bus.joints)}" if bus else f"frames of {sensor}"
+            print(f"{name:8} {options.links / name if options.links else path}  {text}", flush=True)
         try:
             _take_commands(server, options.seconds)
         except KeyboardInterrupt:
             print("stopped")
+    machine.close()
     if server.failure is not None:
         raise server.failure
     if server.slipped > 0.0:
         print(f"this computer was too busy: emulated time fell behind by {server.slipped:.2f} s", file=sys.stderr)
-    machine.close()
     return OK
 
 
@@ -93,8 +96,7 @@ def machine_of(options: EmulateOptions) -> Machine:
     from wlr_gym.hardware.emulator import Machine, MachineOptions
     from wlr_gym.hardware.emulator.line import NO_TIME, LineTiming
     from wlr_gym.hardware.emulator.link import with_flow_port
-    from wlr_gym.hardware.emulator.machine import EmulatedStand
-    from wlr_gym.physics.effects import apply_patch
+    from wlr_gym.hardware.emulator.stand import EmulatedStand
     from wlr_gym.physics.plants import check_simulator
 
     check_simulator(options.backend, "--backend")
@@ -107,25 +109,16 @@ def machine_of(options: EmulateOptions) -> Machine:
         factory=options.factory,
         timing=timing,
     )
-    hardware, patch = load_hardware(options.hardware), options.patch()
+    hardware, effects = load_hardware(options.hardware), options.patch()
     robot = load_robot(options.robot or hardware.robot or "nominal")
     hardware = with_flow_port(robot, hardware)
     if options.stand:
-        machine = EmulatedStand(robot, hardware, patch, options=machine_options).machine
+        machine = EmulatedStand(robot, hardware, effects, options=machine_options).machine
     else:
-        parameters = apply_patch(patch, Parameters.nominal(robot, 1))
-        machine = Machine(robot, hardware, machine_options, parameters=parameters, forces=patch.forces)
+        machine = Machine(robot, hardware, machine_options, effects=effects)
     for fault in options.fault:
         machine.inject(fault)
     return machine
-
-
-def _print_ports(server: Server, links: Path | None) -> None:
-    buses = server.machine.hardware.buses
-    for name, path in server.ports.items():
-        bus, sensor = buses.get(name), "the IMU" if name == "imu" else name
-        text = f"{bus.model}, {bus.baud_rate} bit/s: {', '.join(bus.joints)}" if bus else f"frames of {sensor}"
-        print(f"{name:8} {links / name if links else path}  {text}", flush=True)
 
 
 def _take_commands(server: Server, seconds: float) -> None:
@@ -137,7 +130,9 @@ def _take_commands(server: Server, seconds: float) -> None:
     import time
 
     end = time.monotonic() + seconds if seconds > 0.0 else math.inf
-    source = _standard_input()
+    source = None
+    with contextlib.suppress(AttributeError, OSError, ValueError):  # there may be no standard input
+        source = sys.stdin.fileno()
     text = b""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that links are removed then too
     while (left := end - time.monotonic()) > 0.0 and server.failure is None:
@@ -154,11 +149,3 @@ def _take_commands(server: Server, seconds: float) -> None:
                     said = f"error: {error}"
                 print(said, flush=True)
             source = source if data else None
-
-
-def _standard_input() -> int | None:
-    """File descriptor of the standard input; None where there is none."""
-    try:
-        return sys.stdin.fileno()
-    except (AttributeError, OSError, ValueError):
-        return None

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.excitations import Motion
 from wlr_gym.hardware.loop import ControlLoop, StoppedError
 from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.hardware.plant import RobotPlant
@@ -23,6 +22,7 @@ from wlr_gym.robot import JOINTS, LEG_SLICE
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
+    from wlr_gym.data.excitations import Motion
     from wlr_gym.envs.core import Core
     from wlr_gym.policy import Policy
 
@@ -182,6 +182,8 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     Raises:
         InputError: the robot waits for an operator's signs, which nobody gives here.
     """
+    from wlr_gym.data.record import start_setpoints
+
     refuse_deadman(plant)
     loop, robot = plant.loop, plant.robot
     state = standing_state(robot, Parameters.nominal(robot))

@@ -119,14 +119,13 @@ class CountedMotion(NamedTuple):
     end: float
 
 
-class FlowStream:
+class FlowStream(FrameStream):
     """A connected flow sensor. One thread owns it.
 
     Args:
         port: device, baud rate, axes, calibration.
         sensor: of the robot's file.
-        clock: s; what ages are told by.
-        make_device: opens the port; the emulator in memory puts its own here.
+        clock, make_device: see :class:`wlr_gym.hardware.serial_frames.FrameStream`.
 
     Attributes:
         statistics: what came since the port was opened.
@@ -139,30 +138,16 @@ class FlowStream:
         clock: Callable[[], float] = time.monotonic,
         make_device: Callable[[str, int, str], Device] = SerialDevice,
     ) -> None:
-        self._path, self._sensor, self._clock = port.port, sensor, clock
-        self._stream = FrameStream(FLOW_FRAMES, port.port, port.baud_rate, "flow port", clock, make_device, repeats=False)
-        self._convert = FlowConversion(port, sensor)
-        self._begin()
+        super().__init__(FLOW_FRAMES, port.port, port.baud_rate, "flow port", clock, make_device, repeats=False)
+        self._sensor, self._convert = sensor, FlowConversion(port, sensor)
 
     def _begin(self) -> None:
+        super()._begin()
         self.statistics = FlowStatistics()
         self._flow = np.zeros(2)
         self._end = self._last_frame = self._clock()
         self._seen: tuple[int, int, int, int] | None = None
         self._repeats = 0
-
-    def open(self) -> None:
-        """Open the port and throw away what piled up in it.
-
-        Raises:
-            InputError: it is not there, cannot be opened, or another program has it.
-        """
-        self._stream.open()
-        self._begin()
-
-    def close(self) -> None:
-        """Close the port."""
-        self._stream.close()
 
     def read(self) -> FlowReading:
         """Return the mean over what came since the last reading, for a control step; does not wait.
@@ -171,11 +156,11 @@ class FlowStream:
         """
         frames, trouble = [], ""
         try:
-            frames = self._stream.read()
+            frames = self.frames()
         except ConnectionError as error:
-            trouble = f"no port: {self._path} is {error}"
-        found, parser, now = self.statistics, self._stream.parser, self._clock()
-        found.lost, found.errors = parser.lost, parser.crc_errors
+            trouble = f"no port: {self.path} is {error}"
+        found, now = self.statistics, self._clock()
+        found.lost, found.errors = self.parser.lost, self.parser.crc_errors
         good: list[CountedMotion] = []
         for (_, _, microseconds, *counted), end in frames:
             if end is None:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.hardware.config import ImuCalibration, ImuPort
-from wlr_gym.hardware.serial_frames import Device, FrameFormat, FrameStream, SerialDevice, lock
+from wlr_gym.hardware.serial_frames import TAKEN, Device, FrameFormat, FrameStream, PortInUseError, SerialDevice
 from wlr_gym.physics.plants.sensors import rotation
 
 Array = NDArray[np.float64]
@@ -120,13 +120,12 @@ class Conversion:
         return to_counts(force, self._accel_count), to_counts(rate, self._gyro_count)
 
 
-class ImuStream:
+class ImuStream(FrameStream):
     """The IMU behind a microcontroller.
 
     Args:
         port: device, baud rate, ranges, calibration.
-        clock: s; what ages are told by.
-        make_device: opens the port; the emulator in memory puts its own here.
+        clock, make_device: see :class:`wlr_gym.hardware.serial_frames.FrameStream`.
 
     Attributes:
         statistics: what came since the port was opened.
@@ -138,27 +137,13 @@ class ImuStream:
         clock: Callable[[], float] = time.monotonic,
         make_device: Callable[[str, int, str], Device] = SerialDevice,
     ) -> None:
-        self._path, self._clock = port.port, clock
-        self._stream = FrameStream(IMU_FRAMES, port.port, port.baud_rate, "IMU port", clock, make_device)
+        super().__init__(IMU_FRAMES, port.port, port.baud_rate, "IMU port", clock, make_device)
         self._convert = Conversion(port)
-        self._begin()
 
     def _begin(self) -> None:
+        super()._begin()
         self.statistics = ImuStatistics()
         self._newest: tuple[Sequence[int], float] | None = None
-
-    def open(self) -> None:
-        """Open the port and throw away what piled up in it.
-
-        Raises:
-            InputError: it is not there, cannot be opened, or another program has it.
-        """
-        self._begin()
-        self._stream.open()
-
-    def close(self) -> None:
-        """Close the port."""
-        self._stream.close()
 
     def read(self) -> ImuReading | None:
         """Return the newest reading without waiting for one; None = nothing has come yet, or nobody knows how old it is.
@@ -167,12 +152,12 @@ class ImuStream:
             ImuGoneError: the port is gone.
         """
         try:
-            frames = self._stream.read()
+            frames = self.frames()
         except ConnectionError as error:
-            raise ImuGoneError(f"IMU port {self._path} is {error}") from None
-        found, parser = self.statistics, self._stream.parser
+            raise ImuGoneError(f"IMU port {self.path} is {error}") from None
+        found = self.statistics
         found.readings += len(frames)
-        found.lost, found.errors, found.restarts = parser.lost, parser.crc_errors, self._stream.restarts
+        found.lost, found.errors, found.restarts = self.parser.lost, self.parser.crc_errors, self.restarts
         if frames:
             (_, _, *burst), taken = frames[-1]
             self._newest = None if taken is None else (burst, taken)
@@ -201,10 +186,8 @@ RELATIVES = {0x70: "MPU-6500", 0x71: "MPU-9250", 0x73: "MPU-9255", 0x98: "ICM-20
 FILTERS = {184: 1, 94: 2, 44: 3, 21: 4, 10: 5, 5: 6}
 #: Hz before the divider.
 _SAMPLING = 1000.0
-#: POWER_1: reset.
-_RESET = 0x80
-#: POWER_1: clocked by the gyroscope.
-_GYRO_CLOCK = 0x01
+#: POWER_1: reset; awake, on the gyroscope's oscillator: steadier than the internal one.
+_RESET, _GYRO_CLOCK = 0x80, 0x01
 #: INTERRUPT_STATUS: new values.
 _DATA_READY = 0x01
 #: s the chip needs after a reset.
@@ -227,7 +210,7 @@ class I2cBus(Protocol):
 def registers(port: ImuPort) -> dict[int, int]:
     """Return register -> value of a set-up, in the order they are written."""
     return {
-        POWER_1: _GYRO_CLOCK,  # awake, on the gyroscope's oscillator: steadier than the internal one
+        POWER_1: _GYRO_CLOCK,
         CONFIG: FILTERS[port.bandwidth],
         SAMPLE_RATE_DIVIDER: round(_SAMPLING / port.rate) - 1,
         GYRO_CONFIG: (250, 500, 1000, 2000).index(port.gyro_range) << 3,
@@ -251,10 +234,13 @@ def open_bus(path: str) -> I2cBus:
         hint = "switch I2C on in the system's settings and join the group 'i2c'"
         raise InputError(f"IMU bus {path}: cannot be opened: {error}; {hint}") from None
     try:
-        lock(bus.fd, path, "IMU bus")
-    except InputError:
-        bus.close()
-        raise
+        import fcntl
+
+        fcntl.flock(bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed
+    except OSError as error:
+        if error.errno in TAKEN:
+            bus.close()
+            raise PortInUseError(path, "IMU bus") from None
     return bus
 
 
@@ -298,30 +284,27 @@ class Mpu6050:
             InputError: nobody answers, another chip answers, or a register did not take its value.
         """
         self._reset()
-        self._bus = self._make_bus(self._port.port)
+        self._bus = bus = self._make_bus(self._port.port)
+        address, where = self._port.address, self._where()
         try:
-            self._set_up(self._bus)
+            found = bus.read_byte_data(address, WHO_AM_I)
+            if found != IDENTITY:
+                name = RELATIVES.get(found, "an unknown chip")
+                raise InputError(f"{where}: WHO_AM_I is {found:#04x} ({name}), expected {IDENTITY:#04x} (MPU-6050)")
+            bus.write_byte_data(address, POWER_1, _RESET)
+            self._sleep(RESET_TIME)
+            for register, value in registers(self._port).items():
+                bus.write_byte_data(address, register, value)
+            for register, value in registers(self._port).items():
+                if (found := bus.read_byte_data(address, register)) != value:
+                    raise InputError(f"{where}: register {register:#04x} reads {found:#04x} after {value:#04x} was written")
         except OSError as error:
             self.close()
             hint = "check wiring, supply and the AD0 pin (low: 0x68, high: 0x69); i2cdetect lists who answers"
-            raise InputError(f"{self._where()}: no answer ({error}); {hint}") from None
+            raise InputError(f"{where}: no answer ({error}); {hint}") from None
         except InputError:
             self.close()
             raise
-
-    def _set_up(self, bus: I2cBus) -> None:
-        address = self._port.address
-        found = bus.read_byte_data(address, WHO_AM_I)
-        if found != IDENTITY:
-            name = RELATIVES.get(found, "an unknown chip")
-            raise InputError(f"{self._where()}: WHO_AM_I is {found:#04x} ({name}), expected {IDENTITY:#04x} (MPU-6050)")
-        bus.write_byte_data(address, POWER_1, _RESET)
-        self._sleep(RESET_TIME)
-        for register, value in registers(self._port).items():
-            bus.write_byte_data(address, register, value)
-        for register, value in registers(self._port).items():
-            if (found := bus.read_byte_data(address, register)) != value:
-                raise InputError(f"{self._where()}: register {register:#04x} reads {found:#04x} after {value:#04x} was written")
 
     def _where(self) -> str:
         return f"IMU at {self._port.address:#04x} on {self._port.port}"

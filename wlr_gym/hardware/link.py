@@ -57,11 +57,7 @@ class Link:
         return [device for device in (self.servos, self.imu, self.flow, self.camera) if device is not None]
 
     def open(self) -> None:
-        """Open all ports, or none.
-
-        Raises:
-            InputError: a port is not there, or cannot be opened.
-        """
+        """Open all ports, or none; see :class:`wlr_gym.hardware.serial_frames.SerialDevice`."""
         with contextlib.ExitStack() as stack:
             for device in self._devices():
                 device.open()
@@ -126,11 +122,7 @@ class Sensing:
 
     @property
     def known(self) -> RobotStatus:
-        """What was last read.
-
-        Raises:
-            InputError: nothing yet.
-        """
+        """What was last read; an :class:`InputError` before :meth:`first`."""
         if self.status is None:
             raise InputError("the robot has not been started")
         return self.status

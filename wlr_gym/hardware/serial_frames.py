@@ -14,22 +14,22 @@ import select
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 from wlr_gym.base.errors import InputError, require_package
 
 try:
-    import fcntl
     import termios
 
     _FAILURES: tuple[type[Exception], ...] = (OSError, termios.error)
 except ImportError:  # not on Windows
-    fcntl = None
     _FAILURES = (OSError,)
 
 #: What a lock that is taken says, and a device that another program has opened for itself alone.
-_TAKEN = (errno.EWOULDBLOCK, errno.EBUSY)
+TAKEN = (errno.EWOULDBLOCK, errno.EBUSY)
 #: Bytes taken at once, as systems give them; reads until a port must be empty (256 kB).
 _CHUNK, _LARGEST_BACKLOG = 4096, 64
 #: s since the port was last empty, up to which frames are hardly older than that: they relate the clocks.
@@ -42,21 +42,6 @@ class PortInUseError(InputError):
 
     def __init__(self, path: str, name: str) -> None:
         super().__init__(f"{name} {path} is in use by another program: two readers would steal each other's answers")
-
-
-def lock(descriptor: int, path: str, name: str = "port") -> None:
-    """Keep other programs of this library off a device until it is closed or its process ends (not on Windows).
-
-    Raises:
-        PortInUseError: another program has it.
-    """
-    if fcntl is None:
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in _TAKEN:
-            raise PortInUseError(path, name) from None
 
 
 def is_pseudo_terminal(path: str) -> bool:
@@ -99,7 +84,7 @@ class SerialDevice:
             self.serial: serial.Serial = serial.Serial(path, baud_rate, timeout=0, exclusive=True)
         except _FAILURES as error:
             number = getattr(error, "errno", None)
-            if number in _TAKEN:
+            if number in TAKEN:
                 raise PortInUseError(path, name) from None
             reason = os.strerror(number) if number else str(error)  # pyserial says it twice, and the path with it
             hint = "" if Path(path).exists() else "; see wlr doctor"
@@ -107,13 +92,8 @@ class SerialDevice:
 
     def received(self) -> bytes:
         """Return all bytes that have come; does not wait."""
-        data = b""
-        for _ in range(_LARGEST_BACKLOG):
-            part = self.serial.read(_CHUNK)
-            data += part
-            if not part:
-                break
-        return data
+        parts = iter(partial(self.serial.read, _CHUNK), b"")
+        return b"".join(islice(parts, _LARGEST_BACKLOG))
 
     def wait(self, seconds: float) -> bytes:
         """Return bytes as soon as there are some; none when the time is over."""
@@ -300,6 +280,7 @@ class FrameStream:
         repeats: see :class:`FrameParser`.
 
     Attributes:
+        path: of the port.
         parser: counts what is lost and broken.
         restarts: times the microcontroller's clock began anew.
     """
@@ -315,25 +296,21 @@ class FrameStream:
         *,
         repeats: bool = True,
     ) -> None:
-        self._port = (path, baud_rate, name)
+        self.path, self._baud_rate, self._name = path, baud_rate, name
         self._clock, self._make_device = clock, make_device
-        self._make_parser: Callable[[], FrameParser] = lambda: FrameParser(format, repeats=repeats)
-        self._device: Any = None
+        self._make_parser = partial(FrameParser, format, repeats=repeats)
+        self._device: Device | None = None
         self._begin()
 
     def _begin(self) -> None:
-        self.parser: FrameParser = self._make_parser()
+        self.parser = self._make_parser()
         self._stream_clock = StreamClock()
         self.restarts = 0
         self._emptied_at = self._clock()
 
     def open(self) -> None:
-        """Open the port and throw away what piled up in it; counts begin anew.
-
-        Raises:
-            InputError: it is not there, cannot be opened, or another program has it.
-        """
-        self._device = self._make_device(*self._port)
+        """Open the port (see :class:`SerialDevice`) and throw away what piled up in it; counts begin anew."""
+        self._device = self._make_device(self.path, self._baud_rate, self._name)
         self._device.reset_input_buffer()
         self._begin()
 
@@ -343,13 +320,18 @@ class FrameStream:
             self._device.close()
             self._device = None
 
-    def read(self) -> list[TimedFrame]:
+    def frames(self) -> list[TimedFrame]:
         """Return the frames that have come since the last call; does not wait.
 
         Raises:
             ConnectionError: the port is not open, or is gone.
         """
-        frames = self.parser.feed(self._received())
+        if self._device is None:
+            raise ConnectionError("not open")
+        try:
+            frames = self.parser.feed(self._device.received())
+        except OSError as error:
+            raise ConnectionError(f"gone: {error}") from None
         now = self._clock()
         is_recent, self._emptied_at = now - self._emptied_at <= _RECENT, now
         if not frames:
@@ -360,11 +342,3 @@ class FrameStream:
         if age is None:  # a backlog: nobody knows how old it is
             return [TimedFrame(frame, None) for frame in frames]
         return [TimedFrame(frame, now - age - ((last - frame[1]) % 2**32) * 1e-6) for frame in frames]
-
-    def _received(self) -> bytes:
-        if self._device is None:
-            raise ConnectionError("not open")
-        try:
-            return self._device.received()
-        except OSError as error:
-            raise ConnectionError(f"gone: {error}") from None

@@ -168,7 +168,7 @@ class Servos:
     ) -> None:
         check_fit(robot, hardware)
         self.joint_map: JointMap = JointMap(robot, hardware)
-        self._ids = [robot.dynamixel_ids[joint] for joint in JOINTS]
+        self._ids = {joint: robot.dynamixel_ids[joint] for joint in JOINTS}
         self._bus_of = {joint: name for name, bus in hardware.buses.items() for joint in bus.joints}
         self.groups: dict[str, BusGroup] = {}
         self.ports: dict[str, str] = {name: bus.port for name, bus in hardware.buses.items()}
@@ -185,11 +185,7 @@ class Servos:
             self._health[name] = Block(table, *_HEALTH)
 
     def open(self) -> None:
-        """Open all ports, or none.
-
-        Raises:
-            InputError: a port is not there, or cannot be opened.
-        """
+        """Open all ports, or none; see :class:`wlr_gym.hardware.serial_frames.SerialDevice`."""
         with contextlib.ExitStack() as stack:
             for group in self.groups.values():
                 group.open()
@@ -219,7 +215,7 @@ class Servos:
         """Have the servos' registers read with every :meth:`read` from here on. Torque must be off."""
         for joint in JOINTS:
             block = self._supervised[self._bus_of[joint]]
-            _persist(self._group(joint).point, self._id(joint), block)
+            _persist(self._group(joint).point, self._ids[joint], block)
         self._is_supervised = True
 
     def unsupervise(self) -> None:
@@ -230,7 +226,7 @@ class Servos:
         """Read all joints; the buses work at the same time."""
         readings = self._read(self._supervised if self._is_supervised else self._motion)
         items = (*_STATE, *_REGISTERS) if self._is_supervised else _STATE
-        rows = [_row(readings.get(id), items) for id in self._ids]
+        rows = [_row(readings.get(id), items) for id in self._ids.values()]
         age, effort, position, velocity, *registers = np.array([numbers for numbers, _ in rows]).T
         flags = np.array([flags for _, flags in rows]).T
         convert = self.joint_map
@@ -249,7 +245,7 @@ class Servos:
         """Return supply voltages (8,) in V and temperatures (8,) in degC; NaN where a servo did not answer."""
         readings = self._read(self._health)
         values = np.full((2, len(JOINTS)), np.nan)
-        for k, id in enumerate(self._ids):
+        for k, id in enumerate(self._ids.values()):
             if id in readings:
                 counts = readings[id].counts
                 values[:, k] = counts["present_input_voltage"] * 0.1, counts["present_temperature"]
@@ -267,28 +263,25 @@ class Servos:
 
     def ping(self, joint: str) -> tuple[int, int]:
         """Return a joint's model number and firmware version; see :meth:`BusGroup.ping`."""
-        return _persist(self._group(joint).ping, self._id(joint))
+        return _persist(self._group(joint).ping, self._ids[joint])
 
     def get(self, joint: str, item: str) -> int:
         """Return the count of a joint's control table item; see :meth:`BusGroup.read`. A lost answer is asked for again."""
-        return _persist(self._group(joint).read, self._id(joint), item)
+        return _persist(self._group(joint).read, self._ids[joint], item)
 
     def set(self, joint: str, item: str, count: int) -> None:
         """Write a count into a joint's control table item; see :meth:`BusGroup.write`. A lost answer is asked for again."""
-        _persist(self._group(joint).write, self._id(joint), item, count)
+        _persist(self._group(joint).write, self._ids[joint], item, count)
 
     def get_all(self, item: str) -> dict[str, int]:
         """Return joint -> count of an item, of the joints that answered; the buses work at the same time."""
         tables = {name: next(iter(group.servos.values())) for name, group in self.groups.items()}
         readings = self._read({name: Block(table, item, item) for name, table in tables.items()})
-        return {joint: readings[id].counts[item] for joint, id in zip(JOINTS, self._ids, strict=True) if id in readings}
-
-    def _id(self, joint: str) -> int:
-        return self._ids[JOINTS.index(joint)]
+        return {joint: readings[id].counts[item] for joint, id in self._ids.items() if id in readings}
 
     def table(self, joint: str) -> ControlTable:
         """Return a joint's control table."""
-        return self._group(joint).servos[self._id(joint)]
+        return self._group(joint).servos[self._ids[joint]]
 
     def _group(self, joint: str) -> BusGroup:
         if joint not in self._bus_of:
@@ -312,8 +305,7 @@ class Servos:
     def write_item(self, item: str, counts: Mapping[str, int]) -> None:
         """Write joint -> count of one item, all joints of a bus in one packet. Not acknowledged."""
         for name, group in self.groups.items():
-            here = {self._ids[JOINTS.index(joint)]: count for joint, count in counts.items() if self._bus_of[joint] == name}
-            if here:
+            if here := {self._ids[joint]: count for joint, count in counts.items() if self._bus_of[joint] == name}:
                 group.write_all(item, here)
 
     def torque_off_unacknowledged(self) -> None:
@@ -341,7 +333,7 @@ class Servos:
         """
         left: list[str] = []
         for name, group in self.groups.items():
-            here = {self._id(joint): joint for joint in joints if self._bus_of[joint] == name}
+            here = {self._ids[joint]: joint for joint in joints if self._bus_of[joint] == name}
             try:
                 left += [here[id] for id in group.torque_off(retries, here)]
             except BusGoneError:

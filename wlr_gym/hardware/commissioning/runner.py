@@ -21,7 +21,8 @@ from wlr_gym.hardware.commissioning.stand_tests import PartlyError, Reading, Sta
 from wlr_gym.hardware.config import Hardware, Measured, MeasuredValue
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
 from wlr_gym.hardware.emulator.link import emulated_link
-from wlr_gym.hardware.emulator.machine import EmulatedStand, MachineOptions
+from wlr_gym.hardware.emulator.machine import MachineOptions
+from wlr_gym.hardware.emulator.stand import EmulatedStand
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import stop_on_signals
 from wlr_gym.hardware.safety.preflight import check_servos

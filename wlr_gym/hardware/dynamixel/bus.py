@@ -6,8 +6,9 @@ import contextlib
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from wlr_gym.base.errors import InputError, require_package
@@ -34,11 +35,16 @@ class Block:
     def __init__(self, table: ControlTable, first: str, last: str) -> None:
         self.address, self.length = table.block(first, last)
         inside = [item for item in table.items.values() if self.address <= item.address < self.address + self.length]
-        self.names: tuple[str, ...] = tuple(item.name for item in inside)
-        pattern, place = "<", self.address
-        for item in inside:
-            pattern += f"{item.address - place}x" + _letter(item)
-            place = item.address + item.size
+        self._take(inside, [item.address - self.address for item in inside])
+
+    def _take(self, items: Sequence[Item], places: Iterable[int]) -> None:
+        """Note the items, and at which byte of the block each begins."""
+        self.names = tuple(item.name for item in items)
+        pattern, end = "<", 0
+        for item, place in zip(items, places, strict=True):
+            letter = {1: "b", 2: "h", 4: "i"}[item.size]
+            pattern += f"{place - end}x" + (letter if item.signed else letter.upper())
+            end = place + item.size
         self._struct = struct.Struct(pattern)
 
     def decode(self, data: bytes) -> dict[str, int]:
@@ -58,18 +64,12 @@ class IndirectBlock(Block):
     """
 
     def __init__(self, table: ControlTable, names: Iterable[str]) -> None:
-        self.names = tuple(names)
-        items = [table[name] for name in self.names]
+        items = [table[name] for name in names]
+        *starts, self.length = accumulate((item.size for item in items), initial=0)
         self.address = table["indirect_data_1"].address
-        self.length = sum(item.size for item in items)
+        self._take(items, starts)
         places = [item.address + k for item in items for k in range(item.size)]
         self.pointers: bytes = struct.pack(f"<{len(places)}H", *places)
-        self._struct = struct.Struct("<" + "".join(_letter(item) for item in items))
-
-
-def _letter(item: Item) -> str:
-    letter = {1: "b", 2: "h", 4: "i"}[item.size]
-    return letter if item.signed else letter.upper()
 
 
 @dataclass(frozen=True)
@@ -137,12 +137,10 @@ class TickClock:
 
 #: s an answer may take beyond its bytes' time on the wire: adapter's latency timer (1 ms) twice, and the scheduler.
 PATIENCE = 0.005
-#: Data bytes of a ping's answer: model number and firmware version.
-_PING_DATA = 3
-#: Time a servo waits for each id below its own before it answers a ping of all, ms.
-_PING_SPACING = 3.0
-#: Time for the first answer to a ping of all, ms.
-_PING_START = 16.0
+#: Data of a ping's answer: model number and firmware version.
+_IDENTITY = struct.Struct("<HB")
+#: ms until the first answer to a ping of all; ms that a servo waits for each id below its own before it answers.
+_PING_START, _PING_SPACING = 16.0, 3.0
 _ERROR_NAMES = {error.value: error.name.lower().replace("_", " ") + " error" for error in Error}
 
 
@@ -217,11 +215,7 @@ class BusGroup:
         self._asked_at = 0.0
 
     def open(self) -> None:
-        """Open the port.
-
-        Raises:
-            InputError: it is not there, or cannot be opened.
-        """
+        """Open the port; see :class:`wlr_gym.hardware.serial_frames.SerialDevice`."""
         self.port.openPort()
 
     def close(self) -> None:
@@ -243,19 +237,19 @@ class BusGroup:
 
     def ping(self, id: int) -> tuple[int, int]:
         """Return model number and firmware version."""
-        status = self._ask(id, protocol.ping(id), _PING_DATA, "ping")
-        return _identity(status)
+        return _IDENTITY.unpack(self._ask(id, protocol.ping(id), _IDENTITY.size, "ping").data)
 
     def scan(self) -> dict[int, tuple[int, int]]:
         """Return id -> (model number, firmware) of every servo that answers; takes about 0.8 s."""
         port = self.port
         port.send_packet(protocol.ping(), is_answered=True)
-        port.setPacketTimeoutMillis(protocol.MAX_ID * ((_PING_DATA + 11) * port.tx_time_per_byte + _PING_SPACING) + _PING_START)
+        answer_time = (_IDENTITY.size + 11) * port.tx_time_per_byte + _PING_SPACING
+        port.setPacketTimeoutMillis(protocol.MAX_ID * answer_time + _PING_START)
         found: dict[int, tuple[int, int]] = {}
         while (packet := port.next_answer()) is not None:
             status = protocol.as_status(packet)
-            if status is not None and len(status.data) == _PING_DATA:
-                found[status.id] = _identity(status)
+            if status is not None and len(status.data) == _IDENTITY.size:
+                found[status.id] = _IDENTITY.unpack(status.data)
         return dict(sorted(found.items()))
 
     def read(self, id: int, item: str) -> int:
@@ -269,10 +263,9 @@ class BusGroup:
         self._ask(id, protocol.write(id, row.address, row.encode(count)), 0, f"write {item} = {count}")
 
     def point(self, id: int, block: IndirectBlock) -> None:
-        """Make a servo's Indirect Data stand for the items of a block, and see that they do. A reboot undoes it.
+        """Make a servo's Indirect Data stand for the items of a block, and see that they do (else it counts as silent).
 
-        Raises:
-            NoAnswerError: also where it holds something else afterwards.
+        A reboot undoes it.
         """
         address = self._table(id)["indirect_address_1"].address
         self._ask(id, protocol.write(id, address, block.pointers), 0, "write indirect addresses")
@@ -388,8 +381,3 @@ class BusGroup:
     def _note_port(self) -> None:
         self.statistics.crc_errors = self.port.parser.crc_errors
         self.statistics.discarded = self.port.discarded
-
-
-def _identity(ping: Status) -> tuple[int, int]:
-    """Model number and firmware version in the answer to a ping."""
-    return int.from_bytes(ping.data[:2], "little"), ping.data[2]

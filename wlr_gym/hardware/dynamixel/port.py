@@ -133,11 +133,7 @@ class DynamixelPort(sdk.PortHandler):
     # ---- packets ----
 
     def send_packet(self, raw: bytes, *, is_answered: bool) -> None:
-        """Send a packet; what came in before it is forgotten where that could be taken for its answer.
-
-        Raises:
-            BusGoneError: the port is gone.
-        """
+        """Send a packet; what came in before it is forgotten where that could be taken for its answer."""
         if is_answered or self.suspect:
             self.clearPort()
         self.suspect = _GIVEN_UP if is_answered else 0

@@ -50,9 +50,6 @@ class Instruction(IntEnum):
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
-    REG_WRITE = 0x04
-    ACTION = 0x05
-    FACTORY_RESET = 0x06
     REBOOT = 0x08
     CLEAR = 0x10
     STATUS = 0x55
@@ -106,16 +103,6 @@ class Status(NamedTuple):
 # ---- encoding ----
 
 
-def stuff(body: bytes) -> bytes:
-    """Return instruction and parameters as they go over the line."""
-    return body.replace(_PATTERN, _STUFFED)
-
-
-def unstuff(body: bytes) -> bytes:
-    """Undo :func:`stuff`."""
-    return body.replace(_STUFFED, _PATTERN)
-
-
 def word(value: int) -> bytes:
     """Return two bytes, little-endian."""
     return value.to_bytes(2, "little")
@@ -123,7 +110,7 @@ def word(value: int) -> bytes:
 
 def encode(id: int, instruction: int, parameters: bytes = b"") -> bytes:
     """Return one packet as bytes for the line."""
-    body = stuff(bytes([instruction]) + parameters)
+    body = (bytes([instruction]) + parameters).replace(_PATTERN, _STUFFED)
     packet = HEADER + bytes([id]) + word(len(body) + 2) + body
     return packet + word(crc16(packet))
 
@@ -146,11 +133,6 @@ def read(id: int, address: int, length: int) -> bytes:
 def write(id: int, address: int, data: bytes) -> bytes:
     """Return a write."""
     return encode(id, Instruction.WRITE, word(address) + data)
-
-
-def reboot(id: int) -> bytes:
-    """Return a reboot: RAM to its defaults, latched errors cleared, torque off."""
-    return encode(id, Instruction.REBOOT)
 
 
 def sync_read(address: int, length: int, ids: Iterable[int], fast: bool = False) -> bytes:
@@ -230,42 +212,33 @@ class Parser:
 
     def feed(self, data: bytes) -> list[Packet]:
         """Take bytes from the line; return the packets they complete."""
-        self._buffer += data
-        packets = []
-        while self._align():
-            size = PREFIX + int.from_bytes(self._buffer[5:7], "little")
-            if len(self._buffer) < size:
-                break
-            raw = bytes(self._buffer[:size])
-            whole = crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
-            packet = _decode(raw) if whole else None
-            self.crc_errors += not whole
+        buffer, packets = self._buffer, []
+        buffer += data
+        while (place := buffer.find(HEADER)) >= 0:
+            del buffer[:place]
+            if len(buffer) < PREFIX:
+                return packets
+            id, length = buffer[4], int.from_bytes(buffer[5:PREFIX], "little")
+            size, packet = PREFIX + length, None
+            if (id <= MAX_ID or id == BROADCAST) and 3 <= length <= MAX_LENGTH:
+                if len(buffer) < size:
+                    return packets
+                raw = bytes(buffer[:size])
+                if crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little"):
+                    packet = _decode(raw)
+                else:
+                    self.crc_errors += 1
             if packet is None:
-                del self._buffer[:1]
+                del buffer[:1]
             else:
                 packets.append(packet)
-                del self._buffer[:size]
+                del buffer[:size]
+        del buffer[:-3]  # they may begin a header
         return packets
 
     def clear(self) -> None:
         """Forget everything received so far."""
         self._buffer.clear()
-
-    def _align(self) -> bool:
-        """Bring a plausible packet start to the front; False where more bytes are needed to tell."""
-        while True:
-            place = self._buffer.find(HEADER)
-            if place < 0:
-                start = next((size for size in (3, 2, 1) if self._buffer.endswith(HEADER[:size])), 0)  # of a header to come
-                del self._buffer[: len(self._buffer) - start]
-                return False
-            del self._buffer[:place]
-            if len(self._buffer) < PREFIX:
-                return False
-            id, length = self._buffer[4], int.from_bytes(self._buffer[5:7], "little")
-            if (id <= MAX_ID or id == BROADCAST) and 3 <= length <= MAX_LENGTH:
-                return True
-            del self._buffer[:1]
 
 
 def _decode(raw: bytes) -> Packet | None:
@@ -275,5 +248,5 @@ def _decode(raw: bytes) -> Packet | None:
         return Packet(raw[4], body[0], body[1:])
     if _PATTERN in body.replace(_STUFFED, b"\0"):
         return None
-    plain = unstuff(body)
+    plain = body.replace(_STUFFED, _PATTERN)
     return Packet(raw[4], plain[0], plain[1:])

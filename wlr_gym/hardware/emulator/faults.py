@@ -62,7 +62,8 @@ FAULTS: dict[str, FaultKind] = {
 _REPLY_FAULTS = ("drop", "delay", "late", "flip", "truncate", "noise", "duplicate_id")
 #: Bytes of an answer before the error byte, which are the same in both of two servos with one id.
 _SAME = 8
-_KEYS = ("probability", "value", "after", "duration")
+#: Key of a fault -> its largest value.
+_LARGEST = {"probability": 1.0, "value": math.inf, "after": math.inf, "duration": math.inf}
 
 
 @dataclass(frozen=True)
@@ -111,22 +112,16 @@ def parse_fault(text: str, places: Collection[str]) -> Fault:
     for place in where:
         check_name("place", place, places, f"fault '{text}'")
     numbers = {"value": FAULTS[kind].value, "duration": FAULTS[kind].duration}
-    for word in words:
-        if "=" in word:
-            key, _, number = word.partition("=")
-            numbers[key] = _number(key, number, text)
+    for key, _, number in (word.partition("=") for word in words if "=" in word):
+        check_name("key", key, _LARGEST, f"fault '{text}'")
+        try:
+            numbers[key] = float(number)
+        except ValueError:
+            raise InputError(f"fault '{text}': {key} = '{number}' is no number") from None
+        if not 0.0 <= numbers[key] <= _LARGEST[key]:
+            up_to = " up to 1" if key == "probability" else ""
+            raise InputError(f"fault '{text}': {key} = {number}, expected 0 or more{up_to}")
     return Fault(kind, where, **numbers)
-
-
-def _number(key: str, text: str, where: str) -> float:
-    check_name("key", key, _KEYS, f"fault '{where}'")
-    try:
-        value = float(text)
-    except ValueError:
-        raise InputError(f"fault '{where}': {key} = '{text}' is no number") from None
-    if not (value >= 0.0 and (key != "probability" or value <= 1.0)):
-        raise InputError(f"fault '{where}': {key} = {text}, expected 0 or more" + (" up to 1" if key == "probability" else ""))
-    return value
 
 
 class FaultBoard:
@@ -150,7 +145,7 @@ class FaultBoard:
         self._faults = [entry for entry in self._faults if kind is not None and entry[2].kind != kind]
 
     def active(self, now: float, kind: str, places: Sequence[str]) -> Fault | None:
-        """Return a fault of ``kind`` that holds at any of ``places`` now; None where there is none."""
+        """Return a fault of ``kind`` that holds at any of ``places`` now; None = there is none."""
         return next((fault for fault in self._holding(now, places) if fault.kind == kind), None)
 
     def values(self, now: float, places: Sequence[str]) -> dict[str, float]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,7 +18,6 @@ FAST_READ_FIRMWARE = 45
 #: Payload of one USB packet of the adapter: full ones are sent at once, the rest waits for the latency timer.
 USB_PACKET = 62
 _BITS_PER_BYTE = 10
-_WRITES = (Instruction.WRITE, Instruction.REG_WRITE)
 #: Status Return Level from which an instruction is answered; all others from 2.
 _ANSWER_LEVEL: dict[int, int] = {Instruction.PING: 0, Instruction.READ: 1}
 
@@ -65,14 +65,6 @@ class BusLine:
         self._faults = faults
         self._parser = Parser()
         self._busy_until = 0.0
-        self._simple: dict[int, Callable[[EmulatedServo, bytes], tuple[Error, bytes]]] = {
-            Instruction.PING: _ping,
-            Instruction.READ: _read,
-            Instruction.WRITE: lambda servo, data: (_write(servo.write, data), b""),
-            Instruction.REG_WRITE: lambda servo, data: (_write(servo.register, data), b""),
-            Instruction.ACTION: lambda servo, data: (servo.action(), b""),
-            Instruction.CLEAR: lambda servo, data: (servo.clear(data), b""),
-        }
 
     def receive(self, data: bytes, now: float, baud_rate: int | None = None) -> list[Emission]:
         """Take bytes the host sent; return what comes back and when.
@@ -88,7 +80,13 @@ class BusLine:
         for packet in self._parser.feed(data):
             size = len(packet.parameters) + 10
             start = max(now, self._busy_until) + self._wire_time(size, baud_rate)
-            heard = [servo for servo in self.servos if self._hears(servo, baud_rate, now)]
+            heard = [
+                servo
+                for servo in self.servos
+                if servo.answers
+                and baud_rate in (None, servo.baud_rate)
+                and not self._faults.happens(now, "deaf", [servo.name, self.name])
+            ]
             for servo in heard:
                 servo.hear()
             emissions += self._send(self._answer(packet, heard), start, now, baud_rate)
@@ -97,10 +95,6 @@ class BusLine:
     def forget(self) -> None:
         """Drop half-received instructions (the adapter was unplugged)."""
         self._parser.clear()
-
-    def _hears(self, servo: EmulatedServo, baud_rate: int | None, now: float) -> bool:
-        right_speed = baud_rate is None or servo.baud_rate == baud_rate
-        return servo.answers and right_speed and not self._faults.happens(now, "deaf", [servo.name, self.name])
 
     def _wire_time(self, count: int, baud_rate: int | None) -> float:
         speed = baud_rate or self.servos[0].baud_rate
@@ -150,20 +144,21 @@ class BusLine:
 
     def _answer(self, packet: Packet, heard: list[EmulatedServo]) -> list[tuple[EmulatedServo, bytes]]:
         instruction, parameters = packet.instruction, packet.parameters
-        if instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
-            address, length = _words(parameters)
-            asked = [(id, address, length) for id in parameters[4:]]
-            return self._read_several(asked, heard, instruction == Instruction.FAST_SYNC_READ)
-        if instruction in (Instruction.BULK_READ, Instruction.FAST_BULK_READ):
-            asked = [(part[0], *_words(part[1:])) for part in _parts(parameters, 5)]
-            return self._read_several(asked, heard, instruction == Instruction.FAST_BULK_READ)
-        if instruction == Instruction.SYNC_WRITE:
-            address, length = _words(parameters)
-            _write_several([(part[0], address, part[1:]) for part in _parts(parameters[4:], length + 1)], heard)
-            return []
-        if instruction == Instruction.BULK_WRITE:
-            _write_several(list(_bulk_parts(parameters)), heard)
-            return []
+        address, length = _words(parameters)
+        is_fast = instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
+        match instruction:
+            case Instruction.SYNC_READ | Instruction.FAST_SYNC_READ:
+                return _read_several([(id, address, length) for id in parameters[4:]], heard, is_fast)
+            case Instruction.BULK_READ | Instruction.FAST_BULK_READ:
+                whole = len(parameters) // _BULK.size * _BULK.size
+                return _read_several(list(_BULK.iter_unpack(parameters[:whole])), heard, is_fast)
+            case Instruction.SYNC_WRITE:
+                starts = range(4, len(parameters) - length, length + 1)
+                _write_several([(parameters[k], address, parameters[k + 1 : k + 1 + length]) for k in starts], heard)
+                return []
+            case Instruction.BULK_WRITE:
+                _write_several(list(_bulk_parts(parameters)), heard)
+                return []
         return self._answer_one(packet, heard)
 
     def _answer_one(self, packet: Packet, heard: list[EmulatedServo]) -> list[tuple[EmulatedServo, bytes]]:
@@ -172,91 +167,80 @@ class BusLine:
         for servo in sorted(heard, key=lambda servo: servo.id):
             own = servo.id
             if packet.id not in (own, BROADCAST):
-                if packet.id == servo["secondary_id"] and packet.instruction in _WRITES:
-                    self._carry_out(servo, packet)
+                if packet.id == servo["secondary_id"] and packet.instruction == Instruction.WRITE:
+                    _carry_out(servo, packet)
                 continue
-            alert = servo.alert
-            level = servo["status_return_level"]
-            error, data = self._carry_out(servo, packet)
-            silent = packet.id == BROADCAST and packet.instruction != Instruction.PING
-            if level >= _ANSWER_LEVEL.get(packet.instruction, 2) and not silent:
+            alert, level = servo.alert, servo["status_return_level"]
+            error, data = _carry_out(servo, packet)
+            is_silent = packet.id == BROADCAST and packet.instruction != Instruction.PING
+            if level >= _ANSWER_LEVEL.get(packet.instruction, 2) and not is_silent:
                 answers.append((servo, protocol.encode_status(own, error | alert, data)))
         return answers
 
-    def _carry_out(self, servo: EmulatedServo, packet: Packet) -> tuple[Error, bytes]:
-        instruction, parameters = packet.instruction, packet.parameters
-        if instruction == Instruction.REBOOT:
+
+def _carry_out(servo: EmulatedServo, packet: Packet) -> tuple[Error, bytes]:
+    parameters = packet.parameters
+    match packet.instruction:
+        case Instruction.PING:
+            return Error.NONE, protocol.word(servo.table.model_number) + bytes([servo.firmware])
+        case Instruction.READ if len(parameters) == 4:
+            return servo.read(*_words(parameters))
+        case Instruction.WRITE if len(parameters) >= 3:
+            return servo.write(_words(parameters)[0], parameters[2:]), b""
+        case Instruction.READ | Instruction.WRITE:
+            return Error.DATA_LENGTH, b""
+        case Instruction.CLEAR:
+            return servo.clear(parameters), b""
+        case Instruction.REBOOT:
             servo.boot()
             return Error.NONE, b""
-        if instruction == Instruction.FACTORY_RESET:
-            keep = parameters[0] if parameters else 0
-            refused = packet.id == BROADCAST and keep == 0xFF
-            return (Error.RESULT_FAIL if refused else servo.factory_reset(keep)), b""
-        act = self._simple.get(instruction)
-        return act(servo, parameters) if act is not None else (Error.INSTRUCTION, b"")
-
-    def _read_several(
-        self, asked: list[tuple[int, int, int]], heard: list[EmulatedServo], fast: bool
-    ) -> list[tuple[EmulatedServo, bytes]]:
-        """Each servo waits for the one named before it, so a missing one silences all behind it."""
-        by_id = {servo.id: servo for servo in heard}
-        chain: list[tuple[EmulatedServo, Status]] = []
-        for id, address, length in asked:
-            servo = by_id.get(id)
-            if servo is None or (fast and servo.firmware < FAST_READ_FIRMWARE):
-                break
-            error, data = servo.read(address, length)
-            chain.append((servo, Status(id, error | servo.alert, data)))
-        if not fast:
-            answering = ((servo, status) for servo, status in chain if servo["status_return_level"] >= 1)
-            return [(servo, protocol.encode_status(*status)) for servo, status in answering]
-        if sum(length + 4 for *_, length in asked) >= protocol.MAX_LENGTH:
-            return []
-        answered = [status._replace(data=status.data or bytes(asked[k][2])) for k, (_, status) in enumerate(chain)]
-        missing = [Status(id, 0, bytes(length)) for id, _, length in asked[len(chain) :]]
-        pieces = protocol.encode_fast_status(answered + missing)
-        return [(servo, piece) for (servo, _), piece in zip(chain, pieces, strict=False)]
+    return Error.INSTRUCTION, b""
 
 
-# ---- parameters of the instructions ----
-
-
-def _words(parameters: bytes) -> tuple[int, int]:
-    return int.from_bytes(parameters[:2], "little"), int.from_bytes(parameters[2:4], "little")
-
-
-def _parts(parameters: bytes, size: int) -> Iterator[bytes]:
-    """Whole parts of ``size`` bytes; a rest is ignored."""
-    for start in range(0, len(parameters) - size + 1, size):
-        yield parameters[start : start + size]
-
-
-def _bulk_parts(parameters: bytes) -> Iterator[tuple[int, int, bytes]]:
-    while len(parameters) >= 5:
-        address, length = _words(parameters[1:])
-        if len(parameters) < 5 + length:
-            return
-        yield parameters[0], address, parameters[5 : 5 + length]
-        parameters = parameters[5 + length :]
+def _read_several(
+    asked: Sequence[tuple[int, int, int]], heard: list[EmulatedServo], fast: bool
+) -> list[tuple[EmulatedServo, bytes]]:
+    """Read (id, address, length) each. A servo waits for the one named before it, so a missing one silences all behind it."""
+    by_id = {servo.id: servo for servo in heard}
+    chain: list[tuple[EmulatedServo, Status]] = []
+    for id, address, length in asked:
+        servo = by_id.get(id)
+        if servo is None or (fast and servo.firmware < FAST_READ_FIRMWARE):
+            break
+        error, data = servo.read(address, length)
+        chain.append((servo, Status(id, error | servo.alert, data)))
+    if not fast:
+        return [(servo, protocol.encode_status(*status)) for servo, status in chain if servo["status_return_level"] >= 1]
+    if sum(length + 4 for *_, length in asked) >= protocol.MAX_LENGTH:
+        return []
+    answered = [status._replace(data=status.data or bytes(asked[k][2])) for k, (_, status) in enumerate(chain)]
+    missing = [Status(id, 0, bytes(length)) for id, _, length in asked[len(chain) :]]
+    pieces = protocol.encode_fast_status(answered + missing)
+    return [(servo, piece) for (servo, _), piece in zip(chain, pieces, strict=False)]
 
 
 def _write_several(parts: list[tuple[int, int, bytes]], heard: list[EmulatedServo]) -> None:
-    """Sync and bulk writes are never answered: what a servo refuses is lost without a word."""
+    """Write (id, address, data) each. Nobody answers: what a servo refuses is lost without a word."""
     by_id = {servo.id: servo for servo in heard}
     for id, address, data in parts:
         if id in by_id:
             by_id[id].write(address, data)
 
 
-def _ping(servo: EmulatedServo, parameters: bytes) -> tuple[Error, bytes]:
-    return Error.NONE, protocol.word(servo.table.model_number) + bytes([servo.firmware])
+# ---- parameters of the instructions ----
+
+#: Of a bulk read, for each servo: id, address, length.
+_BULK = struct.Struct("<BHH")
 
 
-def _read(servo: EmulatedServo, parameters: bytes) -> tuple[Error, bytes]:
-    return servo.read(*_words(parameters)) if len(parameters) == 4 else (Error.DATA_LENGTH, b"")
+def _words(parameters: bytes) -> tuple[int, int]:
+    return int.from_bytes(parameters[:2], "little"), int.from_bytes(parameters[2:4], "little")
 
 
-def _write(act: Callable[[int, bytes], Error], parameters: bytes) -> Error:
-    if len(parameters) < 3:
-        return Error.DATA_LENGTH
-    return act(int.from_bytes(parameters[:2], "little"), parameters[2:])
+def _bulk_parts(parameters: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Return id, address and data of each part of a bulk write; a rest is ignored."""
+    while len(parameters) >= _BULK.size:
+        id, address, length = _BULK.unpack_from(parameters)
+        data, parameters = parameters[5 : 5 + length], parameters[5 + length :]
+        if len(data) == length:
+            yield id, address, data

@@ -17,10 +17,8 @@ from wlr_gym.hardware.flow import FlowStream
 from wlr_gym.hardware.imu import ImuStream
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.servos import Servos
-from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.effects.patch import Source
 from wlr_gym.robot import Robot
-from wlr_gym.robot.parameters import Parameters
 
 
 class EmulatedWorld:
@@ -96,9 +94,6 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     Args:
         machine: the robot.
         camera: above its floor; None = there is none.
-
-    Raises:
-        MissingPackageError: dynamixel-sdk is not installed.
     """
     require_package("dynamixel_sdk", "robot")
     from wlr_gym.hardware.dynamixel.port import DynamixelPort
@@ -109,8 +104,6 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     def make_port(path: str, baud_rate: int, patience: float) -> DynamixelPort:
         return DynamixelPort(names[path], baud_rate, patience, world.now, partial(MemoryDevice, machine))
 
-    servos = Servos(robot, hardware, hardware.safety.patience, world.now, make_port)
-    imu = ImuStream(hardware.imu, world.now, lambda *_: MemoryDevice(machine, "imu"))
     flow = eye = None
     if hardware.flow is not None and robot.sensors.flow is not None:
         flow = FlowStream(hardware.flow, robot.sensors.flow, world.now, lambda *_: MemoryDevice(machine, "flow"))
@@ -119,8 +112,16 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
 
         require_package("cv2", "vision")
         eye = EmulatedCamera(machine, camera)
-    seed = machine.options.seed
-    return Link(servos, imu, world, is_serial=False, finish=machine.close, flow=flow, camera=eye, seed=seed)
+    return Link(
+        servos=Servos(robot, hardware, hardware.safety.patience, world.now, make_port),
+        imu=ImuStream(hardware.imu, world.now, lambda *_: MemoryDevice(machine, "imu")),
+        clock=world,
+        is_serial=False,
+        finish=machine.close,
+        flow=flow,
+        camera=eye,
+        seed=machine.options.seed,
+    )
 
 
 def with_flow_port(robot: Robot, hardware: Hardware) -> Hardware:
@@ -147,12 +148,6 @@ def emulated_robot(
         effects: what the emulated robot has that its file does not say.
         sensor_noise, seed: of the simulator behind it.
         camera: above its floor; None = there is none.
-
-    Raises:
-        InputError: effects that cannot be read or that this robot cannot have.
     """
-    patch = load_patch(effects)
     options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise, seed=seed)
-    parameters = apply_patch(patch, Parameters.nominal(robot))
-    hardware = with_flow_port(robot, hardware)
-    return emulated_link(Machine(robot, hardware, options, parameters=parameters, forces=patch.forces), camera)
+    return emulated_link(Machine(robot, with_flow_port(robot, hardware), options, effects=effects), camera)

@@ -1,58 +1,61 @@
 """The emulated robot, in emulated time: eight servos and sensors around any one-robot plant. No ports, no clock of its own.
 
-:func:`run_command` takes lines of text (faults, ``clear``, ``faults``, ``status``, ``turn``, ``straighten``, ``help``).
-:class:`EmulatedStand` holds the robot by springs with its wheels off the ground, with the hands of whoever stands beside it.
+:class:`PlantCoupling` joins servos and plant: what their firmware asks of the motors becomes setpoints, what the physics did
+becomes their shafts. The plant's own servo model is the physics: it takes leg angles and wheel speeds and runs the servo's law
+itself, every substep. So a leg in (extended) position mode and a wheel in velocity mode are *native*: goal, torque, gains and
+profile registers go straight to the plant, and the motion is bit for bit the simulator's. In any other mode, or with a PWM
+limit, the emulator runs that mode's law once per tick and hands the plant the voltage: a leg gets gain 1 V/rad and the setpoint
+``angle + voltage``, a wheel gain 1 V s/rad and the setpoint ``speed + voltage``, which the plant's law turns back into that
+voltage. It acts half a tick late and is held over the tick; at 1 ms, the servo's own control period, so it is in the servo.
+Position I and D gains and the feed-forward gains are registers without effect.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, check_name, unknown_name
-from wlr_gym.hardware.config import FlowPort, Hardware, check_fit
-from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, error_names, load_table
-from wlr_gym.hardware.emulator.coupling import PlantCoupling
-from wlr_gym.hardware.emulator.faults import FAULTS, Fault, FaultBoard, parse_fault
+from wlr_gym.base.errors import InputError, check_name
+from wlr_gym.hardware.config import FlowCalibration, FlowPort, Hardware, check_fit
+from wlr_gym.hardware.dynamixel.tables import (
+    BAUD_RATES,
+    CURRENT_MODE,
+    CURRENT_POSITION_MODE,
+    EXTENDED_POSITION_MODE,
+    POSITION_MODE,
+    POSITION_MODES,
+    PWM_MODE,
+    VELOCITY_MODE,
+    load_table,
+)
+from wlr_gym.hardware.emulator.faults import Fault, FaultBoard, parse_fault
 from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
-from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo
+from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo, MotorDrive
 from wlr_gym.hardware.flow import FLOW_FRAMES, FULL_QUALITY, FlowConversion
 from wlr_gym.hardware.imu import IMU_FRAMES, Conversion
-from wlr_gym.physics.effects import apply_patch, load_patch
-from wlr_gym.physics.effects.patch import Source
+from wlr_gym.physics import servo as law
+from wlr_gym.physics.effects.patch import Source, apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, standing_state
-from wlr_gym.physics.plants.forces import Force, force_values, make_force
-from wlr_gym.physics.plants.simulator import Simulator
-from wlr_gym.physics.servo import winding
-from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
+from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors
+from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, Robot
 from wlr_gym.robot.description import FlowSensor
+from wlr_gym.robot.parameter_table import SPECS
 from wlr_gym.robot.parameters import Parameters
 
-#: Frames after which the last bit changes of a chip without noise.
-IMU_DITHER = 3
-#: 30 degC as the chip counts it.
+Array = NDArray[np.float64]
+
+#: Frames after which the last bit changes of the IMU's values, and of the flow sensor's surface quality, without noise.
+DITHER = 3
+#: 30 degC as the IMU's chip counts it.
 _IMU_TEMPERATURE = round((30.0 - 36.53) * 340)
-
-
 #: Shutter on a floor of good texture in a lit room, and at its longest.
 _SHUTTER, _LONGEST_SHUTTER = 0x0400, 0x1FFF
-#: Frames after which the last bit of the surface quality changes, of a plant without noise.
-_DITHER = 3
-
-
-#: m that the body hangs above the floor.
-HEIGHT = 0.5
-#: N m of a hand that holds a wheel or a leg.
-GRIP = 10.0
-#: Springs and dampers of the stand: stiff in place, and slow to follow a hand that tilts the body (0.5 s).
-_PLACE = {"k": 4000.0, "c": 250.0}
-_ATTITUDE = {"k": 40.0, "c": 20.0}
-_ANGLES = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,8 @@ class Machine:
         hardware: wiring and mounting.
         options: see :class:`MachineOptions`.
         plant: one robot with ``control_period`` = ``options.tick``; None makes the options' backend.
-        parameters: of the plant (effects included); None = nominal. See :class:`PlantCoupling`.
-        forces: formula forces of the plant that is made.
+        parameters: of the plant; None = nominal. See :class:`PlantCoupling`.
+        effects: what the robot has that file and parameters do not say; their forces are for the plant that is made.
         state: where the robot starts; None = standing.
 
     Attributes:
@@ -101,11 +104,12 @@ class Machine:
         coupling: of the servos and the plant.
         lines: bus name -> line.
         faults: what is wrong right now.
+        sensors: names of the sensors that have a port of their own. places: names a fault may be at.
         is_plugged, pulls: bus or sensor -> its adapter was in its socket at the last tick; times that it was pulled out.
         watchers: called at the end of every tick (what looks at the robot from outside: a camera).
 
     Raises:
-        InputError: a plant of another size or period.
+        InputError: a plant of another size or period, effects that cannot be read or that this robot cannot have.
     """
 
     def __init__(
@@ -116,14 +120,16 @@ class Machine:
         *,
         plant: Plant | None = None,
         parameters: Parameters | None = None,
-        forces: Sequence[Force] = (),
+        effects: Source = None,
         state: PlantState | None = None,
     ) -> None:
         self.options: MachineOptions = options or MachineOptions()
         check_fit(robot, hardware)
         self.robot = robot
         self.hardware = hardware
-        self.plant: Plant = plant or make_plant(self.options.backend, robot, 1, self.options.plant_options(), forces)
+        patch = load_patch(effects)
+        parameters = apply_patch(patch, parameters or Parameters.nominal(robot))
+        self.plant: Plant = plant or make_plant(self.options.backend, robot, 1, self.options.plant_options(), patch.forces)
         if self.plant.count != 1 or abs(self.plant.options.control_period - self.options.tick) > 1e-12:
             raise InputError(
                 f"the emulator needs a plant of 1 robot stepped every {self.options.tick:g} s, got {self.plant.count} "
@@ -137,6 +143,8 @@ class Machine:
         self._flow: EmulatedFlow | None = None
         if port is not None and sensor is not None:
             self._flow = EmulatedFlow(port, sensor, self.faults, self.options.tick)
+        self.sensors: tuple[str, ...] = ("imu",) if self._flow is None else ("imu", "flow")
+        self.places: tuple[str, ...] = (*JOINTS, *hardware.buses, *self.sensors, "camera")
         self.is_plugged: dict[str, bool] = dict.fromkeys([*hardware.buses, *self.sensors], True)
         self.pulls: dict[str, int] = dict.fromkeys(self.is_plugged, 0)
         self._due: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in self.is_plugged}
@@ -156,21 +164,11 @@ class Machine:
             for name, bus in hardware.buses.items()
         }
 
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Names of the sensors that have a port of their own."""
-        return ("imu",) if self._flow is None else ("imu", "flow")
-
     def _make_servo(self, joint: str) -> EmulatedServo:
         bus = next(bus for bus in self.hardware.buses.values() if joint in bus.joints)
         ours = {"id": self.robot.dynamixel_ids[joint], "baud_rate": BAUD_RATES.index(bus.baud_rate), **bus.eeprom}
         table = load_table(bus.model).at(self.robot.servo.supply_voltage)
         return EmulatedServo(joint, table, {} if self.options.factory else ours, self.options.firmware)
-
-    @property
-    def places(self) -> tuple[str, ...]:
-        """Names a fault may be at."""
-        return (*JOINTS, *self.hardware.buses, *self.sensors, "camera")
 
     def close(self) -> None:
         """Release the plant."""
@@ -209,7 +207,7 @@ class Machine:
             servo.pause(duration)
 
     def turn(self, joint: str, angle: float) -> None:
-        """Turn a joint by hand while torque is off; see :meth:`PlantCoupling.turn`.
+        """Turn a joint by hand while torque is off, by ``angle`` (rad) in its positive direction.
 
         Raises:
             InputError: unknown joint, torque that is on, or a plant whose state cannot be set.
@@ -218,11 +216,7 @@ class Machine:
         self.coupling.turn(joint, angle)
 
     def straighten(self, leg: str) -> None:
-        """Turn a leg straight down by hand while torque is off: the leg itself, whatever its encoder says.
-
-        Raises:
-            InputError: unknown leg, torque that is on, or a plant whose state cannot be set.
-        """
+        """Turn a leg straight down by hand, as :meth:`turn`: the leg itself, whatever its encoder says."""
         check_name("leg", leg, LEGS)
         self.turn(leg, float(np.pi / 2 - self.plant.mechanical_state().joint_position[0, JOINTS.index(leg)]))
 
@@ -235,7 +229,7 @@ class Machine:
         if not self.faults.active(self.time, "imu_frozen", ["imu"]):
             force, (x, y, z) = self._imu.counts(sensors.accelerometer[0], sensors.gyro[0])
             # the chip's last bit never rests, also where the plant's sensors have no noise
-            self._imu_values = force, (x, y, z if self.options.sensor_noise else z + self._frames // IMU_DITHER % 2)
+            self._imu_values = force, (x, y, z if self.options.sensor_noise else z + self._frames // DITHER % 2)
         force, rate = self._imu_values
         if not self.faults.active(self.time, "imu_stale", ["imu"]):
             self._imu_frame = IMU_FRAMES.encode((self._frames, round(stamp * 1e6), *force, _IMU_TEMPERATURE, *rate))
@@ -282,11 +276,7 @@ class Machine:
     # ---- faults ----
 
     def inject(self, fault: Fault | str) -> Fault:
-        """Make something go wrong.
-
-        Raises:
-            InputError: unknown kind, place or key.
-        """
+        """Make something go wrong: a fault, or a line of text that :func:`parse_fault` understands."""
         fault = parse_fault(fault, self.places) if isinstance(fault, str) else fault
         self.faults.add(fault, self.time)
         return fault
@@ -308,14 +298,14 @@ class EmulatedFlow:
     """Chip and microcontroller.
 
     Args:
-        port: the chip's axes; of its calibration nothing: what is wrong with the sensor is the plant's.
+        port: the chip's axes. Its calibration does not count: what is wrong with the sensor is the plant's.
         sensor: of the robot's file.
         faults: shared with the rest of the robot.
         tick: s of emulated time.
     """
 
     def __init__(self, port: FlowPort, sensor: FlowSensor, faults: FaultBoard, tick: float) -> None:
-        self._convert = FlowConversion(port.model_copy(update={"calibration": type(port.calibration)()}), sensor)
+        self._convert = FlowConversion(port.model_copy(update={"calibration": FlowCalibration()}), sensor)
         self._sensor, self._faults, self._tick = sensor, faults, tick
         self._frames = 0
         self._sent_at = 0.0
@@ -329,16 +319,15 @@ class EmulatedFlow:
             paused: s for which it stood still while quartzes went on.
             sensors: of the plant at this tick.
         """
-        is_valid = bool(sensors.flow_is_new[0])
-        if not is_valid and time - self._sent_at < 1.0 / self._sensor.rate + self._tick:
+        is_valid, interval = bool(sensors.flow_is_new[0]), 1.0 / self._sensor.rate
+        if not is_valid and time - self._sent_at < interval + self._tick:
             return []
         self._sent_at = time
         self._frames += 1
-        interval = 1.0 / self._sensor.rate
+        faults = self._faults.values(time, ["flow"])
+        if "flow_frozen" not in faults:
+            self._last = self._counted(sensors if is_valid else None, faults)
         end = time - float(sensors.flow_age[0]) if is_valid else time
-        flow = sensors.flow[0] if is_valid else np.zeros(2)
-        quality = float(sensors.flow_quality[0]) if is_valid else 0.0
-        self._last = self._counted(time, flow, quality, interval)
         stamp = round((end + paused) * 1e6)
         frame = FLOW_FRAMES.encode((self._frames, stamp, round(interval * 1e6), *self._last))
         raw, delay = self._faults.mangle(time, frame, ["flow"])
@@ -346,155 +335,240 @@ class EmulatedFlow:
             return []
         return [Emission(time + delay, raw)]
 
-    def _counted(self, time: float, flow: np.ndarray, quality: float, interval: float) -> tuple[int, int, int, int]:
-        """Return counts along x and y, SQUAL and Shutter, with what the faults make of them."""
-        active = self._faults.active
-        if active(time, "flow_frozen", ["flow"]) is not None:
-            return self._last
-        if (turned := active(time, "flow_turned", ["flow"])) is not None:
-            c, s = math.cos(turned.value), math.sin(turned.value)
+    def _counted(self, sensors: Sensors | None, faults: Mapping[str, float]) -> tuple[int, int, int, int]:
+        """Return counts along x and y, SQUAL and Shutter of a reading (None = no valid one), and what faults make of them."""
+        if "flow_texture" in faults:
+            return 0, 0, min(round(faults["flow_texture"]), FULL_QUALITY), _LONGEST_SHUTTER
+        flow, quality = (np.zeros(2), 0.0) if sensors is None else (sensors.flow[0], float(sensors.flow_quality[0]))
+        if "flow_turned" in faults:
+            c, s = math.cos(faults["flow_turned"]), math.sin(faults["flow_turned"])
             flow = np.array([c * flow[0] + s * flow[1], c * flow[1] - s * flow[0]])
-        if (scale := active(time, "flow_scale", ["flow"])) is not None:
-            flow = scale.value * flow
-        x, y = self._convert.counts(flow, interval)
-        if (stuck := active(time, "flow_saturated", ["flow"])) is not None:
-            x = y = round(stuck.value)
+        x, y = self._convert.counts(faults.get("flow_scale", 1.0) * flow, 1.0 / self._sensor.rate)
+        if "flow_saturated" in faults:
+            x = y = round(faults["flow_saturated"])
         squal, shutter = round(quality * FULL_QUALITY), _SHUTTER if quality > 0.0 else _LONGEST_SHUTTER
-        squal += self._frames // _DITHER % 2 if squal else 0
-        if (bare := active(time, "flow_texture", ["flow"])) is not None:
-            x, y, squal, shutter = 0, 0, round(bare.value), _LONGEST_SHUTTER
-        return x, y, min(squal, 255), shutter
+        squal += self._frames // DITHER % 2 if squal else 0
+        return x, y, min(squal, FULL_QUALITY), shutter
 
 
-def run_command(machine: Machine, text: str) -> str:
-    """Carry out one line of text and return the answer.
+# ---- servos on the plant ----
 
-    Raises:
-        InputError: it cannot be understood.
-    """
-    word, *rest = text.split() or ["help"]
-    if word in FAULTS:
-        return f"{machine.time:.3f} s: {machine.inject(text)}"
-    if word == "clear":
-        if rest:
-            check_name("fault", rest[0], FAULTS)
-        machine.clear(rest[0] if rest else None)
-        return "cleared"
-    if word == "turn":
-        return _turn(machine, text, rest)
-    if word == "straighten":
-        machine.straighten(" ".join(rest))
-        return f"{rest[0]} hangs straight down"
-    if word == "faults":
-        return "\n".join(machine.faults.listing(machine.time)) or "no faults"
-    if word == "status":
-        return _status(machine)
-    if word == "help":
-        return _help()
-    raise unknown_name("command", word, ["faults", "status", "help", "clear", "turn", "straighten", *FAULTS])
+_IS_LEG = np.arange(len(JOINTS)) < len(LEGS)
+_NATIVE_MODES = {True: (POSITION_MODE, EXTENDED_POSITION_MODE), False: (VELOCITY_MODE,)}
+#: Gains that make the plant's law pass a voltage on: (kp, kd, profile velocity, profile acceleration).
+_LEG_CARRIER = (1.0, 0.0, 0.0, 0.0)
+_WHEEL_CARRIER = (0.0, 1.0, 0.0, 0.0)
+_TUNED = ("servo.kp", "servo.kd", "servo.profile_velocity", "servo.profile_acceleration")
 
 
-def _turn(machine: Machine, text: str, words: list[str]) -> str:
-    try:
-        joint, degrees = words
-        angle = float(np.deg2rad(float(degrees)))
-    except ValueError:
-        raise InputError(f"'{text}': expected turn JOINT DEGREES") from None
-    machine.turn(joint, angle)
-    return f"{joint} turned by {degrees} deg"
-
-
-def _status(machine: Machine) -> str:
-    """One line per servo: torque, mode, position, velocity, supply, temperature, errors."""
-    lines = [f"{machine.time:.3f} s"]
-    for joint, servo in machine.servos.items():
-        errors = ", ".join(error_names(servo["hardware_error_status"])) or "no error"
-        power = "no power" if servo.dead else "torque on" if servo["torque_enable"] else "torque off"
-        lines.append(
-            f"{joint:9} id {servo['id']:3}  {power:10}  mode {servo['operating_mode']:2}"
-            f"  position {servo['present_position']:6}  velocity {servo['present_velocity']:4}"
-            f"  {servo['present_input_voltage'] / 10:4.1f} V  {servo['present_temperature']:3} degC  {errors}"
-        )
-    return "\n".join(lines)
-
-
-def _help() -> str:
-    lines = [
-        "status | faults | clear [KIND] | turn JOINT DEGREES | straighten LEG | help",
-        "KIND [WHERE ...] [probability=] [value=] [after=] [duration=]",
-    ]
-    for name, kind in FAULTS.items():
-        value = f" (value: {kind.unit}, default {kind.value:g})" if kind.unit else ""
-        lines.append(f"  {name:9} {kind.doc}{value}")
-    return "\n".join(lines)
-
-
-class EmulatedStand:
-    """An emulated robot on a stand.
+class PlantCoupling:
+    """Eight servos on a plant of one robot.
 
     Args:
-        robot, hardware: as for :class:`Machine`.
-        effects: what the robot has that its file does not say.
-        parameters: of the robot before the effects; None = nominal.
-        options: of the machine.
+        robot: the robot.
+        hardware: how the servos are mounted.
+        plant: steps by one tick.
+        servos: in joint order.
+        parameters: of the plant. Gains differ from what the registers say by the same factor as they do from nominal.
+        seed: of sensor noise.
+        state: where the robot starts; None = standing.
 
     Attributes:
-        machine: the robot.
-        stall_current: A of a wheel's motor at stall.
-
-    Raises:
-        InputError: effects that cannot be read or that this robot cannot have.
+        sensors: the plant's last readings.
+        supply: V at the servos.
+        nominal_supply: V without a fault.
     """
 
     def __init__(
         self,
         robot: Robot,
         hardware: Hardware,
-        effects: Source = None,
-        parameters: Parameters | None = None,
-        options: MachineOptions | None = None,
+        plant: Plant,
+        servos: Sequence[EmulatedServo],
+        parameters: Parameters,
+        seed: int,
+        state: PlantState | None,
     ) -> None:
-        patch, options = load_patch(effects), options or MachineOptions()
-        changed = apply_patch(patch, parameters or Parameters.nominal(robot))
-        self._forces = patch.forces
-        plant = make_plant(options.backend, robot, 1, options.plant_options(), [*_stand_forces(), *patch.forces])
-        assert isinstance(plant, Simulator), "the emulator runs on simulators only"
-        self._plant: Simulator = plant
-        state = standing_state(robot, changed)
-        state.position[0, 2] = HEIGHT
-        self.machine: Machine = Machine(robot, hardware, options, plant=plant, parameters=changed, state=state)
-        self._friction = dict(zip(JOINTS, changed["servo.coulomb_friction"][0].tolist(), strict=True))
-        self.stall_current: float = robot.servo.supply_voltage / float(winding(robot)[1][-1])
+        self.plant = plant
+        self._servos = servos
+        self._sign = np.array([hardware.joints[joint].sign for joint in JOINTS], np.float64)
+        units = [servo.table.per_count("present_position") for servo in servos]
+        self._zero = np.array([hardware.joints[joint].zero * unit for joint, unit in zip(JOINTS, units, strict=True)])
+        self._effort_count, self._idle_effort = law.effort_counts(robot), law.idle_effort(robot)
+        nominal = Parameters.nominal(robot, 1)
+        self._parameters = parameters.copy()
+        self._gain_factor = self._parameters["servo.kp"][0] / nominal["servo.kp"][0]
+        self._damping = self._parameters["servo.kd"][0].copy()
+        known = nominal["servo.kd"][0]
+        self._damping_factor = np.divide(self._damping, known, where=known > 0, out=np.ones(len(JOINTS)))
+        leg, wheel = robot.servo.leg, robot.servo.wheel
+        self._nominal_stall = np.where(_IS_LEG, leg.stall_torque, wheel.stall_torque)
+        self._nominal_line = law.line_constants(robot)
+        self._nominal_winding = np.stack(law.winding(robot), axis=1).tolist()
+        self.nominal_supply: float = float(self._parameters["servo.supply_voltage"][0])
+        self.supply: float = self.nominal_supply
+        seeds = np.array([seed], np.uint64)
+        plant.reset(seeds, self._parameters, state=state)
+        plant.step(np.zeros((1, len(JOINTS))), np.zeros((1, len(JOINTS)), bool))  # compiles now, not under a client's eyes
+        self.sensors = plant.reset(seeds, self._parameters, state=state)
+        self._setpoints = np.zeros((1, len(JOINTS)))
+        self._torque = np.zeros((1, len(JOINTS)), bool)
+        self._own_law = np.zeros(len(JOINTS), bool)
+        self._own_voltage = np.zeros(len(JOINTS))  # V, encoder frame, of the emulator's own laws
+        self._reference = np.zeros((2, len(JOINTS)))  # of the emulator's own laws
+        self._plant_reference: Array | None = None  # of the plant's, at this tick
+        self._turned = np.zeros(len(JOINTS))  # rad by which wheels were turned beyond what the plant's encoders count
+        self._output: list[tuple[int, float]] | None = None  # of the motors, at this tick
+        self._tuning: list[tuple[float, ...]] = [(-1.0,)] * len(JOINTS)
+        self._settled: list[MotorDrive | None] = [None] * len(JOINTS)  # what the plant does by itself from tick to tick
+        self._plant_supply = self._parameters["servo.supply_voltage"]
+        for k, servo in enumerate(servos):
+            servo.shaft.reference, servo.shaft.output = partial(self._reference_of, k), partial(self._output_of, k)
+        self._show_sensors()
 
-    def tilt(self, **angles: float) -> None:
-        """Begin to turn the body to ``roll``, ``pitch`` and ``yaw`` (rad; the others to 0); it gets there in about 2 s."""
-        self._plant.set_force_values(force_values([*_stand_forces(**angles), *self._forces])[None])
+    def step(self) -> None:
+        """Let the motors do for one tick what the firmware asks."""
+        self._command_plant()
+        self.sensors = self.plant.step(self._setpoints, None if self._torque.all() else self._torque)
+        self._plant_reference = None
+        self._show_sensors()
 
-    def brake(self, joint: str) -> None:
-        """Hold a wheel or a leg by hand."""
-        self.machine.coupling.set_friction(joint, GRIP)
+    # ---- firmware to plant ----
 
-    def release(self, joint: str) -> None:
-        """Let go of it."""
-        self.machine.coupling.set_friction(joint, self._friction.get(joint, 0.0))
+    def _command_plant(self) -> None:
+        retune = self.supply != self._plant_supply[0]
+        for k, servo in enumerate(self._servos):
+            drive, is_well = servo.drive(), servo.shaft.is_well
+            if drive is self._settled[k] and is_well:
+                continue
+            native = drive.mode in _NATIVE_MODES[bool(_IS_LEG[k])] and drive.goal_pwm >= 1.0 and is_well
+            comes_back = drive.on and native and self._own_law[k]  # a tick off: the plant's profile generator goes to the joint
+            self._settled[k] = None if comes_back or (drive.on and not native) else drive
+            self._torque[0, k] = drive.on and not comes_back
+            if not self._torque[0, k]:
+                self._own_law[k] = False
+                continue
+            wanted = self._native_setpoint(k, drive) if native else self._voltage_setpoint(k, drive, servo)
+            self._setpoints[0, k], tuning = wanted
+            if tuning != self._tuning[k]:
+                self._tuning[k], retune = tuning, True
+        if retune:
+            self._tune()
 
-    def wheel_current(self) -> float:
-        """Return what the wheels draw from the supply, A: motor currents times the part of the time they are switched on."""
-        shafts = [self.machine.servos[wheel].shaft for wheel in WHEELS]
-        return sum(abs(shaft.output()[1]) * abs(shaft.load) for shaft in shafts) * self.stall_current
+    def _native_setpoint(self, k: int, drive: MotorDrive) -> tuple[float, tuple[float, ...]]:
+        """Return the plant's setpoint for a mode that the plant has itself, and its gains and profile."""
+        if _IS_LEG[k]:
+            gain = drive.position_gain * self._gain_factor[k]
+            gains = (gain, self._damping[k], drive.profile_velocity, drive.profile_acceleration)
+            return self._sign[k] * (drive.goal_position - self._zero[k]), gains
+        integral, gain = drive.velocity_integral_gain * self._gain_factor[k], drive.velocity_gain * self._damping_factor[k]
+        gains = (integral, gain, 0.0, drive.profile_acceleration)
+        return self._sign[k] * drive.goal_velocity, gains
 
+    def _voltage_setpoint(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> tuple[float, tuple[float, ...]]:
+        """Return the setpoint that makes the plant put a mode's voltage on the motor, and the gains that do it."""
+        self._own_voltage[k] = self._voltage(k, drive, servo)
+        voltage = self._sign[k] * self._own_voltage[k]
+        if _IS_LEG[k]:
+            return self._sign[k] * (servo.shaft.true_position - self._zero[k]) + voltage, _LEG_CARRIER
+        return self._sign[k] * servo.shaft.true_velocity + voltage, _WHEEL_CARRIER
 
-def _stand_forces(**angles: float) -> list[Force]:
-    """Return what holds the body in place, at ``roll``, ``pitch`` and ``yaw`` (rad); 0 where one is not named."""
-    units = {"k": "N/m", "c": "N s/m"}
-    height = "k * (height - position_z) - c * velocity_z"
-    forces = [
-        make_force(["floor_force_z"], height, {**_PLACE, "height": HEIGHT}, {**units, "height": "m"}),
-        make_force(["floor_force_x"], "-k * position_x - c * floor_velocity_x", _PLACE, units),
-        make_force(["floor_force_y"], "-k * position_y - c * floor_velocity_y", _PLACE, units),
-    ]
-    units = {"k": "N m/rad", "c": "N m s/rad", "tilt": "rad"}
-    for name in _ANGLES:
-        formula = f"k * (tilt - {name}) - c * {name}_rate"
-        forces.append(make_force([f"body_torque_{name}"], formula, {**_ATTITUDE, "tilt": angles.get(name, 0.0)}, units))
-    return forces
+    def _voltage(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> float:
+        """Return the voltage (V, encoder frame) of a law the plant has not got, and move its profile on by a tick."""
+        shaft, supply, step = servo.shaft, servo.shaft.strength * self.supply, self.plant.options.control_period
+        if not self._own_law[k]:
+            self._reference[:, k] = shaft.reference()
+            self._own_law[k] = True
+        constant, resistance = self._nominal_winding[k]
+        back_emf = constant * shaft.true_velocity
+        if drive.mode == PWM_MODE:
+            return drive.goal_pwm * supply
+        limit = drive.goal_pwm * supply
+        if drive.mode == CURRENT_MODE:
+            return float(np.clip(back_emf + resistance * drive.goal_current, -limit, limit))
+        acceleration = drive.profile_acceleration or law.NO_LIMIT
+        stood, moved = self._reference[:, k].tolist()
+        if drive.mode in POSITION_MODES:
+            speed = drive.profile_velocity or law.NO_LIMIT
+            acceleration = acceleration if drive.profile_velocity else law.NO_LIMIT
+            new = law.leg_profile_step(stood, moved, drive.goal_position, speed, acceleration, step)
+            kp, kd = drive.position_gain, 0.0
+        else:
+            kp, kd = drive.velocity_integral_gain, drive.velocity_gain
+            new = law.wheel_profile_step(stood, moved, drive.goal_velocity, acceleration, step, shaft.position, kp, supply)
+        self._reference[0, k], self._reference[1, k] = new[0], new[1]
+        voltage = law.controller_voltage(kp, kd, new[0], new[1], shaft.position, shaft.velocity, limit)
+        if drive.mode == CURRENT_POSITION_MODE:
+            room = resistance * abs(drive.goal_current)
+            voltage = np.clip(voltage, back_emf - room, back_emf + room)
+        return float(voltage)
+
+    def _tune(self) -> None:
+        """Hand gains, profiles and supply to the plant."""
+        for k, values in enumerate(self._tuning):
+            if len(values) == len(_TUNED):
+                for name, value in zip(_TUNED, values, strict=True):  # registers go beyond what a plant takes
+                    self._parameters[name][0, k] = np.clip(value, SPECS[name].low, SPECS[name].high)
+        self._plant_supply[0] = self.supply
+        self.plant.set_parameters(self._parameters)
+
+    # ---- plant to firmware ----
+
+    def _show_sensors(self) -> None:
+        sensors, self._output = self.sensors, None
+        position = self._zero + self._sign * (sensors.joint_position[0] + self._turned)
+        velocity = self._sign * sensors.joint_velocity[0]
+        load = self._sign * sensors.joint_effort[0] / self._nominal_stall
+        volt = float(sensors.supply_voltage[0])
+        columns = zip(self._servos, position.tolist(), velocity.tolist(), load.tolist(), strict=True)
+        for servo, p, v, strain in columns:
+            shaft = servo.shaft
+            shaft.load, shaft.voltage = strain, volt
+            shaft.move(p, v)
+
+    def _output_of(self, k: int) -> tuple[int, float]:
+        """Return counts of current or load, and part of the supply, of motor ``k``; worked out when a register is read."""
+        if self._output is None:
+            effort, velocity = self._sign * self.sensors.joint_effort[0], self._sign * self.sensors.joint_velocity[0]
+            counts = np.rint((effort + self._torque[0] * self._idle_effort * velocity) / self._effort_count)
+            constant, resistance = self._nominal_line
+            inferred = resistance / constant * effort + constant * velocity  # the plant does not tell its voltage
+            voltage = np.where(self._own_law, self._own_voltage, inferred)
+            pwm = np.where(self._torque[0], voltage / max(self._plant_supply[0], 1e-3), 0.0)
+            self._output = list(zip(counts.astype(int).tolist(), pwm.tolist(), strict=True))
+        return self._output[k]
+
+    def _reference_of(self, k: int) -> tuple[float, float]:
+        """Return where the profile generator of joint ``k`` stands: rad and rad/s, encoder frame."""
+        if self._own_law[k] or not self.plant.capabilities.can_set_state:
+            return self._reference[0, k], self._reference[1, k]
+        if self._plant_reference is None:
+            state = self.plant.mechanical_state()
+            position = state.reference_position[0].copy()
+            position[LEG_SLICE] += self.plant.parameters["joint.zero_offset"][0]
+            position += self._turned
+            self._plant_reference = np.stack([self._zero + self._sign * position, self._sign * state.reference_velocity[0]])
+        return self._plant_reference[0, k], self._plant_reference[1, k]
+
+    # ---- a hand ----
+
+    def set_friction(self, joint: str, torque: float) -> None:
+        """Let a joint's dry friction be ``torque`` (N m) from now on: what a hand does that holds it."""
+        check_name("joint", joint, JOINTS)
+        self._parameters["servo.coulomb_friction"][0, JOINTS.index(joint)] = torque
+        self.plant.set_parameters(self._parameters)
+
+    def turn(self, joint: str, angle: float) -> None:
+        """See :meth:`Machine.turn`."""
+        if not self.plant.capabilities.can_set_state or any(servo["torque_enable"] for servo in self._servos):
+            raise InputError(f"turn {joint}: motors are on, or this plant's state cannot be set")
+        k = JOINTS.index(joint)
+        wheels = self.sensors.joint_position[0, WHEEL_SLICE].copy()
+        if _IS_LEG[k]:
+            state = self.plant.mechanical_state()
+            state.joint_position[0, k] += angle
+            self.sensors = self.plant.reset(state=state)
+            self._turned[WHEEL_SLICE] += wheels  # a reset plant counts its wheels from zero
+        else:
+            self._turned[k] += angle
+        self._show_sensors()

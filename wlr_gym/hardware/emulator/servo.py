@@ -48,8 +48,6 @@ TIME_BASED = 4
 HOTTEST = 255
 #: One count of Bus Watchdog, s.
 _WATCHDOG_UNIT = 0.02
-#: Parameter of a factory reset -> what it keeps.
-_KEPT = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}
 
 
 class Registers:
@@ -58,27 +56,27 @@ class Registers:
     Args:
         table: of the servo's model.
         present: item -> works out its count; done when the item is read.
-        changed: called with an item's name after its count was set.
 
     Attributes:
         memory: the bytes.
         get: item -> the count it was set to last.
     """
 
-    def __init__(self, table: ControlTable, present: Mapping[str, Callable[[], int]], changed: Callable[[str], None]) -> None:
+    def __init__(self, table: ControlTable, present: Mapping[str, Callable[[], int]]) -> None:
         self.table = table
         self.memory: bytearray = bytearray(TABLE_SIZE)
         self._present = present
-        self._changed = changed
         items = table.items.values()
         self._counts = dict.fromkeys(table.items, 0)  # of items that are set; set alone writes it
         self.get: Callable[[str], int] = self._counts.__getitem__
         self._at = {item.address + k: item for item in items for k in range(item.size)}
         self._pointers = {
-            table[f"indirect_data_{k}"].address: table[f"indirect_address_{k}"]
-            for k in range(1, 1 + sum(item.name.startswith("indirect_data") for item in items))
+            item.address: table[name.replace("data", "address")]
+            for name, item in table.items.items()
+            if name.startswith("indirect_data")
         }
-        self._plans: dict[tuple[int, int], tuple[list[Item], list[int]]] = {}  # while no pointer is written
+        # Block -> items to work out before it is read, addresses of the bytes it stands for; until a pointer is written.
+        self._plans: dict[tuple[int, int], tuple[list[Item], list[int]]] = {}
 
     # ---- by name ----
 
@@ -100,14 +98,14 @@ class Registers:
             self._plans.clear()
         self._changed(name)
 
+    def _changed(self, name: str) -> None:
+        """Take note that an item's count was set."""
+
     def load_defaults(self, in_eeprom: bool) -> None:
         """Set the items of the EEPROM, or of the RAM, to their defaults."""
         items = [item for item in self.table.items.values() if item.in_eeprom == in_eeprom]
-        for item in items:  # plain defaults first: the others copy them
-            self.set(item.name, item.default if isinstance(item.default, int) else 0)
-        for item in items:
-            if isinstance(item.default, str):
-                self.set(item.name, self.get(item.default))
+        for item in sorted(items, key=lambda item: isinstance(item.default, str)):  # a copy comes after what it copies
+            self.set(item.name, self.get(item.default) if isinstance(item.default, str) else item.default or 0)
 
     # ---- by address ----
 
@@ -115,19 +113,14 @@ class Registers:
         """Return ``length`` bytes from ``address``; gaps read as 0."""
         if length == 0 or address + length > TABLE_SIZE:
             return Error.ACCESS, b""
-        block = (address, length)
-        if block not in self._plans:
-            self._plans[block] = self._plan(*block)
-        kept_up, places = self._plans[block]
+        if (address, length) not in self._plans:
+            places = [self._resolve(place) for place in range(address, address + length)]
+            inside = [item for place in places if (item := self._at.get(place)) and item.name in self._present]
+            self._plans[address, length] = list(dict.fromkeys(inside)), places
+        kept_up, places = self._plans[address, length]
         for item in kept_up:
             self._refresh(item)
         return Error.NONE, bytes([self.memory[place] for place in places])
-
-    def _plan(self, address: int, length: int) -> tuple[list[Item], list[int]]:
-        """Return the items to work out before a block is read, and the addresses of the bytes that it stands for."""
-        places = [self._resolve(place) for place in range(address, address + length)]
-        inside = [item for place in places if (item := self._at.get(place)) and item.name in self._present]
-        return list(dict.fromkeys(inside)), places
 
     def _refresh(self, item: Item) -> int:
         """Work an item out that the servo keeps up to date; return its count."""
@@ -289,8 +282,8 @@ class EncoderFrame:
         return self.direction * round(position / self._unit)
 
 
-class EmulatedServo:
-    """One servo.
+class EmulatedServo(Registers):
+    """One servo: its registers, and the firmware that works with them.
 
     Args:
         name: what faults and reports call it.
@@ -299,46 +292,31 @@ class EmulatedServo:
         firmware: version it reports; fast reads need 45.
 
     Attributes:
-        registers: its control table's content.
         shaft: written by the physics before :meth:`advance`.
         temperature: degC; a reboot does not cool the motor. heating_rate: degC/s that a fault adds.
         dead: no power at the electronics: silent, motor off.
-        set, read: see :class:`Registers`.
     """
 
     def __init__(self, name: str, table: ControlTable, eeprom: Mapping[str, int], firmware: int = FIRMWARE) -> None:
         self.name = name
-        self.table = table
         self.firmware = firmware
         self.shaft: Shaft = Shaft(voltage=table.supply)
         self.temperature, self.heating_rate = AMBIENT, 0.0
-        self._overload_time = 0.0
         self.dead = False
         self._drive: MotorDrive | None = None
         self._frame = EncoderFrame(table)
-        self.registers: Registers = Registers(table, self._make_present_values(), self._register_changed)
-        self._get = self.registers.get
-        self.set = self.registers.set
-        self.read = self.registers.read
-        self._load_eeprom()
-        for item_name, count in eeprom.items():
+        super().__init__(table, self._make_present_values(table))
+        self.load_defaults(in_eeprom=True)
+        for item_name, count in {"firmware_version": firmware, **eeprom}.items():
             self.set(item_name, count)
         self.boot(0.0)
 
-    def __getitem__(self, name: str) -> int:
-        """Return the count an item holds now."""
-        return self.registers[name]
-
-    def _register_changed(self, name: str) -> None:
+    def _changed(self, name: str) -> None:
         self._drive = None
         if name in EncoderFrame.ITEMS:
-            self._frame.update(self.registers)
+            self._frame.update(self)
 
     # ---- resets ----
-
-    def _load_eeprom(self) -> None:
-        self.registers.load_defaults(in_eeprom=True)
-        self.set("firmware_version", self.firmware)
 
     def boot(self, silence: float = BOOT_TIME, *, keep_clock: bool = False) -> None:
         """Start the firmware: RAM to its defaults, latches cleared, torque as Startup Configuration says.
@@ -347,56 +325,43 @@ class EmulatedServo:
             silence: s during which it does not answer.
             keep_clock: Realtime Tick goes on.
         """
-        self.registers.load_defaults(in_eeprom=False)
+        self.load_defaults(in_eeprom=False)
         self._overload_time = 0.0
-        self._registered = None
         self._clock = self._clock if keep_clock else 0.0
         self._silence = silence
         self._since_packet = 0.0
         self._shut_down = False
         self._goal_given = False
-        self._start_turn_count()
-        self._go_to_present()
-        if self._get("startup_configuration") & 1:
+        self._recount()
+        if self.get("startup_configuration") & 1:
             self._torque(True)
-
-    def factory_reset(self, keep: int) -> Error:
-        """Carry out a factory reset; ``keep``: FF nothing, 01 the id, 02 id and baud rate."""
-        if keep not in _KEPT:
-            return Error.DATA_RANGE
-        kept = {name: self._get(name) for name in _KEPT[keep]}
-        self._load_eeprom()
-        for name, count in kept.items():
-            self.set(name, count)
-        self.boot()
-        return Error.NONE
 
     # ---- the line's view ----
 
     @property
     def answers(self) -> bool:
         """Whether it is powered, booted and speaking Protocol 2."""
-        return not self.dead and self._silence <= 0.0 and self._get("protocol_type") == 2
+        return not self.dead and self._silence <= 0.0 and self.get("protocol_type") == 2
 
     @property
     def id(self) -> int:
         """Its id on the line."""
-        return self._get("id")
+        return self.get("id")
 
     @property
     def baud_rate(self) -> int:
         """Bits per second."""
-        return BAUD_RATES[self._get("baud_rate")]
+        return BAUD_RATES[self.get("baud_rate")]
 
     @property
     def return_delay(self) -> float:
         """s from an instruction's end to the answer's start."""
-        return self._get("return_delay_time") * 2e-6
+        return self.get("return_delay_time") * 2e-6
 
     @property
     def alert(self) -> int:
         """Alert bit of the status packets."""
-        return ALERT if self._get("hardware_error_status") else 0
+        return ALERT if self.get("hardware_error_status") else 0
 
     def set_power(self, on: bool) -> None:
         """Take the power away, or give it back (then :meth:`boot` it)."""
@@ -410,28 +375,11 @@ class EmulatedServo:
 
     def write(self, address: int, data: bytes) -> Error:
         """Write bytes; either all of it acts or nothing does."""
-        error, changes = self.registers.check_write(address, data)
+        error, changes = self.check_write(address, data)
         if error == Error.NONE:
             for item, count in changes:
                 self._apply(item, count)
         return error
-
-    def register(self, address: int, data: bytes) -> Error:
-        """Keep a write back until :meth:`action`."""
-        error, _ = self.registers.check_write(address, data)
-        if error == Error.NONE:
-            self._registered = (address, data)
-            self.set("registered_instruction", 1)
-        return error
-
-    def action(self) -> Error:
-        """Carry out the registered write."""
-        if self._registered is None:
-            return Error.INSTRUCTION
-        address, data = self._registered
-        self._registered = None
-        self.set("registered_instruction", 0)
-        return self.write(address, data)
 
     def clear(self, parameters: bytes) -> Error:
         """Bring Present Position back into one turn; refused while moving."""
@@ -439,8 +387,7 @@ class EmulatedServo:
             return Error.DATA_RANGE
         if self["moving"]:
             return Error.RESULT_FAIL
-        self._start_turn_count()
-        self._go_to_present()
+        self._recount()
         return Error.NONE
 
     # ---- writing ----
@@ -450,7 +397,7 @@ class EmulatedServo:
         if name == "torque_enable":
             self._torque(bool(count))
             return
-        changed = count != self._get(name)
+        changed = count != self.get(name)
         self.set(name, count)
         if name in GOAL_REGISTERS:
             self._take_goal(name)
@@ -463,19 +410,18 @@ class EmulatedServo:
         elif name == "bus_watchdog":
             self._since_packet = 0.0
         elif name == "drive_mode" and changed:
-            self._start_turn_count()
-            self._go_to_present()
+            self._recount()
 
     def _take_goal(self, name: str) -> None:
         self._goal_given = True
-        if name == "goal_position" and self._get("drive_mode") & TIME_BASED:  # a new mode asks by itself
+        if name == "goal_position" and self.get("drive_mode") & TIME_BASED:  # a new mode asks by itself
             self._profile_start = self.shaft.reference()[0]
-        if self._get("drive_mode") & 8 and not self._get("torque_enable"):
+        if self.get("drive_mode") & 8 and not self.get("torque_enable"):
             self._torque(True)
 
     def _torque(self, on: bool) -> None:
-        if on and not self._get("torque_enable") and not self._shut_down:
-            if self._get("operating_mode") == POSITION_MODE:
+        if on and not self.get("torque_enable") and not self._shut_down:
+            if self.get("operating_mode") == POSITION_MODE:
                 self._start_turn_count()
             if not self._goal_given:
                 self._go_to_present()
@@ -491,17 +437,21 @@ class EmulatedServo:
                 self.set(name, item.default)
         self.set("profile_velocity", 0)
         self.set("profile_acceleration", 0)
-        self.set("goal_pwm", self._get("pwm_limit"))
+        self.set("goal_pwm", self.get("pwm_limit"))
         if "goal_current" in self.table.items:
-            self.set("goal_current", self._get("current_limit"))
+            self.set("goal_current", self.get("current_limit"))
         self._goal_given = False
-        self._start_turn_count()
-        self._go_to_present()
+        self._recount()
 
     def _start_turn_count(self) -> None:
         """Present Position becomes the absolute angle within one turn (plus Homing Offset)."""
         self._frame.start_turn_count(self.shaft.position)
         self._drive = None
+
+    def _recount(self) -> None:
+        """Count turns from here, and ask for no motion."""
+        self._start_turn_count()
+        self._go_to_present()
 
     def _go_to_present(self) -> None:
         """Setpoints that ask for no motion."""
@@ -514,7 +464,7 @@ class EmulatedServo:
     def drive(self) -> MotorDrive:
         """Return what the firmware asks of the motor."""
         if self._drive is None:
-            si, get, sign = self.table.per_count, self._get, self._frame.direction
+            si, get, sign = self.table.per_count, self.get, self._frame.direction
             mode, goal = get("operating_mode"), self._frame.position(get("goal_position"))
             pwm = get("goal_pwm") / self.table.counts.full_pwm
             has_current = "goal_current" in self.table.items
@@ -536,8 +486,8 @@ class EmulatedServo:
 
     def _profile(self, way: float) -> tuple[float, float]:
         """Profile velocity and acceleration in SI units; time-based profiles for the ``way`` (rad) to the goal."""
-        velocity, acceleration = self._get("profile_velocity"), self._get("profile_acceleration")
-        if not self._get("drive_mode") & TIME_BASED:
+        velocity, acceleration = self.get("profile_velocity"), self.get("profile_acceleration")
+        if not self.get("drive_mode") & TIME_BASED:
             si = self.table.per_count
             return velocity * si("profile_velocity"), acceleration * si("profile_acceleration")
         duration, ramp = velocity * 1e-3, min(acceleration, velocity / 2) * 1e-3
@@ -556,8 +506,8 @@ class EmulatedServo:
             self._drive = None
             return
         self._since_packet += step
-        limit = self._get("bus_watchdog")
-        if limit > 0 and self._get("torque_enable") and self._since_packet > limit * _WATCHDOG_UNIT:
+        limit = self.get("bus_watchdog")
+        if limit > 0 and self.get("torque_enable") and self._since_packet > limit * _WATCHDOG_UNIT:
             self._watchdog_stop()
         if error := self._watch_itself(step):
             self.raise_error(error)
@@ -569,9 +519,9 @@ class EmulatedServo:
         self.temperature += step * ((equilibrium - self.temperature) / THERMAL_TIME + self.heating_rate)
         self._overload_time = self._overload_time + step if load > LARGEST_LOAD else 0.0
         error, supply = 0, round(self.shaft.voltage / self.table.counts.voltage)
-        if not self._get("min_voltage_limit") <= supply <= self._get("max_voltage_limit"):
+        if not self.get("min_voltage_limit") <= supply <= self.get("max_voltage_limit"):
             error |= INPUT_VOLTAGE
-        if self.temperature > self._get("temperature_limit"):
+        if self.temperature > self.get("temperature_limit"):
             error |= OVERHEATING
         if self._overload_time > OVERLOAD_TIME:
             error |= OVERLOAD
@@ -587,7 +537,7 @@ class EmulatedServo:
         self.set("profile_velocity", 0)
         self.set("profile_acceleration", 0)
         self._go_to_present()
-        mode = self._get("operating_mode")
+        mode = self.get("operating_mode")
         if mode == PWM_MODE:
             self.set("goal_pwm", 0)
         if mode == CURRENT_MODE:
@@ -595,39 +545,38 @@ class EmulatedServo:
 
     def raise_error(self, error: int) -> None:
         """Set bits of Hardware Error Status, until the next reboot; shut down where Shutdown says so."""
-        status = self._get("hardware_error_status") | error
+        status = self.get("hardware_error_status") | error
         self.set("hardware_error_status", status)
-        if status & self._get("shutdown") and not self._shut_down:
+        if status & self.get("shutdown") and not self._shut_down:
             self._shut_down = True
             self._torque(False)
 
     # ---- reading ----
 
-    def _make_present_values(self) -> dict[str, Callable[[], int]]:
+    def _make_present_values(self, table: ControlTable) -> dict[str, Callable[[], int]]:
         """How to work out the items that the servo itself keeps up to date; done when they are read."""
-        si, shaft = self.table.per_count, self.shaft
-        effort, full_pwm = self.table.effort, self.table.counts.full_pwm
-        speed, volt = si("present_velocity"), self.table.counts.voltage
+        shaft, speed = self.shaft, table.per_count("present_velocity")
+        volt, full_pwm = table.counts.voltage, table.counts.full_pwm
         return {
             "realtime_tick": lambda: int(self._clock * 1000 + 1e-6) % 32768,
             "present_pwm": lambda: self._frame.direction * round(shaft.output()[1] * full_pwm),
-            effort: lambda: self._frame.direction * shaft.output()[0],
+            table.effort: lambda: self._frame.direction * shaft.output()[0],
             "present_velocity": lambda: self._frame.direction * round(shaft.velocity / speed),
             "present_position": lambda: self._frame.count(shaft.position),
             "velocity_trajectory": lambda: self._frame.direction * round(shaft.reference()[1] / speed),
             "position_trajectory": lambda: self._frame.count(shaft.reference()[0]),
             "present_input_voltage": lambda: max(0, round(shaft.voltage / volt)),
             "present_temperature": lambda: min(round(self.temperature), HOTTEST),
-            "moving": lambda: int(abs(round(shaft.velocity / speed)) > self._get("moving_threshold")),
+            "moving": lambda: int(abs(round(shaft.velocity / speed)) > self.get("moving_threshold")),
             "moving_status": self._moving_status,
-            "led": lambda: int(self._clock) % 2 if self._shut_down else self._get("led"),
+            "led": lambda: int(self._clock) % 2 if self._shut_down else self.get("led"),
         }
 
     def _moving_status(self) -> int:
-        if self._get("operating_mode") not in POSITION_MODES:
+        if self.get("operating_mode") not in POSITION_MODES:
             return 0
-        goal, present = self._get("goal_position"), self._frame.count(self.shaft.position)
+        goal, present = self.get("goal_position"), self._frame.count(self.shaft.position)
         reference = self._frame.count(self.shaft.reference()[0])
-        profile = 0 if self._get("profile_velocity") == 0 else 3 if self._get("profile_acceleration") else 1
+        profile = 0 if self.get("profile_velocity") == 0 else 3 if self.get("profile_acceleration") else 1
         flags = (abs(goal - present) <= IN_POSITION, reference != goal, False, abs(reference - present) > IN_POSITION)
         return profile << 4 | sum(flag << bit for bit, flag in enumerate(flags))

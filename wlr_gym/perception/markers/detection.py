@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -405,10 +406,15 @@ _OFFSET = 6
 _LARGEST_AXIS_RATIO = 4.0
 _ELLIPSE_TOLERANCE = 0.15  # of the area
 _LEAST_MATCH = 0.78  # correlation of a brightness profile with a code
-_RADII = np.array([ring_radii(code) for code in range(len(CODE_NAMES))])
-#: Profile of every code: +1 white, -1 black, at these shares of the outer radius.
+#: Shares of the outer radius at which a brightness profile is taken.
 _GRID = (np.arange(26) + 0.5) / 20
-_PROFILES = np.array([[1.0 if rho > 1 or r3 < rho < r2 else -1.0 for rho in _GRID] for _, r2, r3 in _RADII])
+
+
+@cache
+def _codes() -> tuple[Array, Array]:
+    """Return radii (codes, 3) and profiles (codes, 26) of every code: +1 white, -1 black."""
+    radii = np.array([ring_radii(code) for code in range(len(CODE_NAMES))])
+    return radii, np.array([[1.0 if rho > 1 or r3 < rho < r2 else -1.0 for rho in _GRID] for _, r2, r3 in radii])
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,7 +449,7 @@ def refine(image: Image, camera: Array, ellipse: Array, code: int) -> Detection 
     """Fit a marker of a known code near a guessed ellipse (6,), px; None where there is none. ``camera``: its ``values``."""
     guess, shape, quality = np.array(ellipse, float), np.empty(6), np.empty(4)
     centres, covariances = np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan)
-    if not fit_marker(image, camera, guess, _RADII[code], centres, covariances, shape, quality):
+    if not fit_marker(image, camera, guess, _codes()[0][code], centres, covariances, shape, quality):
         return None
     if quality[RADIUS_ERROR] > 0.1:
         return None
@@ -506,14 +512,15 @@ def _same_place(ellipse: Array, other: Detection) -> bool:
 
 def _identify(image: Image, camera: Array, ellipse: Array) -> Detection | None:
     """Try the codes and edges whose profile fits, the best first."""
-    scores = np.empty((len(_RADII), 3))
-    _match(image, ellipse, _RADII, _PROFILES, _GRID, scores)
+    radii, profiles = _codes()
+    scores = np.empty((len(radii), 3))
+    _match(image, ellipse, radii, profiles, _GRID, scores)
     for index in np.argsort(-scores, axis=None)[:2]:
         code, edge = divmod(int(index), 3)
         if not scores[code, edge] > _LEAST_MATCH:
             return None
         guess = ellipse.copy()
-        guess[2:] /= _RADII[code, edge]
+        guess[2:] /= radii[code, edge]
         found = refine(image, camera, guess, code)
         if found is not None and found.radius > SMALLEST_RADIUS:
             return found
