@@ -182,8 +182,6 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     Raises:
         InputError: the robot waits for an operator's signs, which nobody gives here.
     """
-    from wlr_gym.data.record import start_setpoints
-
     refuse_deadman(plant)
     loop, robot = plant.loop, plant.robot
     state = standing_state(robot, Parameters.nominal(robot))
