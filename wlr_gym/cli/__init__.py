@@ -24,6 +24,7 @@ from typing import Any
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError, MissingPackageError, nearest, unknown_name
+from wlr_gym.base.jobs import import_modules
 
 #: Exit codes; an interrupted command ends as a shell reports SIGINT (128 + 2).
 OK = 0
@@ -130,10 +131,8 @@ def _import_modules(words: list[str]) -> list[str]:
     IMPORTED.clear()
     while words and words[0].partition("=")[0] == "--import":
         module, words = (words[0].partition("=")[2], words[1:]) if "=" in words[0] else ("".join(words[1:2]), words[2:])
-        if os.getcwd() not in sys.path:
-            sys.path.insert(0, os.getcwd())  # as for python -m: modules lie where one works
         try:
-            importlib.import_module(module)
+            import_modules([module])
         except (ModuleNotFoundError, TypeError, ValueError) as error:
             raise InputError(f"--import {module}: expected a module of Python: {error}") from None
         IMPORTED.append(module)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import heading, table
 from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, filmed, paragraph
 from wlr_gym.envs.tasks.task import having
@@ -21,13 +19,12 @@ from wlr_gym.learning.evaluation.card import rows
 if TYPE_CHECKING:
     from wlr_gym.learning.evaluation import Rollout
     from wlr_gym.learning.evaluation.metrics import Metric
+    from wlr_gym.policy import TrainingProgress
 
 LEARN_TITLE = "1. A policy learns"
 REFERENCES = ("do_nothing", "pid")
 #: The highest reward per second: both tracking terms of the task have weight 1.
 BEST = 2.0
-#: s between two looks at the learning curve.
-_LOOK = 0.5
 
 
 def train(demo: Demo, tell: Tell) -> Section:
@@ -35,10 +32,13 @@ def train(demo: Demo, tell: Tell) -> Section:
     from wlr_gym.learning.evaluation import plots, read_curve
     from wlr_gym.policy import Training, load_agent, load_agent_config
 
+    def on_update(done: TrainingProgress) -> None:
+        steps, reward = f"{done.steps / 1e6:.1f} of {demo.steps / 1e6:.1f} million steps", done.metrics["reward_per_second"]
+        tell(f"training: {steps}, reward {reward:.2f} per second", 0.93 * done.steps / demo.steps)
+
     config = load_agent_config("ppo") | {"seed": demo.seed, "total_steps": demo.steps}
     tell("training: compiling the simulator", 0.0)
-    with _watched(demo, tell):
-        load_agent("ppo").train(Training(ENVIRONMENT, demo.training, config, progress=False))
+    load_agent("ppo").train(Training(ENVIRONMENT, demo.training, config, progress=False, on_update=on_update))
     tell("training: episodes of the new policy and of references", 0.93)
     references = {name: _reward_per_second(_play_alone(name, demo)) for name in REFERENCES}
     episodes = _play_alone(demo.training / "policy", demo)
@@ -80,32 +80,6 @@ def behind(reward: float, references: Mapping[str, float]) -> list[str]:
     better = [f"{name} ({value:.2f})" for name, value in references.items() if value > reward]
     said = f"in whole episodes, {listed(better)} gets more reward per second than the new policy ({reward:.2f})"
     return [said] if better else []
-
-
-@contextmanager
-def _watched(demo: Demo, tell: Tell) -> Iterator[None]:
-    """Report the training's progress, by its learning curve, until it is over."""
-    from wlr_gym.learning.evaluation import read_curve
-
-    over = threading.Event()
-
-    def watch() -> None:
-        while not over.wait(_LOOK):
-            try:
-                done = read_curve(demo.training / "learning_curve.csv")[-1]
-            except (InputError, IndexError):
-                continue
-            reward = f"reward {done['reward_per_second']:.2f} per second"
-            said = f"training: {done['steps'] / 1e6:.1f} of {demo.steps / 1e6:.1f} million steps, {reward}"
-            tell(said, 0.93 * done["steps"] / demo.steps)
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        over.set()
-        watcher.join()
 
 
 def _play_alone(source: str | Path, demo: Demo) -> Rollout:

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import json
 import queue
-import signal
 import threading
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from wlr_gym.base.errors import InputError, MissingPackageError, require_package
-from wlr_gym.base.jobs import PATIENCE, Job, Send, serve, start
+from wlr_gym.base.jobs import Job, Send, serve, start, stop
 from wlr_gym.demo import diagnosis, policies, retraining
 from wlr_gym.demo.stage import FAILED, SKIPPED, Demo, DemoStage, Section, paragraph
 
@@ -53,15 +51,25 @@ def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
 
     Ctrl-C ends the workers in good order.
     """
-    inbox: queue.Queue[tuple[str, dict[str, Any] | None]] = queue.Queue()
+    inbox: queue.Queue[tuple[str, str]] = queue.Queue()  # worker and a line that it said; an empty one: it has ended
     found: dict[str, list[Section]] = {worker: [] for worker in WORKERS}
-    interrupted = False
-    running = {worker: _start(worker, demo, inbox) for worker in WORKERS}
+    interrupted, running = False, {}
+
+    def read(worker: str) -> None:
+        for line in running[worker].stdout:
+            inbox.put((worker, line))
+        inbox.put((worker, ""))
+
     try:
+        for worker in WORKERS:
+            task = {"worker": worker, "demo": {**asdict(demo), "out": str(demo.out)}}
+            running[worker] = start(Job(worker, "wlr_gym.demo.workers", task, str(demo.out / "log.txt")))
+            threading.Thread(target=read, args=(worker,), daemon=True).start()
         while running:
             try:
-                worker, message = inbox.get()
-                if message is None:
+                worker, line = inbox.get()
+                message = json.loads(line or "{}")
+                if not line:
                     running.pop(worker).wait()
                 elif "section" in message:
                     found[worker].append(Section(**message["section"]))
@@ -69,11 +77,7 @@ def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
                     tell(worker, message["text"], message["share"])
             except KeyboardInterrupt:
                 interrupted = True
-                for process in running.values():
-                    process.send_signal(signal.SIGINT)
-                    killer = threading.Timer(PATIENCE, process.kill)
-                    killer.daemon = True
-                    killer.start()
+                stop(running.values())  # what they say meanwhile comes into the inbox
     finally:
         for process in running.values():
             process.kill()
@@ -82,20 +86,6 @@ def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
         missing = stages[len(found[worker]) :]
         found[worker] += [Section(one.title, "", paragraph(f"Not reached: {why}"), verdict) for one in missing]
     return [section for sections in found.values() for section in sections], interrupted
-
-
-def _start(worker: str, demo: Demo, inbox: queue.Queue[Any]) -> Any:
-    """Start a worker, and a thread that puts all it sends into the inbox; return its process."""
-    task = {"worker": worker, "demo": {**asdict(demo), "out": str(demo.out)}}
-    process = start(Job(worker, "wlr_gym.demo.workers", task, str(demo.out / "log.txt")))
-
-    def read() -> None:
-        for line in process.stdout:
-            inbox.put((worker, json.loads(line)))
-        inbox.put((worker, None))
-
-    threading.Thread(target=read, daemon=True).start()
-    return process
 
 
 # ---- a worker --------------------------------------------------------------------------------------------------------
