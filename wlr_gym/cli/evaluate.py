@@ -21,6 +21,7 @@ from wlr_gym.cli.options import (
     ForceOption,
     JsonOption,
     PatchOption,
+    ProgressOption,
     Seconds,
     Seed,
     SensorsOption,
@@ -84,7 +85,7 @@ FULL_BLOCKS = 5
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
+class EvaluateOptions(ProgressOption, JsonOption, ForceOption, PatchOption, SensorsOption):
     policy: tyro.conf.Positional[tuple[str, ...]] = ()
     """Agent, policy file (.onnx), policy or run folder, or shipped policy; NAME=POLICY names it. Several, NAME=POLICY,POLICY, a
     pattern ('out/five/trials/*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
@@ -129,8 +130,6 @@ class EvaluateOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     """Film (.webp, .gif, .png, .mp4) of the first episode: the policy, beside the first baseline where there is one."""
     video_seconds: Seconds = 10.0
     """Length of the film."""
-    progress: bool = True
-    """Show a progress bar."""
 
 
 def run(options: EvaluateOptions) -> int:

@@ -14,14 +14,14 @@ from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption, PatchOption, Seed, environment_of, refuse_given
+from wlr_gym.cli.options import JsonOption, PatchOption, ProgressOption, Seed, environment_of, refuse_given
 from wlr_gym.cli.terminal import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
 from wlr_gym.policy import Training, TrainingProgress, find_policy
 
 
 @dataclass(frozen=True)
-class TrainOptions(JsonOption, PatchOption):
+class TrainOptions(ProgressOption, JsonOption, PatchOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id (see: wlr envs); default: that of --init, else WLR-Velocity-v0."""
     agent: str = "ppo"
@@ -46,8 +46,6 @@ class TrainOptions(JsonOption, PatchOption):
     """With --resume: go on until so many environment steps, at the rate at which the run's schedule ended."""
     max_minutes: Annotated[float, Interval("min", above=0.0)] | None = None
     """Stop in good order after this time."""
-    progress: bool = True
-    """Show a progress bar."""
 
 
 def run(options: TrainOptions) -> int:

@@ -14,7 +14,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, Seconds, require_simulator
+from wlr_gym.cli.options import PatchOption, RunsRobotOption, Seconds, require_simulator
 from wlr_gym.render.web.page import HOST, PORT
 
 if TYPE_CHECKING:
@@ -25,13 +25,11 @@ FIRST = ("cam_xy", "vel_wheel", "pos_leg")
 
 
 @dataclass(frozen=True)
-class ViewOptions(PatchOption):
+class ViewOptions(RunsRobotOption, PatchOption):
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Runs (CSV or Parquet), or folders of runs."""
     backend: str = "gibbs_appell"
     """Simulator of the ghost."""
-    robot: str | None = None
-    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     ghost: bool = True
     """Replay the run, and show that robot, too."""
     segment: float = 10.0

@@ -24,7 +24,7 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, Seconds, settings_of
+from wlr_gym.cli.options import JsonOption, OutOption, RunsRobotOption, Seconds, settings_of
 from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.perception.markers.targets import Target
 
@@ -37,21 +37,17 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class VisionOptions(JsonOption, ForceOption):
+class VisionOptions(JsonOption, OutOption, RunsRobotOption):
     video: Positional[str]
     """Video file, folder of images, or number of a live camera: filmed until Ctrl-C, or --seconds."""
     run: Path
     """What the robot logged meanwhile (CSV or Parquet); with a live camera it may appear while it films."""
-    out: Path
-    """Folder for the results; made if it is not there."""
     camera: Path
     """Calibration file; make one with: wlr calibrate camera."""
     markers: str = "body"
     """Markers on the robot: name in configs/vision/ or path."""
     floor: str = "floor"
     """Markers on the floor: name in configs/vision/ or path."""
-    robot: str | None = None
-    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     offset: float | None = None
     """Servo time minus camera time, s; default: found from the motion."""
     around: float = 0.0

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
-import operator
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -81,6 +80,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("coulomb_friction", "N m", 0.03, 0.03, 0.0, 0.5),
     Quantity("viscous_friction", "N m s/rad", 0.005, 0.01, 0.0, 0.2),
 )
+#: Names of these.
+CALIBRATED = frozenset(quantity.name for quantity in QUANTITIES)
 
 
 # ---- its effects -----------------------------------------------------------------------------------------------------
@@ -91,13 +92,11 @@ class RigEffect(RigLaw):
     """An effect as the rig knows it.
 
     Attributes:
-        acts: number of the model -> parameter that changes it.
-        how: from the number and the parameter to the changed number.
+        acts: number of the model -> parameter that it is, or by which a calibrated number grows.
         least: below these values of its parameters it is another effect.
     """
 
     acts: Mapping[str, str]
-    how: Callable[[float, float], float] = operator.add
     least: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -113,16 +112,12 @@ class RigEffect(RigLaw):
 
     def apply(self, numbers: Numbers, effect: PatchEffect) -> None:
         """Write the effect with its parameters into ``numbers``."""
-        values = {}
-        for key, parameter in self.parameters.items():
+        for target, key in self.acts.items():
+            parameter = self.parameters[key]
             if key not in effect.parameters and not parameter.optional:
                 raise InputError(f"{effect.name}: has no '{key}' ({parameter.unit})")
-            values[key] = float(effect.parameters.get(key, float(parameter.neutral)))
-        numbers.update({target: self.how(numbers[target], values[parameter]) for target, parameter in self.acts.items()})
-
-
-def _put(old: float, new: float) -> float:
-    return new
+            value = float(effect.parameters.get(key, float(parameter.neutral)))
+            numbers[target] = numbers[target] + value if target in CALIBRATED else value
 
 
 def _library(name: str, guesses: tuple[Guess, ...], **more: Any) -> RigEffect:
@@ -159,7 +154,7 @@ RIG_EFFECTS: dict[str, RigEffect] = {
     "viscous_friction": _library("viscous_friction", _steps("coefficient", 0.005), acts={"viscous_friction": "coefficient"}),
     "load_dependent_friction": _library("load_dependent_friction", _steps("ratio", 0.1, 0.3), acts={"load_friction": "ratio"}),
     "backlash": _library("backlash", _steps("angle", 0.01, 0.03, 0.06), acts={"play": "angle"}),
-    "weak_motor": _library("weak_motor", _steps("scale", -0.1, neutral=1.0), acts={"torque_scale": "scale"}, how=operator.mul),
+    "weak_motor": _library("weak_motor", _steps("scale", -0.1, neutral=1.0), acts={"torque_scale": "scale"}),
     "command_delay": _library("command_delay", _steps("delay", 0.01, 0.03), acts={"delay": "delay"}),
     "torque_saturation": RigEffect(
         "torque falls behind the current: K I / (1 + coefficient |I|)",
@@ -185,29 +180,24 @@ RIG_EFFECTS: dict[str, RigEffect] = {
         {"torque": EffectParameter("N m", "the limit", 0.01, NO_TORQUE_LIMIT, NO_TORQUE_LIMIT, (0.45, NO_TORQUE_LIMIT), 0.6)},
         tuple(_limit(torque) for torque in (0.5, 0.6, 0.75)),
         acts={"torque_limit": "torque"},
-        how=_put,
     ),
     "stribeck_friction": _library(
         "stribeck_friction",
         tuple(_stribeck(speed) for speed in (0.05, 0.2, 0.8)),
         refines="coulomb_friction",  # more of it at rest than in motion
         acts={"stribeck_torque": "extra_static_torque", "stribeck_speed": "stribeck_speed"},
-        how=_put,
     ),
     "torque_ripple": _library(
         "torque_ripple",
         tuple(_ripple(float(order)) for order in (6, 8, 12, 16, 24, 32, 48, 64)),
         acts={"ripple_amplitude": "amplitude", "ripple_order": "order", "ripple_phase": "phase"},
-        how=_put,
         least={"order": 6.0},  # slower, it does not repeat within the swing and is an error of the load or of its zero
     ),
 }
 #: What the effects change, where none is.
 _NEUTRAL: Numbers = {
-    "coulomb_friction": 0.0, "viscous_friction": 0.0, "stribeck_torque": 0.0, "stribeck_speed": 0.1, "load_friction": 0.0,
-    "play": 0.0, "ripple_amplitude": 0.0, "ripple_order": 1.0, "ripple_phase": 0.0, "torque_scale": 1.0,
-    "saturation": 0.0, "torque_limit": NO_TORQUE_LIMIT, "quadratic_friction": 0.0, "thermal": 0.0,
-}  # fmt: skip
+    target: float(effect.parameters[key].neutral) for effect in RIG_EFFECTS.values() for target, key in effect.acts.items()
+}
 
 
 def pendulum_patch(source: Source) -> Patch:
@@ -479,13 +469,13 @@ class PendulumProblem(RigProblem):
     """
 
     metric = "RMS over whole runs and over windows of 0.2 s of measured-minus-replayed angle, in units of sensor noise"
+    in_model = CALIBRATED
 
     def __init__(self, recordings: Sequence[Recording], known: Sequence[PatchEffect] = ()) -> None:
         if not recordings:
             raise InputError("no recordings to analyse")
         position = MeasuredSignal("position", "rad", ENCODER_NOISE, "position")
         super().__init__(JOINT, recordings, (position,), QUANTITIES, RIG_EFFECTS, WINDOWS, known)
-        self.in_model: Set[str] = {quantity.name for quantity in QUANTITIES}
         self.recordings: tuple[Recording, ...] = tuple(recordings)
         self.held_out: tuple[str, ...] = spread_over_conditions(self.recordings)
         self.replays: list[Replay] = [Replay(recording) for recording in recordings]
