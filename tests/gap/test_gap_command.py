@@ -119,7 +119,7 @@ def test_options_reach_the_analysis(data, tmp_path, answer):
         (["--threads", "0"], "--threads 0: expected 1 or more"),
         (["--effects", "nothing_like_it"], "--effects: unknown effects config 'nothing_like_it'"),
         (["--effects", "knwon.yaml"], "--effects: effects config: no file 'knwon.yaml'"),
-        (["--rig", "pendulum", "--effects", "icy_patch"], "unknown effect of the test rig 'friction_patch'"),
+        (["--rig", "pendulum", "--effects", "icy_patch"], "unknown effect 'friction_patch'"),
         (["--until-decided", "--budget-runs", "-1"], "--budget-runs -1: expected 0 or more"),
         (["--budget-runs", "2"], "--budget-runs: it is for --until-decided"),
         (["--record", "emulated"], "--record: it is for --until-decided"),

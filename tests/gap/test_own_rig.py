@@ -13,8 +13,8 @@ import yaml
 from wlr_gym.base.errors import InputError
 from wlr_gym.gap.estimation.model import level, mean_squares
 from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting
-from wlr_gym.gap.rig.own import CompiledRig, OwnRigProblem, check_rig, load_rig, open_own_rig, own_patch, read_rig_runs
-from wlr_gym.gap.workflow import analyse
+from wlr_gym.gap.rig.own import CompiledRig, OwnRigProblem, check_rig, load_rig, open_own_rig, read_rig_runs
+from wlr_gym.gap.workflow import analyse, known_patch
 
 FILE = Path(__file__).resolve().parents[2] / "examples" / "linear_axis.py"
 PAGE = FILE.parents[1] / "docs" / "own_rig.md"
@@ -250,10 +250,10 @@ def test_equations_that_cannot_be_compiled_are_named(runs):
 def test_patches_are_read_by_the_rigs_own_laws(tmp_path):
     path = tmp_path / "patch.yaml"
     path.write_text(yaml.safe_dump({"effects": [{"name": "load", "where": ["axis"], "parameters": {"load": 0.4}}]}))
-    assert own_patch(path, AXIS).effects[0].parameters == {"load": 0.4}
-    with pytest.raises(InputError, match=r"unknown effect of the test rig 'lod'.*load"):
-        own_patch({"name": "lod", "parameters": {}}, AXIS)
-    with pytest.raises(InputError, match="the rig has one joint, axis"):
-        own_patch({"name": "load", "where": ["servo"], "parameters": {"load": 0.4}}, AXIS)
-    with pytest.raises(InputError, match="unknown effect of the test rig 'unknown_effect'"):
-        own_patch({"name": "unknown_effect", "formula": "-b * rate"}, AXIS)
+    assert known_patch(path, FILE).effects[0].parameters == {"load": 0.4}
+    with pytest.raises(InputError, match=r"unknown effect 'lod'.*load"):
+        known_patch({"name": "lod", "parameters": {}}, FILE)
+    with pytest.raises(InputError, match="unknown where 'servo'; valid: axis"):
+        known_patch({"name": "load", "where": ["servo"], "parameters": {"load": 0.4}}, FILE)
+    with pytest.raises(InputError, match="unknown effect 'unknown_effect'"):
+        known_patch({"name": "unknown_effect", "formula": "-b * rate"}, FILE)

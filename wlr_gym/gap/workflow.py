@@ -359,12 +359,15 @@ def known_patch(known: Source, rig: str | Path | None) -> Patch:
     """
     if rig is None:
         return load_patch(known)
-    if rig in RIGS:
-        from wlr_gym.gap.rig.pendulum import pendulum_patch
+    from wlr_gym.gap.rig.problem import rig_patch
 
-        return pendulum_patch(known)
+    if rig in RIGS:
+        from wlr_gym.gap.rig.pendulum import JOINT, RIG_EFFECTS
+
+        return rig_patch(known, RIG_EFFECTS, JOINT)
     if Path(rig).suffix != OWN_RIG:
         raise unknown_name("rig", str(rig), RIGS)
-    from wlr_gym.gap.rig.own import load_rig, own_patch
+    from wlr_gym.gap.rig.own import load_rig
 
-    return own_patch(known, load_rig(rig))
+    own = load_rig(rig)
+    return rig_patch(known, own.laws, own.name)

@@ -29,9 +29,9 @@ from wlr_gym.base.random import generator
 from wlr_gym.base.text import row_words
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting, since_reversal
-from wlr_gym.gap.rig.problem import RigLaw, RigProblem, few_runs, rig_patch, smoothed_state
+from wlr_gym.gap.rig.problem import RigLaw, RigProblem, few_runs, smoothed_state
 from wlr_gym.physics.codegen.expression import finite_number
-from wlr_gym.physics.effects import EffectParameter, Patch, PatchEffect, Source
+from wlr_gym.physics.effects import EffectParameter, PatchEffect
 
 __all__ = ["EffectParameter", "MeasuredSignal", "Quantity", "Rig", "RigLaw"]
 
@@ -356,11 +356,6 @@ def open_own_rig(
     runs = read_rig_runs(data, rig)
     too_few = few_runs(f"{len(runs)} runs", len(runs))
     return (None, too_few) if too_few else (OwnRigProblem(runs, CompiledRig(rig), known), [])
-
-
-def own_patch(source: Source, rig: Rig) -> Patch:
-    """Load a patch of the rig, as its analyses write it; see :func:`wlr_gym.gap.rig.problem.rig_patch`."""
-    return rig_patch(source, rig.laws, rig.name)
 
 
 class OwnRigProblem(RigProblem):

@@ -27,11 +27,11 @@ from wlr_gym.base.random import generator
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting, Unknown, since_reversal
 from wlr_gym.gap.rig.pendulum_recordings import DUTY_PER_GAIN, Recording, findings, read_recordings
-from wlr_gym.gap.rig.problem import RigLaw, RigProblem, few_runs, rig_patch, smoothed_state
+from wlr_gym.gap.rig.problem import RigLaw, RigProblem, few_runs, smoothed_state
 from wlr_gym.gap.validation.data_split import HELD_OUT_SHARE
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import Graph, emit, load_module, ops
-from wlr_gym.physics.effects import EFFECTS, EffectParameter, Patch, PatchEffect, Source
+from wlr_gym.physics.effects import EFFECTS, EffectParameter, Patch, PatchEffect
 from wlr_gym.physics.effects.effect import Change, Guess, one_step
 from wlr_gym.physics.plants import drive
 
@@ -198,11 +198,6 @@ RIG_EFFECTS: dict[str, RigEffect] = {
 _NEUTRAL: Numbers = {
     target: float(effect.parameters[key].neutral) for effect in RIG_EFFECTS.values() for target, key in effect.acts.items()
 }
-
-
-def pendulum_patch(source: Source) -> Patch:
-    """Load a patch of the rig, as its analyses write it; see :func:`wlr_gym.gap.rig.problem.rig_patch`."""
-    return rig_patch(source, RIG_EFFECTS, JOINT)
 
 
 # ---- its law, one substep --------------------------------------------------------------------------------------------

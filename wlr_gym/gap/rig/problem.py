@@ -10,22 +10,16 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, check_name
-from wlr_gym.base.paths import find_config
-from wlr_gym.base.settings import read_yaml
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, Start, Unknown
-from wlr_gym.physics.codegen.expression import finite_number
-from wlr_gym.physics.effects import EffectParameter, Patch, PatchEffect, Source, compose
+from wlr_gym.physics.effects import EffectParameter, Patch, PatchEffect, Source, load_patch
 from wlr_gym.physics.effects.effect import Change, Guess
-from wlr_gym.robot.parameter_table import range_in_words
 
 Array = NDArray[np.float64]
 
@@ -244,54 +238,19 @@ def _guess(law: RigLaw) -> Guess:
 # ---- patches ---------------------------------------------------------------------------------------------------------
 
 
+class _LawAt(NamedTuple):
+    """A law of a rig as patch files have it: where it acts, and its parameters."""
+
+    where: tuple[str, ...]
+    parameters: Mapping[str, EffectParameter]
+
+
 def rig_patch(source: Source, laws: Mapping[str, RigLaw], joint: str) -> Patch:
-    """Load a patch of a rig, as its analyses write it.
+    """Load a patch of a rig, as its analyses write it; see :func:`wlr_gym.physics.effects.load_patch`.
 
     Args:
-        source: as for :func:`wlr_gym.physics.effects.load_patch`.
+        source: as there.
         laws: what the rig knows.
         joint: the one place where they act.
-
-    Raises:
-        InputError: naming file, effect, key and the nearest valid name.
     """
-    if source is None or isinstance(source, Patch):
-        return source or Patch()
-    if isinstance(source, str | Path):
-        path = find_config("effects", source)
-        content, name = read_yaml(path), str(path)
-    elif isinstance(source, Mapping):
-        content, name = {"effects": [source]} if "name" in source else source, "effects"
-    elif isinstance(source, Sequence):
-        return compose(*(rig_patch(one, laws, joint) for one in source))
-    else:
-        raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
-    entries = content.get("effects") if isinstance(content, Mapping) else None
-    if not isinstance(entries, list | tuple):
-        raise InputError(f"{name}: expected a mapping with 'effects', a list of effects")
-    origin = content.get("provenance") or {}
-    if not isinstance(origin, Mapping):
-        raise InputError(f"{name}: provenance = {origin!r}: expected a mapping")
-    found = tuple(_effect(entry, f"{name}: effect {k}", laws, joint) for k, entry in enumerate(entries, 1))
-    return Patch(found, dict(origin), name)
-
-
-def _effect(entry: Any, place: str, laws: Mapping[str, RigLaw], joint: str) -> PatchEffect:
-    if not isinstance(entry, Mapping) or not isinstance(entry.get("parameters", {}), Mapping):
-        raise InputError(f"{place}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}")
-    name, given = str(entry.get("name")), entry.get("parameters", {})
-    check_name("effect of the test rig", name, laws, place)
-    place = f"{place} ({name})"
-    if entry.get("where", joint) not in (joint, [joint], (joint,)):
-        raise InputError(f"{place}: where = {entry['where']!r}: the rig has one joint, {joint}")
-    known, numbers = laws[name].parameters, {}
-    for key in given:
-        check_name("parameter", key, known, place)
-    for key, spec in known.items():
-        value = given.get(key)
-        number = finite_number(spec.neutral if value is None and spec.optional else value)
-        if number is None or not spec.low <= number <= spec.high:
-            expected = f"a number in {range_in_words(spec.low, spec.high, spec.unit)}"
-            raise InputError(f"{place}: {key} = {value!r}: expected {expected}")
-        numbers[key] = number
-    return PatchEffect(name, (joint,), numbers, place=place)
+    return load_patch(source, {name: _LawAt((joint,), law.parameters) for name, law in laws.items()})

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import yaml
 
@@ -100,12 +100,27 @@ class Patch:
 Source = Patch | str | Path | Mapping[str, Any] | Sequence[Any] | None
 
 
-def load_patch(source: Source) -> Patch:
+class EffectKind(Protocol):
+    """What a patch file may say of an effect: its places and its parameters."""
+
+    @property
+    def where(self) -> tuple[str, ...]: ...
+
+    @property
+    def parameters(self) -> Mapping[str, EffectParameter]: ...
+
+
+#: Name -> effect that a patch may have; None = those of the library, and formulas.
+EffectKinds = Mapping[str, EffectKind] | None
+
+
+def load_patch(source: Source, kinds: EffectKinds = None) -> Patch:
     """Load a patch from what users pass as ``effects=`` or after ``--effects``.
 
     Args:
         source: path of a YAML file or name of one in ``configs/effects/``, an effect or a whole patch as a mapping, a
             :class:`Patch`, a list of any of these (composed in order), or None (no effects).
+        kinds: effects that it may have, of a system that is not the robot; None = those of the library, and formulas.
 
     Raises:
         InputError: naming file, effect, key and the nearest valid name.
@@ -126,11 +141,11 @@ def load_patch(source: Source) -> Patch:
                     f"{source}: not a patch: expected a YAML file; of a result of wlr gap that is the patch.yaml beside it"
                 )
             path = find_config("effects", source)
-            return _parse(read_yaml(path), str(path))
+            return _parse(read_yaml(path), str(path), kinds)
         case Mapping():
-            return _parse({"effects": [source]} if "name" in source else source, "effects")
+            return _parse({"effects": [source]} if "name" in source else source, "effects", kinds)
         case Sequence():
-            return _compose_entries(source)
+            return _compose_entries(source, kinds)
     raise InputError(f"effects = {source!r}: expected a path, a mapping or a list of effects")
 
 
@@ -145,13 +160,13 @@ def compose(*patches: Patch) -> Patch:
     return Patch(effects, {"composed_of": origins} if origins else {}, ", ".join(sources))
 
 
-def _compose_entries(entries: Sequence[Any]) -> Patch:
+def _compose_entries(entries: Sequence[Any], kinds: EffectKinds) -> Patch:
     patches: list[Patch] = []
     for index, entry in enumerate(entries):
         if isinstance(entry, Patch | str | Path) or (isinstance(entry, Mapping) and "effects" in entry):
-            patches.append(load_patch(entry))
+            patches.append(load_patch(entry, kinds))
         else:
-            patches.append(Patch((_parse_effect(entry, "effects", index),), source="effects"))
+            patches.append(Patch((_parse_effect(entry, "effects", index, kinds),), source="effects"))
     return compose(*patches)
 
 
@@ -206,7 +221,7 @@ def _library() -> Mapping[str, Effect]:
 # ---- reading ---------------------------------------------------------------------------------------------------------
 
 
-def _parse(data: Any, source: str) -> Patch:
+def _parse(data: Any, source: str, kinds: EffectKinds) -> Patch:
     if data is None:
         raise InputError(f"{source}: is empty; expected a mapping with 'effects'")
     if not isinstance(data, Mapping):
@@ -217,22 +232,25 @@ def _parse(data: Any, source: str) -> Patch:
         raise InputError(f"{source}: 'effects' must be a list of effects, got {type(effects).__name__}")
     if not isinstance(provenance, Mapping):
         raise InputError(f"{source}: 'provenance' must be a mapping, got {type(provenance).__name__}")
-    return Patch(tuple(_parse_effect(entry, source, index) for index, entry in enumerate(effects)), dict(provenance), source)
+    parsed = tuple(_parse_effect(entry, source, index, kinds) for index, entry in enumerate(effects))
+    return Patch(parsed, dict(provenance), source)
 
 
-def _parse_effect(entry: Any, source: str, index: int) -> PatchEffect:
+def _parse_effect(entry: Any, source: str, index: int, kinds: EffectKinds) -> PatchEffect:
     if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
         raise InputError(
             f"{source}: effect {index + 1}: expected a mapping with 'name', 'where' and 'parameters', got {entry!r}"
         )
     name = entry["name"]
     place = f"{source}: effect {index + 1} ({name})"
-    if name == UNKNOWN_EFFECT:
+    if name == UNKNOWN_EFFECT and kinds is None:
         _require_keys(entry, KEYS, place)
         return parse_formula(entry, _parse_where(entry.get("where"), tuple(COORDINATES), place), place)
-    if name not in _library():
-        raise unknown_name("effect", name, [*_library(), UNKNOWN_EFFECT], f"{source}: effect {index + 1}")
-    effect = _library()[name]
+    known = _library() if kinds is None else kinds
+    if name not in known:
+        valid = [*known, UNKNOWN_EFFECT] if kinds is None else known
+        raise unknown_name("effect", name, valid, f"{source}: effect {index + 1}")
+    effect = known[name]
     _require_keys(entry, ("name", "where", "parameters"), place)
     where = _parse_where(entry.get("where"), effect.where, place)
     return PatchEffect(name, where, _parse_parameters(entry, effect, place), place=place)
@@ -252,7 +270,7 @@ def _parse_where(where: Any, valid: tuple[str, ...], place: str) -> tuple[str, .
     return tuple(where)
 
 
-def _parse_parameters(entry: Mapping[str, Any], effect: Effect, place: str) -> dict[str, float]:
+def _parse_parameters(entry: Mapping[str, Any], effect: EffectKind, place: str) -> dict[str, float]:
     given = entry.get("parameters") or {}
     if not isinstance(given, Mapping):
         raise InputError(f"{place}: 'parameters' must be a mapping of {', '.join(effect.parameters)}, got {given!r}")
