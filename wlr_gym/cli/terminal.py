@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 _GAPS = (2, 1)
 #: A column of texts is made no narrower than this to have another beside it.
 _LEAST_TEXT = 14
-#: Stands for a blank at which no line is broken; Rich breaks lines at a no-break space.
-_GLUE = "\N{SYMBOL FOR SPACE}"
+_HARD_SPACE = "\N{NO-BREAK SPACE}"
 _SIZE = r"[-+]?[\d.,]*\d(e[-+]\d+)?%?"
 _UNIT = r"[^\W\d][^\s,;:.)]{0,4}(?![^\s,;:.)])"
 _ERROR = r"(±|\+-) ?[\d.]+"
@@ -47,9 +46,9 @@ class _Column:
 
     def __init__(self, heading: str, cells: Sequence[str]) -> None:
         self.is_number = all(_NUMBER.fullmatch(cell) for cell in cells)
-        self.cells = [_TOGETHER.sub(lambda one: one[0].replace(" ", _GLUE), cell) for cell in cells]
+        self.cells = [_TOGETHER.sub(lambda one: one[0].replace(" ", _HARD_SPACE), cell) for cell in cells]
         widest = max((len(line) for cell in cells for line in cell.split("\n")), default=0)
-        words = [word for cell in self.cells for word in cell.split()]
+        words = [word for cell in self.cells for word in cell.replace("\n", " ").split(" ")]
         words += _Names(1, break_long_words=False, break_on_hyphens=False).wrap(heading)
         self.least = max(1, 0 if self.is_number else min(widest, _LEAST_TEXT), *map(len, words))
         self.heading, self.natural = heading, max(widest, len(heading), self.least)
@@ -91,14 +90,24 @@ def _print_columns(console: Console, columns: Sequence[_Column], gap: int, style
         justify = "right" if index and column.is_number else "left"
         heading = Text(_Names(width, break_on_hyphens=False).fill(column.heading))
         table.add_column(heading, justify=justify, overflow="fold", width=width)
-    for index, row in enumerate(zip(*(column.cells for column in columns), strict=True)):
+    cells = [[_wrapped(cell, width) for cell in column.cells] for column, width in zip(columns, widths, strict=True)]
+    for index, row in enumerate(zip(*cells, strict=True)):
         table.add_row(*map(Text, row), style=styles[index] if styles else "")
     with console.capture() as drawn:
         console.print(table)
-    for line in Text.from_ansi(drawn.get().replace(_GLUE, " ")).split():
+    for line in Text.from_ansi(drawn.get().replace(_HARD_SPACE, " ")).split():
         line.rstrip()
         console.print(line, soft_wrap=True)
     console.print()
+
+
+def _wrapped(cell: str, width: int) -> str:
+    """Break the lines of a cell between words; what is indented stays so."""
+    lines = []
+    for line in cell.split("\n"):
+        indent = line[: len(line) - len(line.lstrip())]
+        lines += textwrap.wrap(line, width, subsequent_indent=indent, break_on_hyphens=False) or [""]
+    return "\n".join(lines)
 
 
 def _widths(columns: Sequence[_Column], room: int) -> list[int]:
