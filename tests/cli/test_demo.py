@@ -112,18 +112,24 @@ def numbers(old, new, better, low, high):
     return {"old": old, "new": new, "better_percent": better, "better_ci95": [low, high]}
 
 
-def test_training_on_is_ticked_only_where_the_interval_says_so():
-    sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.3, 0.5], 20.0, 12.0, 31.0))
-    assert verdict == SHOWN
-    assert "0.500 before and 0.400 after training on: 20 % lower (95 % interval 12 to 31 %, 2 pairs" in sentence
-    sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.4, 0.58], 2.0, -3.0, 5.0))
-    assert verdict == NOT_SHOWN
-    assert "after training on: -2 % (95 % interval -5 to +3 %" in sentence  # of the error: minus is better
-    assert "No difference beyond the interval" in sentence
-    sentence, verdict = retraining.outcome(numbers([0.4, 0.6], [0.5, 0.7], -20.0, -31.0, -12.0))
-    assert verdict == NOT_SHOWN
-    assert "20 % higher (95 % interval 12 to 31 %" in sentence
-    assert "made it worse" in sentence
+@pytest.mark.parametrize(
+    ("new", "better", "verdict", "said"),
+    [
+        (
+            [0.3, 0.5],
+            (20.0, 12.0, 31.0),
+            SHOWN,
+            ["0.500 before and 0.400 after", ": 20 % lower (95 % interval 12 to 31 %, 2 pairs"],
+        ),
+        # of the error: minus is better
+        ([0.4, 0.58], (2.0, -3.0, 5.0), NOT_SHOWN, [": -2 % (95 % interval -5 to +3 %", "No difference beyond the interval"]),
+        ([0.5, 0.7], (-20.0, -31.0, -12.0), NOT_SHOWN, [": 20 % higher (95 % interval 12 to 31 %", "made it worse"]),
+    ],
+)
+def test_training_on_is_ticked_only_where_the_interval_says_so(new, better, verdict, said):
+    sentence, found = retraining.outcome(numbers([0.4, 0.6], new, *better))
+    assert found == verdict
+    assert all(text in sentence for text in said)
 
 
 def test_what_is_won_back_of_the_fault_is_said():

@@ -41,20 +41,15 @@ def command(monkeypatch):
     return make
 
 
-def test_help_lists_every_command(capsys):
-    assert cli.main(["--help"]) == 0
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(["--help"], list(cli.COMMANDS)), ([], ["usage: wlr"]), (["--version"], [wlr_gym.__version__])],
+    ids=["help", "nothing", "version"],
+)
+def test_what_the_program_says_of_itself(words, said, capsys):
+    assert cli.main(words) == 0
     shown = capsys.readouterr().out
-    assert all(name in shown for name in cli.COMMANDS)
-
-
-def test_no_command_shows_help(capsys):
-    assert cli.main([]) == 0
-    assert "usage: wlr" in capsys.readouterr().out
-
-
-def test_version(capsys):
-    assert cli.main(["--version"]) == 0
-    assert wlr_gym.__version__ in capsys.readouterr().out
+    assert all(text in shown for text in said)
 
 
 def test_unknown_command_names_the_nearest(capsys):

@@ -431,18 +431,22 @@ def test_held_out_runs_cover_gains_and_trajectories(made):
     assert len({recording.trajectory for recording in held}) == 2
 
 
+def with_one_in_degrees(folder):
+    """Write four runs; the angles of run_0 are in degrees."""
+    for k, one in enumerate(contents(Bench(), [100] * 4, ["sin_sin"] * 4, duration=1.0)):
+        for entry in one["entries"] if k == 0 else ():
+            entry["position"] = 57.3 * entry["position"]
+            entry["goal_position"] = 57.3 * entry["goal_position"]
+        (folder / f"run_{k}.json").write_text(json.dumps(one))
+    return folder
+
+
 def test_opening_leaves_out_what_cannot_be_used(made, tmp_path):
     problem, found = open_pendulum(made)
     assert problem is not None
     assert len(problem.runs) == 6
     assert not any(f.fatal for f in found)
-    runs = contents(Bench(), [100] * 4, ["sin_sin"] * 4, duration=1.0)
-    for entry in runs[0]["entries"]:
-        entry["position"] = 57.3 * entry["position"]
-        entry["goal_position"] = 57.3 * entry["goal_position"]
-    for k, one in enumerate(runs):
-        (tmp_path / f"run_{k}.json").write_text(json.dumps(one))
-    problem, found = open_pendulum(tmp_path)
+    problem, found = open_pendulum(with_one_in_degrees(tmp_path))
     assert problem is not None
     assert problem.runs == ("run_1", "run_2", "run_3")
     assert {f.run for f in found if f.fatal} == {"run_0"}
@@ -480,16 +484,6 @@ def test_the_patch_that_an_analysis_of_the_rig_writes_can_be_given_back(made, tm
     assert np.abs(known - without).max() > 1e-3
 
 
-def test_patches_of_the_rig_are_read_from_anything_that_effects_are():
-    entry = {"name": "load_dependent_friction", "where": ["servo"], "parameters": {"ratio": 0.2}}
-    both = pendulum_patch([entry, {"effects": [{"name": "backlash", "parameters": {"angle": 0.02}}]}])
-    assert [effect.name for effect in both.effects] == ["load_dependent_friction", "backlash"]
-    assert pendulum_patch(both) is both
-    assert pendulum_patch(entry).effects == both.effects[:1]
-    assert not pendulum_patch(None).effects
-    assert not pendulum_patch([]).effects
-
-
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
@@ -497,9 +491,7 @@ def test_patches_of_the_rig_are_read_from_anything_that_effects_are():
         ({"name": "rolling_resistance", "parameters": {"coefficient": 0.1}}, "unknown effect 'rolling_resistance'"),
         ({"name": "weak_motor", "where": ["wheel_lf"], "parameters": {"scale": 0.9}}, "unknown where 'wheel_lf'; valid: servo"),
         ({"name": "weak_motor", "parameters": {"skale": 0.9}}, r"unknown key 'skale' \(did you mean 'scale'"),
-        ({"name": "weak_motor", "parameters": {"scale": "much"}}, r"scale = 'much': expected a finite number"),
         ({"name": "torque_saturation", "parameters": {"coefficient": 11}}, r"coefficient = 11 is outside \[0, 10\]"),
-        ({"name": "torque_saturation"}, r"parameter 'coefficient' \(1/A\) is missing"),
         ({"name": "unknown_effect", "formula": "-b * rate"}, "unknown effect 'unknown_effect'"),
     ],
 )
@@ -509,13 +501,8 @@ def test_patches_that_the_rig_cannot_take_are_refused(entry, words):
 
 
 def test_a_run_that_cannot_be_used_cannot_be_held_out(tmp_path):
-    for k, one in enumerate(contents(Bench(), [100] * 4, ["sin_sin"] * 4, duration=1.0)):
-        for entry in one["entries"] if k == 0 else ():
-            entry["position"] = 57.3 * entry["position"]
-            entry["goal_position"] = 57.3 * entry["goal_position"]
-        (tmp_path / f"run_{k}.json").write_text(json.dumps(one))
     with pytest.raises(InputError, match=r"--heldout run_0: the run cannot be used: "):
-        analyse(tmp_path, rig="pendulum", heldout=("run_0",))
+        analyse(with_one_in_degrees(tmp_path), rig="pendulum", heldout=("run_0",))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real recordings are not beside the repository")
@@ -764,20 +751,10 @@ def test_real_servo_replays_better_with_both(real):
 
 
 BASE = {
-    "stall_torque": 0.36,
-    "no_load_speed": 11.0,
-    "armature": 0.0016,
-    "delay": 0.0,
-    "zero": -0.018,
-    "coulomb_friction": 0.041,
+    "stall_torque": 0.36, "no_load_speed": 11.0, "armature": 0.0016, "delay": 0.0, "zero": -0.018, "coulomb_friction": 0.041,
     "viscous_friction": 0.0,
-}
+}  # fmt: skip
 BOTH = {
-    "stall_torque": 0.77,
-    "no_load_speed": 13.9,
-    "armature": 0.0018,
-    "delay": 0.006,
-    "zero": -0.02,
-    "coulomb_friction": 0.021,
+    "stall_torque": 0.77, "no_load_speed": 13.9, "armature": 0.0018, "delay": 0.006, "zero": -0.02, "coulomb_friction": 0.021,
     "viscous_friction": 0.006,
-}
+}  # fmt: skip
