@@ -119,7 +119,7 @@ def numbers(old, new, better, low, high):
             [0.3, 0.5],
             (20.0, 12.0, 31.0),
             SHOWN,
-            ["0.500 before and 0.400 after", ": 20 % lower (95 % interval 12 to 31 %, 2 pairs"],
+            ["0.500 before and 0.400 after", "20 % lower (95 % interval 12 to 31 %"],
         ),
         # of the error: minus is better
         ([0.4, 0.58], (2.0, -3.0, 5.0), NOT_SHOWN, [": -2 % (95 % interval -5 to +3 %", "No difference beyond the interval"]),
