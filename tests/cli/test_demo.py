@@ -17,9 +17,8 @@ from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import INTERRUPTED, main
 from wlr_gym.data import read_dataset
 from wlr_gym.demo import diagnosis, policies, retraining, workers
-from wlr_gym.demo.page import TERMS
+from wlr_gym.demo.page import NOT_SHOWN, SHOWN, SKIPPED, TERMS, Demo, Section
 from wlr_gym.demo.page import page as page_of
-from wlr_gym.demo.stage import NOT_SHOWN, SHOWN, SKIPPED, Demo, Section
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
 from wlr_gym.learning.evaluation import Estimate
 from wlr_gym.learning.evaluation.metrics import Metric
@@ -119,11 +118,11 @@ def numbers(old, new, better, low, high):
             [0.3, 0.5],
             (20.0, 12.0, 31.0),
             SHOWN,
-            ["0.500 before and 0.400 after", "20 % lower (95 % interval 12 to 31 %"],
+            ["0.500 before and 0.400 after", ": -20 % (95 % interval -31 to -12 %, 2 pairs"],
         ),
         # of the error: minus is better
         ([0.4, 0.58], (2.0, -3.0, 5.0), NOT_SHOWN, [": -2 % (95 % interval -5 to +3 %", "No difference beyond the interval"]),
-        ([0.5, 0.7], (-20.0, -31.0, -12.0), NOT_SHOWN, [": 20 % higher (95 % interval 12 to 31 %", "made it worse"]),
+        ([0.5, 0.7], (-20.0, -31.0, -12.0), NOT_SHOWN, [": +20 % (95 % interval +12 to +31 %", "made it worse"]),
     ],
 )
 def test_training_on_is_ticked_only_where_the_interval_says_so(new, better, verdict, said):

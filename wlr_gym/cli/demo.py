@@ -53,12 +53,11 @@ def run(options: DemoOptions) -> int:
     Raises:
         InputError: bad options, or a folder that holds anything else.
     """
-    from wlr_gym.demo import stage
-    from wlr_gym.demo.page import write_page
+    from wlr_gym.demo import page
     from wlr_gym.demo.workers import WORKERS, run_workers
 
     steps = options.steps or (QUICK_STEPS if options.quick else STEPS)
-    demo = stage.Demo(options.out, options.seed, steps, **(_SHORT if options.quick else {}))
+    demo = page.Demo(options.out, options.seed, steps, **(_SHORT if options.quick else {}))
     refuse_existing(demo.page, options.force)
     _clear(demo.out)
     record_provenance(demo.out, {"seed": demo.seed, "steps": demo.steps, "quick": options.quick}, demo.seed)
@@ -69,7 +68,7 @@ def run(options: DemoOptions) -> int:
     )
     with progress(console, tuple(WORKERS), options.progress) as tell:
         sections, interrupted = run_workers(demo, tell)
-    write_page(demo, sections, interrupted)
+    page.write_page(demo, sections, interrupted)
     for one in sections:
         console.print(f"{one.title}: {one.headline or one.verdict}", markup=False)
     console.print(f"{'stopped' if interrupted else 'done'} after {duration(time.monotonic() - began)}; the page:")
@@ -79,7 +78,7 @@ def run(options: DemoOptions) -> int:
         print_json({"page": demo.page, "interrupted": interrupted, "sections": found})
     if interrupted:
         return INTERRUPTED
-    return FAILED if any(one.verdict == stage.FAILED for one in sections) else OK
+    return FAILED if any(one.verdict == page.FAILED for one in sections) else OK
 
 
 def _clear(folder: Path) -> None:

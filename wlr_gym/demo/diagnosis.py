@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import heading, table
 from wlr_gym.base.plots import COLOURS, new_figure, tidy
 from wlr_gym.base.text import counted, number
-from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, link, paragraph, picture
+from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, link, paragraph, picture
 from wlr_gym.gap.report.text import error, listed, percent, places, plain, unit_of
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 

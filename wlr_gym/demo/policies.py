@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlr_gym.base.html import heading, table
-from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, filmed, paragraph
+from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, filmed, paragraph
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, plain, unit_of
 from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Subject, play, work

@@ -9,7 +9,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.html import commands, table
 from wlr_gym.demo.diagnosis import POLICY
-from wlr_gym.demo.stage import ENVIRONMENT, NOT_SHOWN, SHOWN, SKIPPED, Demo, Section, Tell, filmed, paragraph
+from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, SKIPPED, Demo, Section, Tell, filmed, paragraph
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, places, plain
 from wlr_gym.learning.evaluation import Subject
@@ -108,17 +108,11 @@ def outcome(numbers: dict[str, Any]) -> tuple[str, str]:
     """
     better, (low, high) = numbers["better_percent"], numbers["better_ci95"]
     before, after = (f"{np.mean(numbers[name]):.3f}" for name in ("old", "new"))
-    interval, verdict, tail = f"95 % interval {low:.0f} to {high:.0f} %", NOT_SHOWN, ""
-    if low > 0.0:
-        change, verdict = f"{better:.0f} % lower", SHOWN
-    elif high < 0.0:
-        change, interval = f"{-better:.0f} % higher", f"95 % interval {-high:.0f} to {-low:.0f} %"
+    change = f"{-better:+.0f} % (95 % interval {-high:+.0f} to {-low:+.0f} %, {len(numbers['old'])} pairs of episodes)"
+    verdict, tail = (SHOWN, "") if low > 0.0 else (NOT_SHOWN, " No difference beyond the interval.")
+    if high < 0.0:
         tail = " Training on made it worse."
-    else:
-        change, interval = f"{-better:+.0f} %", f"95 % interval {-high:+.0f} to {-low:+.0f} %"
-        tail = " No difference beyond the interval."
-    text = f"Tracking error on the robot with the fault {before} before and {after} after training on: {change}"
-    return f"{text} ({interval}, {len(numbers['old'])} pairs of episodes).{tail}", verdict
+    return f"Tracking error on the robot with the fault {before} before and {after} after training on: {change}.{tail}", verdict
 
 
 def _said(step: Any) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from wlr_gym.base.errors import InputError, MissingPackageError, require_package
 from wlr_gym.base.jobs import Job, Send, serve, start, stop
 from wlr_gym.demo import diagnosis, policies, retraining
-from wlr_gym.demo.stage import FAILED, SKIPPED, Demo, DemoStage, Section, paragraph
+from wlr_gym.demo.page import FAILED, SKIPPED, Demo, DemoStage, Section, paragraph
 
 #: The shipped policies are ONNX files.
 _POLICIES = (("onnxruntime", "export"),)
