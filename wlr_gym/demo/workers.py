@@ -5,6 +5,7 @@ A worker is a job (:mod:`wlr_gym.base.jobs`): it sends progress and finished sec
 
 from __future__ import annotations
 
+import contextlib
 import json
 import queue
 import threading
@@ -77,7 +78,8 @@ def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
                     tell(worker, message["text"], message["share"])
             except KeyboardInterrupt:
                 interrupted = True
-                stop(running.values())  # what they say meanwhile comes into the inbox
+                with contextlib.suppress(KeyboardInterrupt):  # a second one kills them
+                    stop(running.values())  # what they say meanwhile comes into the inbox
     finally:
         for process in running.values():
             process.kill()
