@@ -18,7 +18,7 @@ from wlr_gym.base.files import output_folder, write_json, write_text
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import Count, ForceOption, JsonOption, PatchOption, Seconds, Seed, settings_of
+from wlr_gym.cli.options import Count, JsonOption, OutOption, PatchOption, RunsRobotOption, Seconds, Seed, settings_of
 from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class CompareOptions(JsonOption, ForceOption, PatchOption):
-    out: Path
-    """Folder for the report; made if it is not there."""
+class CompareOptions(JsonOption, OutOption, RunsRobotOption, PatchOption):
     plants: tuple[str, str] = ("gibbs_appell", "mujoco")
     """Two of: BACKEND or BACKEND:option=value,... with the options physics_step (s) and precision; for example
     gibbs_appell gibbs_appell:precision=float32."""
@@ -45,8 +43,6 @@ class CompareOptions(JsonOption, ForceOption, PatchOption):
     """Seed of the excitations: another seed, another motion of the same kind."""
     seconds: Seconds | None = None
     """Cut every motion off after this long."""
-    robot: str | None = None
-    """Robot file, or name in configs/robot/; default: the one that meta.yaml names, else the nominal one."""
     physics_step: Seconds = 0.001
     """Substep of both plants, s."""
     halve: bool = False
