@@ -227,7 +227,7 @@ def test_arm_and_load_give_gravity_and_inertia():
     """A load at its end and a uniform arm: m l + m_arm l/2 and m l^2 + m_arm l^2/3."""
     recording = read_recording_of(mass=0.49, length=0.098)
     numbers = {quantity.name: quantity.nominal for quantity in QUANTITIES} | {"arm_mass": 0.06, "length_error": 0.002}
-    model = model_of(Setting(np.array(list(numbers.values()))), QUANTITIES)
+    model = model_of(Setting(np.array(list(numbers.values()))))
     lanes = dict(zip(pendulum.PARAMETERS, pack([model], recording, STEP)[0], strict=True))
     assert lanes["gravity"] == pytest.approx(9.81 * 0.1 * (0.49 + 0.03))
     assert lanes["inertia"] == pytest.approx(0.01 * (0.49 + 0.02) + numbers["armature"])

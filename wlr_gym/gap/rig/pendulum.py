@@ -360,14 +360,14 @@ def simulate(
 # ---- its model over a recording --------------------------------------------------------------------------------------
 
 
-def model_of(setting: Setting, quantities: Sequence[Quantity], known: Sequence[PatchEffect] = ()) -> Numbers:
+def model_of(setting: Setting, known: Sequence[PatchEffect] = ()) -> Numbers:
     """Return the numbers of a setting's model by name: its quantities, then the effects that are known, then its own.
 
     Raises:
         InputError: an effect the rig does not know, or a parameter missing.
     """
     numbers = dict(_NEUTRAL)
-    numbers.update({q.name: float(value) for q, value in zip(quantities, setting.quantities, strict=True)})
+    numbers.update({q.name: float(value) for q, value in zip(QUANTITIES, setting.quantities, strict=True)})
     for effect in (*known, *setting.effects):
         check_name("effect of the test rig", effect.name, RIG_EFFECTS)
         RIG_EFFECTS[effect.name].apply(numbers, effect)
@@ -475,13 +475,9 @@ class PendulumProblem(RigProblem):
         self.held_out: tuple[str, ...] = spread_over_conditions(self.recordings)
         self.replays: list[Replay] = [Replay(recording) for recording in recordings]
 
-    def model(self, setting: Setting) -> Numbers:
-        """Return the numbers of a setting's model."""
-        return model_of(setting, self.quantities, self.known)
-
     def replayed(self, settings: Sequence[Setting], run: int, length: float) -> Array:
         """Return what the encoder would have read (settings, rows, 1), begun anew after every ``length`` s, rad."""
-        models = [self.model(setting) for setting in settings]
+        models = [model_of(setting, self.known) for setting in settings]
         zero = np.array([model["zero"] for model in models])
         return self.replays[run].simulate(models, length)[:, :, :1] + zero[:, None, None]
 
@@ -504,7 +500,7 @@ class PendulumProblem(RigProblem):
         found: list[Mapping[str, Array]] = []
         for run in runs:
             recording = self.recordings[run]
-            columns = dict(zip(OUTPUTS, self.replays[run].simulate([self.model(setting)])[0].T, strict=True))
+            columns = dict(zip(OUTPUTS, self.replays[run].simulate([model_of(setting, self.known)])[0].T, strict=True))
             found.append(
                 {
                     "angle [rad]": columns["angle"],
@@ -521,11 +517,11 @@ class PendulumProblem(RigProblem):
         return found
 
 
-def spread_over_conditions(recordings: Sequence[Recording], share: float = HELD_OUT_SHARE) -> tuple[str, ...]:
+def spread_over_conditions(recordings: Sequence[Recording]) -> tuple[str, ...]:
     """Return the names of runs to hold out: in turn one of every gain, each of the trajectory that is held out least so far."""
     gains = sorted({recording.gain for recording in recordings})
     chosen: list[Recording] = []
-    for turn in range(math.ceil(share * len(recordings))):
+    for turn in range(math.ceil(HELD_OUT_SHARE * len(recordings))):
         left = [recording for recording in recordings if recording not in chosen]
         left = [recording for recording in left if recording.gain == gains[turn % len(gains)]] or left
         held = [recording.trajectory for recording in chosen]
