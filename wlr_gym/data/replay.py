@@ -11,7 +11,7 @@ times. Command delays shift the measured times of the setpoints, so a segment st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -318,11 +318,6 @@ def difference(name: str, measured: Array, simulated: Array) -> Array:
     """Return measured minus simulated; angles of the body within half a turn."""
     error = measured - simulated
     return np.angle(np.exp(1j * error)) if name in ANGLES_OF_THE_BODY else error
-
-
-def pooled(errors: Sequence[ChannelError], value: Callable[[ChannelError], float]) -> float:
-    """Root mean square of one figure over several channels or runs."""
-    return float(np.sqrt(np.mean([value(error) ** 2 for error in errors])))
 
 
 # ---- row by row: the ghost that a page shows beside the measured robot -----------------------------------------------
