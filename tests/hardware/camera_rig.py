@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from robot_rig import HARDWARE, PERIOD, ROBOT
+from robot_rig import HARDWARE, PERIOD, RIGS, ROBOT
 
 from wlr_gym.hardware.camera.reading import CameraFile, load_camera_file
 from wlr_gym.hardware.emulator import Machine, MachineOptions
@@ -44,6 +44,7 @@ class CameraRig:
         self.machine = Machine(ROBOT, HARDWARE, MachineOptions(timing=NO_TIME, tick=tick), **parts)
         self.link = emulated_link(self.machine, file or small_camera())
         self.loop = ControlLoop(ROBOT, HARDWARE, self.link, PERIOD, RobotOptions(log=log))
+        RIGS.append(self)
         self.truth: list[tuple[float, float, float, float]] = []
         self.machine.watchers.append(self._look)
         self.shown: list[tuple[float, ...]] = []
@@ -53,6 +54,11 @@ class CameraRig:
         pose = true_pose(self.machine)
         w, x, y, z = pose.quaternion
         self.truth.append((pose.time, *pose.position[:2], math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
+
+    def start(self, seconds: float, setpoints: np.ndarray = FORWARD) -> None:
+        """Start, and drive for so long."""
+        self.loop.start()
+        self.drive(seconds, setpoints)
 
     def drive(self, seconds: float, setpoints: np.ndarray = FORWARD) -> None:
         """Drive and note what the camera shows."""

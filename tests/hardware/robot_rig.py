@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 
 from wlr_gym.data.format import RunMeta
@@ -99,6 +100,10 @@ def imu_that_reads(*counts):
     return SimpleNamespace(counts=lambda accelerometer, gyro: (counts, (0, 0, 0)))
 
 
+#: Rigs of the test that is going on; they are closed when it is over.
+RIGS: list[Any] = []
+
+
 class Rig:
     """A robot and its loop.
 
@@ -114,10 +119,22 @@ class Rig:
         self.link = emulated_link(self.machine)
         meta = None if profile is None else RunMeta(robot=ROBOT.name, profile=profile)
         self.loop = ControlLoop(ROBOT, hardware, self.link, PERIOD, RobotOptions(log=log, dry_run=dry_run), meta)
+        RIGS.append(self)
+
+    def start(self, seconds, setpoints=DRIVE):
+        """Start, and drive for so long."""
+        self.loop.start()
+        self.drive(seconds, setpoints)
 
     def drive(self, seconds, setpoints=DRIVE):
         for _ in range(round(seconds / PERIOD)):
             self.loop.tick(setpoints)
+
+    def stops(self, match, seconds=1.0):
+        """Drive until the robot stops for this reason; torque is off then, or the power has to be cut."""
+        with pytest.raises(StoppedError, match=match) as stopped:
+            self.drive(seconds)
+        assert not self.torque().any() or "CUT THE POWER" in str(stopped.value)
 
     def torque(self):
         """(8,) which motors are on."""
@@ -128,6 +145,11 @@ class Rig:
         return np.array(
             [self.machine.servos[joint]["goal_position" if k < 4 else "goal_velocity"] for k, joint in enumerate(JOINTS)]
         )
+
+    def hear(self, line, answers):
+        """Let ``answers(data, those there would be)`` take the place of a line's answers."""
+        line, receive = self.machine.lines[line], self.machine.lines[line].receive
+        line.receive = lambda data, now, baud_rate=None: answers(data, receive(data, now, baud_rate))
 
     def inject(self, text):
         self.machine.inject(text)

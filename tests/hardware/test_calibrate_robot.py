@@ -238,7 +238,7 @@ class Turner:
 @pytest.fixture
 def sensor(monkeypatch):
     """An emulated robot whose IMU is as :data:`SENSOR` says, and that the commands are connected to."""
-    hardware = find.with_imu_calibration(NOMINAL, SENSOR)
+    hardware = find.with_calibration(NOMINAL, SENSOR)
     machine = Machine(ROBOT, hardware, MachineOptions(timing=NO_TIME))
 
     def link(self, changed=None):
@@ -278,7 +278,7 @@ def test_one_level_pose_finds_bias_and_offset(sensor, tmp_path):
     known = tmp_path / "known.yaml"
     partly = SENSOR.model_copy(update={"gyro_bias": (0.0, 0.0, 0.0), "accel_offset": (0.0, 0.0, 0.0)})
     find.save_hardware(
-        known, data_directory("configs") / "hardware/nominal.yaml", find.with_imu_calibration(NOMINAL, partly), "imu", "by hand"
+        known, data_directory("configs") / "hardware/nominal.yaml", find.with_calibration(NOMINAL, partly), "imu", "by hand"
     )
     assert load_hardware(known).imu.calibration == partly
     assert calibrate_imu(ImuOptions(hardware=str(known), out=known, seconds=2.0), Turner(sensor, [(0, 0, 1)])) == 0

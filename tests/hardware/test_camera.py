@@ -20,17 +20,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli.deploy import camera_line, camera_state
 from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.camera import process
-from wlr_gym.hardware.camera.live import LiveCamera
-from wlr_gym.hardware.camera.reading import (
-    CAMERA_FAULTS,
-    SIZE,
-    UNKNOWN_READOUT,
-    CameraReading,
-    StampClock,
-    load_camera_file,
-    pack,
-    unpack,
-)
+from wlr_gym.hardware.camera.process import StampClock
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, SIZE, UNKNOWN_READOUT, CameraReading, LiveCamera, load_camera_file
 from wlr_gym.hardware.camera.rendered import PoseFeed, RobotPose, scene_pose
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.camera import FeedWriter
@@ -39,6 +30,7 @@ from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.safety import camera as rules
 from wlr_gym.hardware.safety.camera import CameraWatch, camera_statistics
 from wlr_gym.hardware.safety.preflight import check_camera
+from wlr_gym.perception.vision.tracking import DARK, MEANINGS
 
 PERIOD = 0.02
 HEIGHT = ROBOT.leg.length + ROBOT.wheel.radius - ROBOT.hip_position.z
@@ -47,15 +39,17 @@ HEIGHT = ROBOT.leg.length + ROBOT.wheel.radius - ROBOT.hip_position.z
 # ---- what passes between the processes ----
 
 
-def reading(number=1, moment=1.0, pose=(0.1, 0.2, HEIGHT, 0.3, 0.0, 0.0), status="ok", sigma=1e-4):
+def reading(number=1, moment=1.0, pose=(0.1, 0.2, HEIGHT, 0.3, 0.0, 0.0), reason="", sigma=1e-4):
     covariance = sigma**2 * np.eye(6)
-    return CameraReading(number, moment, moment + 0.04, moment + 0.045, status, np.array(pose, float), covariance)
+    return CameraReading(number, moment, moment + 0.04, moment + 0.045, reason, np.array(pose, float), covariance)
 
 
 def test_a_packed_reading_is_whole_and_short_enough_for_one_write():
-    found = unpack(pack(reading(3)))
-    assert (found.number, found.time, found.status) == (3, 1.0, "ok")
+    found = CameraReading.unpack(reading(3).pack())
+    assert (found.number, found.time, found.reason) == (3, 1.0, "")
     np.testing.assert_array_equal(found.pose, reading().pose)
+    for words in MEANINGS.values():
+        assert CameraReading.unpack(reading(reason=words).pack()).reason == words
     np.testing.assert_array_equal(found.covariance, reading().covariance)
     assert SIZE <= 512  # PIPE_BUF, wherever it is least
 
@@ -251,7 +245,7 @@ def test_a_height_that_the_legs_do_not_have_is_wrong():
         ({"age": 0.5}, rules.TOO_OLD),
         ({"age": -0.1}, rules.FUTURE),
         ({"sigma": 0.02}, rules.UNCERTAIN),
-        ({"status": "dark"}, "the picture is dark or blank: lens covered?"),
+        ({"reason": MEANINGS[DARK]}, "the picture is dark or blank: lens covered?"),
     ],
 )
 def test_a_dropout_has_a_reason_and_is_not_wrong(keywords, reason):
@@ -300,8 +294,7 @@ def test_the_lag_of_the_pictures_is_found():
 
 def test_the_camera_is_part_of_the_run(tmp_path):
     rig = CameraRig(small_camera(dropout=0.1, clutter=0, samples=2), log=tmp_path, tick=0.004)
-    rig.loop.start()
-    rig.drive(0.2, FORWARD)
+    rig.start(0.2, FORWARD)
     rig.machine.inject("camera_covered duration=0.2")
     rig.drive(0.4, TURN)
     rig.loop.stop()
@@ -318,7 +311,6 @@ def test_the_camera_is_part_of_the_run(tmp_path):
     assert run["cam_age"].max() > 0.2
     events = [event["no_pose"] for event in read_events(tmp_path / "run_01.csv") if event["event"] == "camera"]
     assert "the picture is dark or blank: lens covered?" in events
-    rig.loop.close()
 
 
 def test_a_camera_whose_readout_is_not_stated_is_doubted(tmp_path):
@@ -327,8 +319,7 @@ def test_a_camera_whose_readout_is_not_stated_is_doubted(tmp_path):
     unknown = known.model_copy(update={"calibration": known.calibration.model_copy(update={"readout": None})})
     assert not known.doubt
     rig = CameraRig(unknown, log=tmp_path, tick=0.004)
-    rig.loop.start()
-    rig.drive(0.1, FORWARD)
+    rig.start(0.1, FORWARD)
     rig.loop.stop()
     assert rig.loop.status is not None
     assert UNKNOWN_READOUT in camera_state(rig.loop.status)
@@ -347,13 +338,11 @@ def test_a_camera_whose_readout_is_not_stated_is_doubted(tmp_path):
 def test_a_wrong_camera_is_an_intervention_that_stops_nothing():
     rig = CameraRig()
     rig.machine.inject("camera_back_to_front")
-    rig.loop.start()
-    rig.drive(0.8, FORWARD)
+    rig.start(0.8, FORWARD)
     assert rig.loop.interventions["camera"] > 0
     assert rig.loop.setpoints[4] > 0.0
     rig.loop.stop()
     assert rig.loop.ended_well
-    rig.loop.close()
 
 
 @pytest.mark.slow
@@ -361,8 +350,7 @@ def test_the_same_run_again_gives_the_same_bits():
     shown = []
     for _ in range(2):
         rig = CameraRig(small_camera(dropout=0.2))
-        rig.loop.start()
-        rig.drive(0.3, FORWARD)
+        rig.start(0.3, FORWARD)
         rig.loop.stop()
         rig.loop.close()
         shown.append(rig.shown)
@@ -388,7 +376,7 @@ def test_the_process_finds_the_robot_and_its_death_is_noticed(tmp_path):
         poses, end = [], time.monotonic() + 30.0
         while len(poses) < 3 and time.monotonic() < end:
             found = camera.read(time.monotonic())
-            if found is not None and found.has_pose:
+            if found is not None and not found.reason:
                 poses.append(found)
             time.sleep(0.005)
         assert len(poses) == 3

@@ -55,7 +55,6 @@ def check(rig: CameraRig) -> None:
     assert rig.loop.reason == "end"
     assert rig.loop.ended_well
     assert rig.longest_wrong() <= BOUND, rig.errors()
-    rig.loop.close()
 
 
 @pytest.mark.slow
@@ -63,8 +62,7 @@ def check(rig: CameraRig) -> None:
 def test_before_the_start(fault):
     rig = CameraRig(tick=0.004)
     rig.machine.inject(fault)
-    rig.loop.start()
-    rig.drive(0.1, STAND)
+    rig.start(0.1, STAND)
     rig.drive(0.7, FORWARD)
     if EXPECTED[fault]:
         assert set(rig.reasons[-20:]) <= set(EXPECTED[fault])
@@ -75,8 +73,7 @@ def test_before_the_start(fault):
 @pytest.mark.parametrize("fault", [*EXPECTED, "camera_late value=2"])
 def test_while_it_stands_drives_and_turns(fault):
     rig = CameraRig(tick=0.004)
-    rig.loop.start()
-    rig.drive(0.2, STAND)
+    rig.start(0.2, STAND)
     expected = STRIKING.get(fault, EXPECTED.get(fault, ()))
     for setpoints in (STAND, FORWARD, TURN):
         rig.drive(PAUSE, setpoints)

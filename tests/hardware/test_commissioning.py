@@ -28,9 +28,18 @@ pytest.importorskip("serial")
 from robot_rig import emulated_imu, hardware_file
 
 from wlr_gym.hardware.commissioning import runner
-from wlr_gym.hardware.commissioning.runner import Commissioning, EmulatedPerson, run_test
-from wlr_gym.hardware.commissioning.stand import PowerError, QuitError, SkippedError, Stand, TerminalPerson, TroubleError
-from wlr_gym.hardware.commissioning.stand_tests import TESTS, PartlyError, Reading, StandTest, choose
+from wlr_gym.hardware.commissioning.runner import Commissioning, Readings, run_test
+from wlr_gym.hardware.commissioning.stand import (
+    EmulatedPerson,
+    PartlyError,
+    Person,
+    PowerError,
+    QuitError,
+    SkippedError,
+    Stand,
+    TroubleError,
+)
+from wlr_gym.hardware.commissioning.stand_tests import TESTS, StandTest, choose
 from wlr_gym.hardware.dynamixel import tables
 from wlr_gym.hardware.emulator import MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
@@ -159,12 +168,12 @@ def changed(name, joint, factor):
 
 
 #: Tests in their order, and one of them -> its readings of the emulated robot that is as the files say; each is made once.
-EXPECTED: dict[tuple[str, ...], list[Reading]] = {}
+EXPECTED: dict[tuple[str, ...], Readings] = {}
 
 
-def make(folder, emulated, *tests, person=None, expected=EXPECTED):
+def make(folder, emulated, *tests, person=None, link=None, expected=EXPECTED):
     """Commission an emulated robot; return the results by test."""
-    link, made = emulated_link(emulated.machine), runner.run_test
+    link, made = link or emulated_link(emulated.machine), runner.run_test
     found = []
 
     def remembering(test, stand, person):
@@ -186,7 +195,7 @@ def make(folder, emulated, *tests, person=None, expected=EXPECTED):
 
 def found_in(results):
     findings = [finding for result in results.values() for finding in result.findings]
-    return {(finding.quantity.name, finding.where) for finding in findings if not finding.is_expected}
+    return {(finding.quantity, finding.where) for finding in findings if not finding.is_expected}
 
 
 @pytest.mark.parametrize(
@@ -313,10 +322,8 @@ def test_an_imu_that_is_mounted_otherwise_is_found(emulated, tmp_path):
         update={"calibration": NOMINAL.imu.calibration.model_copy(update={"mounting": (0, 0, 1.57)})}
     )
     link.imu = emulated_imu(link, turned)
-    with Commissioning(ROBOT, NOMINAL, link, EmulatedPerson(emulated), tmp_path, RunMeta()) as commissioning:
-        (result,) = commissioning.make(choose(["imu"]))
-    wrong = {finding.quantity.name for finding in result.findings if not finding.is_expected}
-    assert wrong == {"gyro_roll", "gyro_pitch", "tilt_roll", "tilt_pitch"}
+    found = found_in(make(tmp_path, emulated, "imu", link=link))
+    assert found == {(quantity, "imu") for quantity in ("gyro_roll", "gyro_pitch", "tilt_roll", "tilt_pitch")}
 
 
 # ---- whatever happens, motors are off --------------------------------------------------------------------------------
@@ -343,9 +350,9 @@ def test_a_leg_that_is_turned_too_far_costs_only_its_own_value(emulated, stand):
         def turn(self, joint, angle):
             super().turn(joint, 1.6 * angle)
 
-    with pytest.raises(PartlyError, match="turn it less") as caught:
+    with pytest.raises(PartlyError, match="turn it less"):
         run_test(TESTS["torque_on"], stand, Far(emulated))
-    assert {one.quantity for one in caught.value.readings} == {"wheel_follows_given", "wheel_follows_kept", "leg_follows_given"}
+    assert {quantity for quantity, _ in stand.readings} == {"wheel_follows_given", "wheel_follows_kept", "leg_follows_given"}
 
 
 def test_a_stop_that_came_during_a_question_comes_before_torque(emulated, stand):
@@ -357,11 +364,11 @@ def test_a_stop_that_came_during_a_question_comes_before_torque(emulated, stand)
 
 def test_only_enter_is_consent():
     for answer in ("n", "no", "x", "s"):
-        person = TerminalPerson(lambda text, answer=answer: answer)
+        person = Person(lambda text, answer=answer: answer)
         for ask in (lambda person: person.ready("Latency."), lambda person: person.brake("wheel_lf")):
             with pytest.raises(SkippedError):
                 ask(person)
-    TerminalPerson(lambda text: "").ready("Latency.")
+    Person(lambda text: "").ready("Latency.")
 
 
 def spinning(then):
@@ -372,7 +379,6 @@ def spinning(then):
         stand.weaken("wheel_lf")
         stand.run(0.1)
         then(stand)
-        return []
 
     return StandTest("trial", "", "", "", (), measure)
 
@@ -429,7 +435,6 @@ def test_a_held_wheel_ends_the_test(emulated, stand):
         emulated.brake("wheel_lf")
         stand.spin({"wheel_lf": 3.0})
         stand.run(3.0)
-        return []
 
     with pytest.raises(TroubleError, match=r"wheel_lf: above 40% of stall torque: does something hold it\?"):
         run_test(StandTest("trial", "", "", "", (), hold), stand, EmulatedPerson(emulated))
@@ -492,7 +497,7 @@ def test_the_next_sign_of_life_comes_in_time_while_a_motor_is_on(emulated, stand
     stand.sign_of_life = lambda seconds: signs.append((stand.clock.now(), seconds))
     look_at_promises(monkeypatch, emulated, stand, lambda: signs[-1][1] if signs else math.inf)
     human = SlowHuman(emulated, stand.clock)
-    run_test(TESTS[name], stand, TerminalPerson(human))
+    run_test(TESTS[name], stand, Person(human))
     assert bool(human.asked) == (name in ("torque_on", *ASKING))
     times, promised = np.array(signs).T
     assert promised[-1] == math.inf
@@ -634,7 +639,7 @@ def test_a_joint_that_cannot_be_held_is_named_and_the_others_are_told(beside, tm
 
 def test_how_the_body_is_to_be_turned():
     asked = []
-    person = TerminalPerson(lambda text: asked.append(text) or "")
+    person = Person(lambda text: asked.append(text) or "")
     for angles in ({"roll": 0.35}, {"pitch": 0.35}, {"yaw": 0.35}, {}):
         person.tilt(3.0, **angles)
     ways = ["right side down by about 20 deg", "nose down by about 20 deg", "nose to the left by about 20 deg", "level"]
@@ -688,14 +693,11 @@ class Hiccups:
 
 
 def make_with_hiccups(folder, test, waits, person=None):
-    """Commission an emulated robot; return the result, and its machine."""
+    """Commission an emulated robot; return the result."""
     emulated = EmulatedStand(ROBOT, NOMINAL)
     link = emulated_link(emulated.machine)
     link.clock = Hiccups(link.clock, waits)
-    with Commissioning(ROBOT, NOMINAL, link, person or EmulatedPerson(emulated), folder, RunMeta()) as commissioning:
-        (result,) = commissioning.make(choose([test]))
-    assert motors_on(emulated.machine) == []
-    return result, emulated.machine
+    return make(folder, emulated, test, person=person, link=link)[test]
 
 
 @pytest.mark.slow
@@ -711,7 +713,7 @@ def make_with_hiccups(folder, test, waits, person=None):
     ],
 )
 def test_a_test_is_made_once_more_where_the_computer_was_silent_for_too_long(tmp_path, test, wait):
-    result, _ = make_with_hiccups(tmp_path, test, {wait})
+    result = make_with_hiccups(tmp_path, test, {wait})
     assert result.state == "done"
     assert result.is_good
     (reason,) = result.repeated
@@ -721,7 +723,7 @@ def test_a_test_is_made_once_more_where_the_computer_was_silent_for_too_long(tmp
 
 
 def test_a_computer_that_is_always_busy_is_named_and_not_the_servo(tmp_path):
-    result, _ = make_with_hiccups(tmp_path, "velocity_step", range(8, 100000, 8))
+    result = make_with_hiccups(tmp_path, "velocity_step", range(8, 100000, 8))
     assert (result.state, len(result.repeated)) == ("failed", 2)
     assert re.search(r"silent for longer than 0.2 s, in 3 tries$", result.reason)
     assert "refused" not in result.reason
@@ -731,8 +733,8 @@ def test_a_computer_that_is_always_busy_is_named_and_not_the_servo(tmp_path):
 
 def test_who_is_beside_the_robot_is_asked_before_a_test_is_made_once_more(tmp_path):
     asked = []
-    person = TerminalPerson(lambda text: asked.append(text) or ("" if len(asked) == 1 else "q"))
-    result, _ = make_with_hiccups(tmp_path, "velocity_step", {20}, person)
+    person = Person(lambda text: asked.append(text) or ("" if len(asked) == 1 else "q"))
+    result = make_with_hiccups(tmp_path, "velocity_step", {20}, person)
     assert [text.startswith("Once more, for wheel_lf") for text in asked] == [False, True]
     assert (result.state, len(result.repeated)) == ("stopped", 1)
 

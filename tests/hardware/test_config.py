@@ -72,7 +72,7 @@ def test_other_ports():
     hardware = with_ports(load_hardware(), {"legs": "/dev/here", "imu": "/dev/there"})
     assert (hardware.buses["legs"].port, hardware.imu.port) == ("/dev/here", "/dev/there")
     assert hardware.buses["wheels"] == load_hardware().buses["wheels"]
-    with pytest.raises(InputError, match=r"no bus 'leg' \(did you mean 'legs'\?\); the buses are legs"):
+    with pytest.raises(InputError, match=r"unknown port 'leg' \(did you mean 'legs'\?\); valid: imu, legs, wheels"):
         with_ports(hardware, {"leg": "x"})
 
 

@@ -150,17 +150,17 @@ def test_what_cannot_be_asked_for():
         doctor.run(doctor.DoctorOptions(port=("legs",)))
     with pytest.raises(InputError, match="one or the other"):
         doctor.run(doctor.DoctorOptions(port=("legs=/dev/x",), emulated=True))
-    with pytest.raises(InputError, match="no bus 'leg'"):
+    with pytest.raises(InputError, match="unknown port 'leg'"):
         doctor.run(doctor.DoctorOptions(port=("leg=/dev/x",)))
 
 
 def test_ports_that_are_there_are_named(tmp_path):
-    assert "no USB serial port" in preflight._ports_here(tmp_path)
+    assert "no USB serial port" in preflight._plug_in("legs", tmp_path)
     (tmp_path / "ttyUSB3").touch()
-    assert preflight._ports_here(tmp_path).endswith("ttyUSB3")
+    assert preflight._plug_in("legs", tmp_path).endswith("ttyUSB3.")
     (tmp_path / "serial/by-id").mkdir(parents=True)
     (tmp_path / "serial/by-id/usb-U2D2").touch()
-    assert preflight._ports_here(tmp_path).endswith("by-id/usb-U2D2")
+    assert preflight._plug_in("legs", tmp_path).endswith("by-id/usb-U2D2.")
 
 
 def write_policy(folder, **changes):

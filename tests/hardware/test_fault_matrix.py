@@ -284,7 +284,6 @@ def test_a_line_and_a_computer_that_are_not_perfect_stop_nothing(minutes):
     rig.loop.stop()
     assert rig.loop.reason == "end"
     assert rig.loop.phase is Phase.TORQUE_OFF
-    rig.loop.close()
 
 
 @pytest.mark.parametrize(("speed", "time", "way"), [(3.0, 0.2, 0.03), (1.0, 0.54, 0.04), (0.3, 1.7, 0.065), (0.1, 5.05, 0.12)])
@@ -303,7 +302,6 @@ def test_a_frozen_wheel_is_found_after_half_a_radian_of_setpoint(speed, time, wa
     assert watch.off_at is not None
     assert watch.off_at - struck <= time
     assert abs(true_angles(rig)[4] - begin) * ROBOT.wheel.radius <= way
-    rig.loop.close()
 
 
 def test_two_servos_with_one_id_are_called_that():
@@ -313,35 +311,29 @@ def test_two_servos_with_one_id_are_called_that():
     words = r"leg_lr for 0\.4\d s \(limit 0\.4 s\).*broken packets.*two servos with the same id"
     with pytest.raises(StoppedError, match=words):
         rig.drive(1.0)
-    rig.loop.close()
     again = Rig(machine=rig.machine)
     with pytest.raises(StoppedError, match=r"leg_lr +answer: \d+ broken packets.*second servo with id 1"):
         again.loop.start()
-    again.loop.close()
 
 
 def test_torque_goes_off_in_time_after_total_loss():
     """The bound of the ladder, to the tick: from the last answer until the last motor is off."""
     rig = Rig()
     watch = Watch(rig)
-    rig.loop.start()
-    rig.drive(0.5)
+    rig.start(0.5)
     rig.inject("drop legs wheels")
     lost = rig.machine.time
-    with pytest.raises(StoppedError, match="silence: no answer from leg_lf"):
-        rig.drive(2.0)
+    rig.stops("silence: no answer from leg_lf", 2.0)
     watch.look()
     assert watch.off_at is not None
     assert watch.off_at - lost <= OFF_BOUND
     assert HARDWARE.safety.silence <= watch.off_at - lost
-    rig.loop.close()
 
 
 def test_wheels_stop_before_torque_goes_off():
     """Coast for three ticks, then hold, then off."""
     rig = Rig()
-    rig.loop.start()
-    rig.drive(0.5)
+    rig.start(0.5)
     rig.inject("drop legs wheels")
     lost, setpoints = rig.machine.time, {}
     rig.loop.operator.spare = lambda: setpoints.__setitem__(round(rig.machine.time - lost, 3), rig.loop.setpoints[4])
@@ -349,25 +341,21 @@ def test_wheels_stop_before_torque_goes_off():
         rig.drive(2.0)
     assert all(goal == 3.0 for time, goal in setpoints.items() if time < 0.06)
     assert all(goal == 0.0 for time, goal in setpoints.items() if time > 0.16)
-    rig.loop.close()
 
 
 def test_an_adapter_that_comes_back_is_told_to_switch_off():
     rig = Rig(off_time=2.0)
-    rig.loop.start()
-    rig.drive(0.3)
+    rig.start(0.3)
     rig.inject("unplug wheels duration=0.8")
     with pytest.raises(StoppedError, match="port") as stop:
         rig.drive(2.0)
     assert "CUT THE POWER" not in str(stop.value)
     assert not rig.torque().any()
-    rig.loop.close()
 
 
 def test_servos_that_cannot_be_reached_are_named():
     rig = Rig(off_time=0.2)
-    rig.loop.start()
-    rig.drive(0.3)
+    rig.start(0.3)
     rig.inject("unplug wheels")
     with pytest.raises(
         StoppedError, match="CUT THE POWER: torque is not confirmed off at wheel_lf, wheel_rf, wheel_lr, wheel_rr"
@@ -375,27 +363,23 @@ def test_servos_that_cannot_be_reached_are_named():
         rig.drive(2.0)
     assert rig.torque().tolist() == [False] * 4 + [True] * 4
     assert [rig.machine.servos[joint]["bus_watchdog"] for joint in JOINTS[4:]] == [-1] * 4
-    rig.loop.close()
 
 
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 12))])
 def test_confirmations_of_torque_off_add_up_on_a_bad_line(seed):
     """Two of five answers are lost: no servo is asked for what it has confirmed, and nobody cries wolf."""
     rig = Rig(options=MachineOptions(timing=NO_TIME, seed=seed))
-    rig.loop.start()
-    rig.drive(0.1)
+    rig.start(0.1)
     rig.inject("drop legs wheels probability=0.4")
     rig.loop.stop()
     assert not rig.torque().any()
     assert "CUT THE POWER" not in rig.loop.reason
-    rig.loop.close()
 
 
 def test_a_bus_that_does_not_answer_does_not_delay_the_other():
     """Torque off is said to all before anybody is asked to confirm."""
     rig, off_at = Rig(), {}
-    rig.loop.start()
-    rig.drive(0.3)
+    rig.start(0.3)
     step = rig.machine.step
 
     def watched():
@@ -406,7 +390,5 @@ def test_a_bus_that_does_not_answer_does_not_delay_the_other():
 
     rig.machine.step = watched
     rig.inject("drop legs wheels")
-    with pytest.raises(StoppedError, match="silence"):
-        rig.drive(2.0)
+    rig.stops("silence", 2.0)
     assert abs(off_at["legs"] - off_at["wheels"]) < 0.012
-    rig.loop.close()

@@ -132,7 +132,7 @@ def test_hardware_file_names_the_sensor_and_the_robot_must_have_one():
     check_fit(ROBOT, hardware)
     with pytest.raises(InputError, match=r"its file needs a section sensors\.flow"):
         check_fit(load_robot("emanual"), hardware)
-    with pytest.raises(InputError, match="no bus 'flow'; the buses are legs, wheels, imu"):
+    with pytest.raises(InputError, match="unknown port 'flow'; valid: imu, legs, wheels"):
         with_ports(load_hardware("nominal"), {"flow": "x"})
     with pytest.raises(ValueError, match=r"expected one of the chip's x and one of its y"):
         hardware_with(axes=["x", "-x"])

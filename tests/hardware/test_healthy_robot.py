@@ -32,7 +32,6 @@ def test_lost_answers_of_fast_wheels_are_no_jumps():
     rig.loop.start()
     rig.inject("drop probability=0.03")
     drive(rig, 8.0)
-    rig.loop.close()
 
 
 @pytest.mark.parametrize("pause", [0.025, 0.05, 0.15])
@@ -51,7 +50,6 @@ def test_a_pause_before_a_read_is_no_jump(pause, monkeypatch):
 
     monkeypatch.setattr(rig.link.servos, "_read", late)
     drive(rig, 0.4)
-    rig.loop.close()
 
 
 @pytest.mark.slow
@@ -60,7 +58,6 @@ def test_wheels_whose_profile_is_slow_are_not_away(acceleration):
     rig = Rig(profile=Profile(wheel_acceleration=acceleration))
     rig.loop.start()
     drive(rig, 6.0)
-    rig.loop.close()
 
 
 @pytest.mark.slow
@@ -69,7 +66,6 @@ def test_legs_whose_profile_is_slow_may_turn_back(velocity, acceleration):
     rig = Rig(profile=Profile(leg_velocity=velocity, leg_acceleration=acceleration))
     rig.loop.start()
     drive(rig, 6.5, lambda t: square(0.0 if t < 0.5 else t + 1.5, wheels=0.0, legs=0.8))
-    rig.loop.close()
 
 
 def test_wheels_that_are_allowed_little_voltage_are_not_away():
@@ -96,7 +92,6 @@ def test_motors_switched_while_answers_are_lost_have_not_lost_torque():
     for _ in range(700):
         on = np.r_[np.ones(4, bool), rng.random(4) < 0.5]
         rig.loop.tick(square(0.0, wheels=1.0), on)
-    rig.loop.close()
 
 
 @pytest.mark.parametrize("call", [1, 2, 3])
@@ -134,7 +129,6 @@ def test_an_imu_that_is_unplugged_is_silent_and_not_frozen():
     with pytest.raises(Exception, match="imu") as stopped:
         drive(rig, 3.0, lambda t: square(t, wheels=1.0))
     assert "same six values" not in str(stopped.value)
-    rig.loop.close()
 
 
 def test_a_supply_that_would_stop_the_run_is_found_before_it():

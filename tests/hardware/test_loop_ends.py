@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("serial")
@@ -17,7 +16,6 @@ from studies.paper.experiments import PROFILE
 from wlr_gym.cli import FAILED, INTERRUPTED, OK, record, replay, run_command
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.format import RunMeta
-from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.deployment import deploy, drive_robot, loop_of
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
@@ -31,10 +29,7 @@ ADVICE = "CUT THE POWER: torque is not confirmed off at wheel_lf, wheel_rf, whee
 
 @pytest.fixture
 def rig(tmp_path):
-    rig = Rig(tmp_path / "log", off_time=0.1)
-    yield rig
-    rig.machine.clear()
-    rig.loop.close()
+    return Rig(tmp_path / "log", off_time=0.1)
 
 
 def in_phase(loop, phase, act):
@@ -83,8 +78,7 @@ def short(name="straight"):
 
 
 def test_a_normal_end_without_confirmed_torque_off_is_no_success(rig, capsys):
-    rig.loop.start()
-    rig.drive(0.1)
+    rig.start(0.1)
     in_phase(rig.loop, Phase.STOPPING, lambda: rig.inject("unplug wheels"))
     with pytest.raises(StoppedError, match="time is over.*" + ADVICE):
         rig.loop.finish("time is over")
@@ -283,12 +277,9 @@ def test_a_fault_during_a_requested_stop_is_the_reason(rig, fault, words):
     rig.loop.start()
     in_phase(rig.loop, Phase.STOPPING, lambda: fault(rig))
     rig.loop.operator.ask_to_stop("stop key")
-    with pytest.raises(StoppedError, match=f"^{words}.*while stopping: stop: stop key"):
-        rig.drive(0.1)
+    rig.stops(f"^{words}.*while stopping: stop: stop key", 0.1)
     assert rig.loop.phase is Phase.FAULT
     assert not rig.loop.ended_well
-    rig.machine.clear()
-    rig.loop.close()
 
 
 def test_a_fault_in_the_tick_of_a_request_is_no_good_end(rig):
@@ -302,8 +293,7 @@ def test_a_fault_in_the_tick_of_a_request_is_no_good_end(rig):
             asked.append(rig.loop.operator.ask_to_stop("stop key"))
 
     rig.loop.operator.spare = spare
-    with pytest.raises(StoppedError, match=r"^tilt: "):
-        rig.drive(3.0)
+    rig.stops(r"^tilt: ", 3.0)
     assert not rig.loop.ended_well
 
 
@@ -336,13 +326,11 @@ def test_a_leg_may_be_as_far_off_as_the_limit_says():
     hold(rig, "leg_rf")
     rig.loop.start([1.0] * 4)
     assert rig.loop.phase is Phase.RUNNING
-    rig.loop.close()
 
 
 def test_a_dry_run_asks_no_leg_to_be_anywhere():
     rig = Rig(dry_run=True)
     rig.loop.start([1.0] * 4)
-    rig.loop.close()
 
 
 def test_the_way_to_the_start_pose_waits_for_slow_servos():
@@ -352,11 +340,6 @@ def test_the_way_to_the_start_pose_waits_for_slow_servos():
     assert plant.loop.status is not None
     np.testing.assert_allclose(plant.loop.status.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
     plant.close()
-
-
-def test_a_limit_of_nothing_is_refused():
-    with pytest.raises(ValidationError, match="start_error"):
-        SafetyLimits(start_error=0.0)
 
 
 def test_the_way_to_the_start_pose_waits_for_the_operator(tmp_path):
@@ -376,7 +359,6 @@ def test_the_way_to_the_start_pose_waits_for_the_operator(tmp_path):
     np.testing.assert_allclose(rig.loop.status.position[:4], [1.0, 1.0, 2.1, 2.1], atol=0.05)
     assert np.ptp(held[20:49]) == 0.0
     assert held[40] > 1.1
-    rig.loop.close()
 
 
 @pytest.mark.slow

@@ -1,8 +1,6 @@
 """Preflight checks on the emulator: a good robot passes all; each fault fails its check alone and names a remedy."""
 
 import dataclasses
-import threading
-import time
 
 import pytest
 
@@ -11,7 +9,6 @@ from wlr_gym.hardware.dynamixel.tables import load_table
 from wlr_gym.hardware.emulator import Machine, MachineOptions, Server
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.emulator.link import emulated_link
-from wlr_gym.hardware.timing import processor_share
 from wlr_gym.robot import JOINTS, load_robot
 
 pytest.importorskip("dynamixel_sdk")
@@ -189,27 +186,6 @@ def test_bus_speed_names_losses(server, servos):
     assert "3 of 24 answers lost" in check.found
     assert "wlr deploy --emulated --stepped" in check.remedy  # a robot on pseudo-terminals has no cables
     assert "cables" not in check.remedy
-
-
-@pytest.mark.parametrize(("share", "words"), [(1.0, "check the cables"), (0.5, "too busy to drive a robot (a program")])
-def test_a_busy_computer_is_told_from_a_slow_bus(rig, monkeypatch, share, words):
-    monkeypatch.setattr(preflight, "processor_share", lambda clock: share)
-    check = preflight.check_bus_speed(rig[1], reads=2, budget=0.0)
-    assert not check.ok
-    assert words in check.remedy
-    assert ("cables" in check.remedy) == (share == 1.0)
-
-
-def test_the_share_of_a_processor():
-    assert processor_share(lambda: 3.0) == 1.0  # emulated time
-    over = threading.Event()
-    other = threading.Thread(target=lambda: [None for _ in iter(over.is_set, True)], daemon=True)
-    other.start()
-    try:
-        assert processor_share(time.monotonic) < 0.9  # the interpreter runs one of two threads at a time
-    finally:
-        over.set()
-        other.join()
 
 
 def test_latency_timer(tmp_path):

@@ -101,7 +101,7 @@ def test_segments_forgive_what_wheels_drifted_and_nothing_else(tmp_path):
         ({"backend": "mujoco", "emulated": False, "hardware": "no.yaml"}, "--hardware: it is about the robot: add --backend"),
         ({"backend": "mujoco", "emulated": False, "yes": True}, "--yes: it is about the robot: add --backend dynamixel"),
         ({"video": "a.webp"}, "--video: a film needs a simulator"),
-        ({"emulated": False, "port": ("leg=/dev/x",), "yes": True}, "no bus 'leg'"),
+        ({"emulated": False, "port": ("leg=/dev/x",), "yes": True}, "unknown port 'leg'"),
     ],
 )
 def test_refusals(run, tmp_path, options, words):

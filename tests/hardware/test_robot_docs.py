@@ -82,8 +82,7 @@ def test_what_the_software_sees_of_the_power_switch():
         ("brownout legs wheels", "ends it after 0.4 s with `{}`"),
     ):
         rig = Rig()
-        rig.loop.start()
-        rig.drive(0.5)
+        rig.start(0.5)
         start = rig.machine.time
         rig.inject(fault)
         with pytest.raises(StoppedError) as stopped:

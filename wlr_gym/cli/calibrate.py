@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import functools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec, TypeVar
 
 import numpy as np
 from rich.console import Console
@@ -25,24 +26,28 @@ from wlr_gym.base.text import tally
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import Count, ForceOption, JsonOption, RobotOption, WiredRobotOption
 from wlr_gym.cli.terminal import NobodyThereError, ask_terminal, print_json
+from wlr_gym.hardware import calibration as find
+from wlr_gym.hardware.calibration import RestPose, save_hardware, with_calibration
+from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting, load_hardware
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
+from wlr_gym.hardware.dynamixel.tables import BAUD_RATES
+from wlr_gym.hardware.flow_comparison import calibrate_flow as fit_flow
+from wlr_gym.hardware.imu import to_body
+from wlr_gym.hardware.servos import FACTORY_RATE, Servos, check_new_servo, find_servos, set_up
 from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.robot import JOINTS, LEGS, Robot, full_name, load_robot
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from wlr_gym.hardware.calibration import RestPose
-    from wlr_gym.hardware.config import Hardware, ImuCalibration, Mounting
     from wlr_gym.hardware.link import Link
-    from wlr_gym.hardware.servos import Servos
     from wlr_gym.perception.markers.calibration import Board, Readout
     from wlr_gym.perception.markers.camera import Camera
     from wlr_gym.perception.vision.video import Frames
 
 #: Shows a text, waits for Enter, returns what was typed.
 Ask = Callable[[str], str]
-Result = TypeVar("Result")
+Options, Result = ParamSpec("Options"), TypeVar("Result")
 #: Squares of a board along a side.
 _Squares = Annotated[int, Interval(least=3)]
 #: Share of the time that looking for the board takes, about; the computation of the lens takes the rest.
@@ -179,19 +184,18 @@ def _calibrated(options: CameraOptions, frames: Frames, board: Board) -> tuple[C
     from wlr_gym.perception.markers.calibration import Readout, calibrate, calibrate_film
 
     with progress(Console(highlight=False)) as tell:
-        named = _named(options.images, frames, lambda doing, share: tell("", doing, share))
+
+        def named() -> Iterator[tuple[str, float, NDArray[np.uint8]]]:
+            for frame in frames:
+                done = _SEARCH * min(frame.index / max(frames.announced, 1), 1.0)
+                tell("", f"looking for the board: picture {frame.index + 1}", done)
+                yield f"{options.images}, frame {frame.index}", frame.time, frame.image
+            tell("", "computing the lens", _SEARCH)
+
         if not Path(options.images).is_dir():
-            return calibrate_film(named, board, options.every, options.readout)
-        camera = calibrate(((name, image) for name, _, image in named), board)
+            return calibrate_film(named(), board, options.every, options.readout)
+        camera = calibrate(((name, image) for name, _, image in named()), board)
         return camera.model_copy(update={"readout": options.readout}), Readout()
-
-
-def _named(source: str, frames: Frames, tell: Callable[[str, float], None]) -> Iterator[tuple[str, float, NDArray[np.uint8]]]:
-    """Yield name, time and picture of each frame, and tell how many are done."""
-    for frame in frames:
-        tell(f"looking for the board: picture {frame.index + 1}", _SEARCH * min(frame.index / max(frames.announced, 1), 1.0))
-        yield f"{source}, frame {frame.index}", frame.time, frame.image
-    tell("computing the lens", _SEARCH)
 
 
 def _shutter(camera: Camera, told: Readout) -> str:
@@ -215,12 +219,12 @@ def write_targets(options: TargetsOptions) -> int:
     from wlr_gym.perception.vision.sheets import board_page, target_pages, write_pages
 
     body, floor = load_target(options.markers), load_target(options.floor)
-    for name in (f"{body.name}_markers", f"{floor.name}_markers", "calibration_board"):
+    sheets = {f"{target.name}_markers": target_pages(target) for target in (body, floor)}
+    sheets["calibration_board"] = [board_page(Board())]
+    for name in sheets:
         refuse_existing(options.out / f"{name}.pdf", options.force)
     make_output_folder(options.out)
-    paths = write_pages(options.out, f"{body.name}_markers", target_pages(body))
-    paths += write_pages(options.out, f"{floor.name}_markers", target_pages(floor))
-    paths += write_pages(options.out, "calibration_board", [board_page(Board())])
+    paths = [path for name, pages in sheets.items() for path in write_pages(options.out, name, pages)]
     print(f"in {options.out}: {', '.join(path.name for path in paths)}")
     print("print at 100 %, then measure the ruler on every page")
     if options.json:
@@ -228,243 +232,39 @@ def write_targets(options: TargetsOptions) -> int:
     return OK
 
 
-def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
-    """Find the one servo that is connected, say what will be written, ask, write and look again; 1 when the operator stops.
-
-    Raises:
-        InputError: unknown joint, none or several servos, another model, a servo that does not take it.
-    """
-    from wlr_gym.hardware.dynamixel.tables import BAUD_RATES
-    from wlr_gym.hardware.servos import FACTORY_RATE, check_new_servo, find_servos, set_up
-
-    check_name("joint", options.joint, JOINTS)
-    robot, hardware = options.load()
-    name, bus = next((name, bus) for name, bus in hardware.buses.items() if options.joint in bus.joints)
-    id = robot.dynamixel_ids[options.joint]
-    print(f"searching {bus.port} ...")
-    likely = (FACTORY_RATE, bus.baud_rate)
-    others = [rate for rate in BAUD_RATES if rate not in likely]
-    with _dialogue():
-        found = find_servos(name, bus.port, likely) or find_servos(name, bus.port, others)
-    servo = check_new_servo(found, bus, options.joint)
-    registers = tally(bus.eeprom)
-    print(f"found: {servo}\n{options.joint} gets id {id}, {bus.baud_rate} bit/s, {registers}")
-    try:
-        if not _yes(ask, "Write it?"):
-            return _stopped()
-    except _StoppedError:
-        return _stopped()
-    with _dialogue():
-        set_up(name, bus, servo, id)
-    print(f"done: id {id} answers at {bus.baud_rate} bit/s; put a label on it")
-    if options.json:
-        print_json({"joint": options.joint, "bus": name, "id": id, "baud_rate": bus.baud_rate, "registers": bus.eeprom})
-    return OK
-
-
-def calibrate_joints(options: JointsOptions, ask: Ask = ask_terminal) -> int:
-    """Ask for each joint, show what was found, and write the file; 1 when the operator stops.
-
-    Raises:
-        InputError: unknown joint or file, a servo that does not answer.
-    """
-    for joint in options.only:
-        check_name("joint", joint, JOINTS)
-    robot, hardware = options.load()
-    source = source_of(options.hardware, options.out)
-    link = options.link()
-    try:
-        with _dialogue():
-            link.servos.open()
-            return _calibrate_joints(options, robot, hardware, source, link, ask)
-    except _StoppedError:
-        return _stopped()
-    finally:
-        link.close()
-
-
-def _calibrate_joints(options: JointsOptions, robot: Robot, hardware: Hardware, source: Path, link: Link, ask: Ask) -> int:
-    from wlr_gym.hardware.calibration import with_mountings
-
-    _require_torque_off(link.servos, ask)
-    print("Put the robot on a stand, wheels off the ground. Enter continues, s skips a joint, q ends without a file.")
-    wanted = options.only or JOINTS
-    found = {joint: _calibrate(joint, robot, hardware, link.servos, ask) for joint in JOINTS if joint in wanted}
-    mountings = {joint: mounting for joint, mounting in found.items() if mounting is not None}
-    for joint, new in mountings.items():
-        old = hardware.joints[joint]
-        print(f"{joint:9} sign {old.sign:+d} -> {new.sign:+d}, zero {old.zero} -> {new.zero}")
-    note = f"Signs and zeros by wlr calibrate joints, {today()}: count = zero + sign * angle / (size of a count)."
-    code = save_calibration(options.out, source, lambda file: with_mountings(file, mountings), "joints", note, ask)
-    if options.json and code == OK:
-        print_json({"hardware": options.out, "joints": {name: one.model_dump() for name, one in mountings.items()}})
-    return code
-
-
-def _require_torque_off(servos: Servos, ask: Ask) -> None:
-    """Have all motors off; what is on is switched off only when the operator holds the robot and says so."""
-    on = [joint for joint in JOINTS if servos.get(joint, "torque_enable")]
-    if not on:
-        return
-    if not _yes(ask, f"Motors are on: {', '.join(on)}. Off, the robot drops: hold it. Switch them off?"):
-        raise _StoppedError
-    if left := servos.torque_off():
-        raise InputError(f"{', '.join(left)}: torque does not go off; cut the supply")
-
-
-def _calibrate(joint: str, robot: Robot, hardware: Hardware, servos: Servos, ask: Ask) -> Mounting | None:
-    """Return how one joint is mounted; None = skipped."""
-    from wlr_gym.hardware.calibration import find_sign, find_zero
-    from wlr_gym.hardware.config import Mounting
-
-    name = full_name(joint)
-    move = "swing its foot to the back by 30 deg" if joint in LEGS else "roll it forward by a quarter turn"
-
-    def look() -> Mounting | None:
-        if _answer(ask, f"{name}: hold it still, then Enter.") == "s":
-            return None
-        before = _counts(servos)
-        _answer(ask, f"{name}: {move} and hold it there, then Enter.")
-        turn = servos.table(joint).counts.turn
-        sign = find_sign(joint, before, _counts(servos), turn)
-        if joint not in LEGS:
-            return Mounting(sign=-1 if sign < 0 else 1, zero=hardware.joints[joint].zero)
-        _answer(ask, f"{name}: hold it straight down, wheel's centre under the hip, then Enter.")
-        straight_down = float(_counts(servos)[JOINTS.index(joint)])
-        zero = find_zero(joint, sign, straight_down, robot.leg_limits, turn)
-        return Mounting(sign=-1 if sign < 0 else 1, zero=zero)
-
-    return _until_good(look)
-
-
-def _counts(servos: Servos) -> NDArray[np.float64]:
-    """Return Present Position of all joints in counts, the average of 20 reads."""
-    return np.mean([[servos.get(joint, "present_position") for joint in JOINTS] for _ in range(20)], axis=0)
-
-
-def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
-    """Ask for each pose, show what was found, and write the file; 1 when the operator stops.
-
-    Raises:
-        InputError: unknown file, options that make no sense, an IMU that says nothing.
-    """
-    from wlr_gym.hardware.calibration import with_imu_calibration
-    from wlr_gym.hardware.config import ImuCalibration
-
-    _, hardware = options.load()
-    source = source_of(options.hardware, options.out)
-    link = options.link(with_imu_calibration(hardware, ImuCalibration()))
-    try:
-        with _dialogue():
-            link.imu.open()
-            print("Enter continues, q ends without a file.")
-            calibration = _find_calibration(options, hardware.imu.calibration, link, ask)
-        for name, value in calibration.model_dump(exclude_unset=True).items():
-            print(f"{name:13} {value}")
-        note = f"IMU calibrated by wlr calibrate imu, {today()}: mounting * scale * (measured - offset), SI units."
-        code = save_calibration(options.out, source, lambda file: with_imu_calibration(file, calibration), "imu", note, ask)
-        if options.json and code == OK:
-            print_json({"hardware": options.out, "imu": calibration.model_dump(mode="json")})
-        return code
-    except _StoppedError:
-        return _stopped()
-    finally:
-        link.close()
-
-
-def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
-    from wlr_gym.hardware import calibration as find
-    from wlr_gym.hardware.imu import to_body
-
-    level = "Block the body level (the legs hold nothing) and let go of it, then Enter."
-    if options.poses == 6:
-        side = "Side {} of 6: turn the robot so that the sensor's axes point {}; keep it still, then Enter."
-        poses = [_pose(options, link, ask, side.format(k, up)) for k, up in enumerate(_UP, 1)]
-        offset, scale = find.six_positions(poses)
-    else:
-        poses = [_pose(options, link, ask, level)]
-        offset, scale = known.accel_offset, known.accel_scale
-    mounting = known.mounting
-    if options.mounting:
-        stood = _pose(options, link, ask, level) if options.poses == 6 else poses[0]
-        nose_down = "Lift the rear: nose down by 10 deg or more, without roll; keep it still, then Enter."
-        tilted = _pose(options, link, ask, nose_down)
-        mounting = find.mounting(*(np.array(scale) * (pose.accelerometer - np.array(offset)) for pose in (stood, tilted)))
-    elif options.poses == 1:
-        offset = find.level_offset(poses[0], known, to_body(known))
-    return known.model_copy(
-        update={
-            "gyro_bias": find.gyro_bias(find.mean_pose(poses)),
-            "accel_offset": offset,
-            "accel_scale": scale,
-            "mounting": mounting,
-            "temperature": round(float(np.mean([pose.temperature for pose in poses])), 1),
-            "date": today(),
-        }
-    )
-
-
-def _pose(options: ImuOptions, link: Link, ask: Ask, text: str) -> RestPose:
-    from wlr_gym.hardware.calibration import rest_pose
-    from wlr_gym.hardware.safety.preflight import sample_imu
-
-    def look() -> RestPose:
-        _answer(ask, text)
-        samples = sample_imu(link.imu, link.clock, options.seconds)
-        return rest_pose(samples.gyro, samples.accelerometer, samples.temperature)
-
-    return _until_good(look)
-
-
-@contextlib.contextmanager
-def _dialogue() -> Iterator[None]:
-    """Turn trouble with the hardware into an :class:`InputError`: nothing moves, so there is nothing to save."""
-    try:
-        yield
-    except (NoAnswerError, RefusedError, ConnectionError) as error:
-        raise InputError(f"{error}; see wlr doctor") from None
-
-
-def calibrate_flow(options: FlowOptions) -> int:
-    """Show what was found, ask, and write the file; 1 when the operator stops.
-
-    Raises:
-        InputError: a run without flow, too little way, a hardware file that names no flow sensor.
-    """
-    from wlr_gym.data.runs import read_run
-    from wlr_gym.hardware.calibration import with_flow_calibration
-    from wlr_gym.hardware.config import load_hardware
-    from wlr_gym.hardware.flow_comparison import calibrate_flow as find
-
-    hardware = load_hardware(options.hardware)
-    robot = load_robot(options.robot or hardware.robot or "nominal")
-    if hardware.flow is None:
-        raise InputError(
-            f"--hardware {options.hardware}: names no flow sensor; expected a section flow, such as flow: {{port: ...}}"
-        )
-    source = source_of(options.hardware, options.out)
-    fit = find(read_run(options.run), robot, hardware.flow.calibration, options.distance)
-    found = fit.calibration.model_copy(update={"date": today()})
-    before = hardware.flow.calibration
-    print(
-        f"{fit.way:.2f} m in {fit.windows} windows, against {'the wheels' if options.distance is None else 'the tape measure'}"
-    )
-    print(f"scale     {before.scale:.4f} -> {found.scale:.4f} +- {fit.scale_sigma:.4f}")
-    print(f"mount_yaw {before.mount_yaw:.4f} -> {found.mount_yaw:.4f} +- {fit.yaw_sigma:.4f} rad")
-    note = f"Flow sensor calibrated by wlr calibrate flow, {today()}: scale, and rotation about body z from body to sensor."
-    ask = (lambda text: "y") if options.yes else ask_terminal
-    code = save_calibration(options.out, source, lambda file: with_flow_calibration(file, found), "flow", note, ask)
-    if options.json and code == OK:
-        sigma = {"scale": fit.scale_sigma, "mount_yaw": fit.yaw_sigma}
-        print_json({"hardware": options.out, "flow": found.model_dump(mode="json"), "sigma": sigma, "way": fit.way})
-    return code
-
-
 # ---- the dialogue ----------------------------------------------------------------------------------------------------
 
 
 class _StoppedError(Exception):
     """The operator does not want to continue."""
+
+
+def _dialogue(command: Callable[Options, int]) -> Callable[Options, int]:
+    """Let a command return 1 when the operator stops it; trouble with the hardware is an :class:`InputError`: nothing moves."""
+
+    @functools.wraps(command)
+    def run(*args: Options.args, **kwargs: Options.kwargs) -> int:
+        try:
+            return command(*args, **kwargs)
+        except _StoppedError:
+            print("stopped: nothing was written")
+            return FAILED
+        except (NoAnswerError, RefusedError, ConnectionError) as error:
+            raise InputError(f"{error}; see wlr doctor") from None
+
+    return run
+
+
+def _answer(ask: Ask, text: str) -> str:
+    answer = ask(text).strip().lower()
+    if answer in ("q", "quit"):
+        raise _StoppedError
+    return answer
+
+
+def _require_yes(ask: Ask, text: str) -> None:
+    if _answer(ask, f"{text} [y/N]") not in ("y", "yes"):
+        raise _StoppedError
 
 
 def _until_good(look: Callable[[], Result]) -> Result:
@@ -478,17 +278,6 @@ def _until_good(look: Callable[[], Result]) -> Result:
             print(f"{error}. Once more.")
 
 
-def _answer(ask: Ask, text: str) -> str:
-    answer = ask(text).strip().lower()
-    if answer in ("q", "quit"):
-        raise _StoppedError
-    return answer
-
-
-def _yes(ask: Ask, text: str) -> bool:
-    return _answer(ask, f"{text} [y/N]") in ("y", "yes")
-
-
 def source_of(hardware: str, out: Path) -> Path:
     """Return the file the hardware comes from; refuse to write over another one."""
     source = find_config("hardware", hardware)
@@ -498,25 +287,182 @@ def source_of(hardware: str, out: Path) -> Path:
     return source
 
 
-def save_calibration(out: Path, source: Path, change: Callable[[Hardware], Hardware], section: str, note: str, ask: Ask) -> int:
+def save_calibration(
+    out: Path, source: Path, change: Callable[[Hardware], Hardware], section: str, note: str, ask: Ask
+) -> None:
     """Ask, and write the file with what was found: ``change`` is made to what it says, not to ports of the command line."""
-    from wlr_gym.hardware.calibration import save_hardware
-    from wlr_gym.hardware.config import load_hardware
-
-    if not _yes(ask, f"Write {out}?"):
-        return _stopped()
+    _require_yes(ask, f"Write {out}?")
     save_hardware(out, source, change(load_hardware(source)), section, note)
     print(f"written: {out}")
-    return OK
-
-
-def _stopped() -> int:
-    print("stopped: nothing was written")
-    return FAILED
 
 
 def today() -> str:
     return datetime.datetime.now().astimezone().date().isoformat()
+
+
+# ---- servos ----------------------------------------------------------------------------------------------------------
+
+
+@_dialogue
+def set_up_servo(options: ServoOptions, ask: Ask = ask_terminal) -> int:
+    """Find the one servo that is connected, say what will be written, ask, write and look again; 1 when the operator stops."""
+    check_name("joint", options.joint, JOINTS)
+    robot, hardware = options.load()
+    name, bus = next((name, bus) for name, bus in hardware.buses.items() if options.joint in bus.joints)
+    id = robot.dynamixel_ids[options.joint]
+    print(f"searching {bus.port} ...")
+    likely = (FACTORY_RATE, bus.baud_rate)
+    others = [rate for rate in BAUD_RATES if rate not in likely]
+    servo = check_new_servo(find_servos(name, bus.port, likely) or find_servos(name, bus.port, others), bus, options.joint)
+    print(f"found: {servo}\n{options.joint} gets id {id}, {bus.baud_rate} bit/s, {tally(bus.eeprom)}")
+    _require_yes(ask, "Write it?")
+    set_up(name, bus, servo, id)
+    print(f"done: id {id} answers at {bus.baud_rate} bit/s; put a label on it")
+    if options.json:
+        print_json({"joint": options.joint, "bus": name, "id": id, "baud_rate": bus.baud_rate, "registers": bus.eeprom})
+    return OK
+
+
+@_dialogue
+def calibrate_joints(options: JointsOptions, ask: Ask = ask_terminal) -> int:
+    """Ask for each joint, show what was found, and write the file; 1 when the operator stops."""
+
+    for joint in options.only:
+        check_name("joint", joint, JOINTS)
+    robot, hardware = options.load()
+    source = source_of(options.hardware, options.out)
+    with contextlib.closing(options.link()) as link:
+        servos = link.servos
+        servos.open()
+        if on := [joint for joint in JOINTS if servos.get(joint, "torque_enable")]:
+            _require_yes(ask, f"Motors are on: {', '.join(on)}. Off, the robot drops: hold it. Switch them off?")
+            if left := servos.torque_off():
+                raise InputError(f"{', '.join(left)}: torque does not go off; cut the supply")
+        print("Put the robot on a stand, wheels off the ground. Enter continues, s skips a joint, q ends without a file.")
+        wanted = [joint for joint in JOINTS if joint in (options.only or JOINTS)]
+        found = {joint: _calibrate(joint, robot, hardware, servos, ask) for joint in wanted}
+    mountings = {joint: mounting for joint, mounting in found.items() if mounting is not None}
+    for joint, new in mountings.items():
+        old = hardware.joints[joint]
+        print(f"{joint:9} sign {old.sign:+d} -> {new.sign:+d}, zero {old.zero} -> {new.zero}")
+    note = f"Signs and zeros by wlr calibrate joints, {today()}: count = zero + sign * angle / (size of a count)."
+    save_calibration(options.out, source, lambda file: find.with_mountings(file, mountings), "joints", note, ask)
+    if options.json:
+        print_json({"hardware": options.out, "joints": {name: one.model_dump() for name, one in mountings.items()}})
+    return OK
+
+
+def _calibrate(joint: str, robot: Robot, hardware: Hardware, servos: Servos, ask: Ask) -> Mounting | None:
+    """Return how one joint is mounted; None = skipped."""
+    name = full_name(joint)
+    move = "swing its foot to the back by 30 deg" if joint in LEGS else "roll it forward by a quarter turn"
+
+    def look() -> Mounting | None:
+        if _answer(ask, f"{name}: hold it still, then Enter.") == "s":
+            return None
+        before = _counts(servos)
+        _answer(ask, f"{name}: {move} and hold it there, then Enter.")
+        turn = servos.table(joint).counts.turn
+        sign, zero = find.find_sign(joint, before, _counts(servos), turn), hardware.joints[joint].zero
+        if joint in LEGS:
+            _answer(ask, f"{name}: hold it straight down, wheel's centre under the hip, then Enter.")
+            straight_down = float(_counts(servos)[JOINTS.index(joint)])
+            zero = find.find_zero(joint, sign, straight_down, robot.leg_limits, turn)
+        return Mounting(sign=-1 if sign < 0 else 1, zero=zero)
+
+    return _until_good(look)
+
+
+def _counts(servos: Servos) -> NDArray[np.float64]:
+    """Return Present Position of all joints in counts, the average of 20 reads."""
+    return np.mean([[servos.get(joint, "present_position") for joint in JOINTS] for _ in range(20)], axis=0)
+
+
+# ---- sensors ---------------------------------------------------------------------------------------------------------
+
+
+@_dialogue
+def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
+    """Ask for each pose, show what was found, and write the file; 1 when the operator stops."""
+    _, hardware = options.load()
+    source = source_of(options.hardware, options.out)
+    with contextlib.closing(options.link(with_calibration(hardware, ImuCalibration()))) as link:
+        link.imu.open()
+        print("Enter continues, q ends without a file.")
+        calibration = _find_calibration(options, hardware.imu.calibration, link, ask)
+    for name, value in calibration.model_dump(exclude_unset=True).items():
+        print(f"{name:13} {value}")
+    note = f"IMU calibrated by wlr calibrate imu, {today()}: mounting * scale * (measured - offset), SI units."
+    save_calibration(options.out, source, lambda file: with_calibration(file, calibration), "imu", note, ask)
+    if options.json:
+        print_json({"hardware": options.out, "imu": calibration.model_dump(mode="json")})
+    return OK
+
+
+def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:
+    from wlr_gym.hardware.safety.preflight import sample_imu
+
+    def pose(text: str) -> RestPose:
+        def look() -> RestPose:
+            _answer(ask, text)
+            samples = sample_imu(link.imu, link.clock, options.seconds)
+            return find.rest_pose(samples.gyro, samples.accelerometer, samples.temperature)
+
+        return _until_good(look)
+
+    level = "Block the body level (the legs hold nothing) and let go of it, then Enter."
+    if options.poses == 6:
+        side = "Side {} of 6: turn the robot so that the sensor's axes point {}; keep it still, then Enter."
+        poses = [pose(side.format(k, up)) for k, up in enumerate(_UP, 1)]
+        offset, scale = find.six_positions(poses)
+    else:
+        poses = [pose(level)]
+        offset, scale = known.accel_offset, known.accel_scale
+    mounting = known.mounting
+    if options.mounting:
+        stood = pose(level) if options.poses == 6 else poses[0]
+        tilted = pose("Lift the rear: nose down by 10 deg or more, without roll; keep it still, then Enter.")
+        mounting = find.mounting(*(np.array(scale) * (one.accelerometer - np.array(offset)) for one in (stood, tilted)))
+    elif options.poses == 1:
+        offset = find.level_offset(poses[0], known, to_body(known))
+    return known.model_copy(
+        update={
+            "gyro_bias": find.gyro_bias(*poses),
+            "accel_offset": offset,
+            "accel_scale": scale,
+            "mounting": mounting,
+            "temperature": round(float(np.mean([one.temperature for one in poses])), 1),
+            "date": today(),
+        }
+    )
+
+
+@_dialogue
+def calibrate_flow(options: FlowOptions) -> int:
+    """Show what was found, ask, and write the file; 1 when the operator stops."""
+    from wlr_gym.data.runs import read_run
+
+    hardware = load_hardware(options.hardware)
+    robot = load_robot(options.robot or hardware.robot or "nominal")
+    if hardware.flow is None:
+        raise InputError(
+            f"--hardware {options.hardware}: names no flow sensor; expected a section flow, such as flow: {{port: ...}}"
+        )
+    source = source_of(options.hardware, options.out)
+    before = hardware.flow.calibration
+    fit = fit_flow(read_run(options.run), robot, before, options.distance)
+    found = fit.calibration.model_copy(update={"date": today()})
+    against = "the wheels" if options.distance is None else "the tape measure"
+    print(f"{fit.way:.2f} m in {fit.windows} windows, against {against}")
+    print(f"scale     {before.scale:.4f} -> {found.scale:.4f} +- {fit.scale_sigma:.4f}")
+    print(f"mount_yaw {before.mount_yaw:.4f} -> {found.mount_yaw:.4f} +- {fit.yaw_sigma:.4f} rad")
+    note = f"Flow sensor calibrated by wlr calibrate flow, {today()}: scale, and rotation about body z from body to sensor."
+    ask = (lambda text: "y") if options.yes else ask_terminal
+    save_calibration(options.out, source, lambda file: with_calibration(file, found), "flow", note, ask)
+    if options.json:
+        sigma = {"scale": fit.scale_sigma, "mount_yaw": fit.yaw_sigma}
+        print_json({"hardware": options.out, "flow": found.model_dump(mode="json"), "sigma": sigma, "way": fit.way})
+    return OK
 
 
 #: Command -> its options, and what it does.

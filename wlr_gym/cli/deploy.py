@@ -7,20 +7,19 @@ off the ground the first time; see docs/robot.md.
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.text import Text
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, Interval, check_name
 from wlr_gym.base.files import require_ending, require_output_place
 from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
@@ -32,6 +31,7 @@ from wlr_gym.cli.options import (
     Seconds,
     Seed,
     environment_of,
+    handed,
     note_untrained,
     refuse_given,
 )
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from wlr_gym.data.logs.write import McapStream
     from wlr_gym.envs.core import Core
     from wlr_gym.hardware.deployment import Deployment
-    from wlr_gym.hardware.emulator.machine import Machine
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import DrivingPad, Keys
     from wlr_gym.hardware.safety.rules import RobotStatus
@@ -63,8 +62,6 @@ if TYPE_CHECKING:
 _LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
 #: s for which the dead-man button of a gamepad may be let go.
 _PAD_DEADMAN = 0.2
-#: File of an emulated robot's true pose, and its key among the ports.
-_POSES = "poses"
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,7 @@ class DeployOptions(JsonOption, PatchOption, CameraOption):
     """What to follow: linear_velocity_x=0.1 yaw_rate=0; default: drawn anew every few seconds, as in training."""
     seed: Seed = 0
     """Seed of the drawn commands, and of an emulated robot's noise."""
-    deadman: float | None = None
+    deadman: Annotated[float, Interval("s", above=0.0, most=10.0)] | None = None
     """Stop the wheels when no key was pressed for so many seconds (10 at most); with --gamepad: its dead-man button (0.2)."""
     gamepad: str | None = None
     """Steer with a gamepad, such as /dev/input/js0, while its dead-man button is held; buttons: the hardware file's gamepad."""
@@ -106,11 +103,7 @@ class DeployOptions(JsonOption, PatchOption, CameraOption):
 
 
 def run(options: DeployOptions) -> int:
-    """Deploy; 0 = ended as it was asked to, 1 = something stopped the robot.
-
-    Raises:
-        InputError: bad options, a policy that does not fit, ports that cannot be opened.
-    """
+    """Deploy; 0 = ended as it was asked to, 1 = something stopped the robot."""
     from wlr_gym.hardware.deployment import deploy, loop_of
     from wlr_gym.hardware.operator import HELP, Keys, stop_on_signals
     from wlr_gym.hardware.safety.preflight import require_ports
@@ -120,20 +113,14 @@ def run(options: DeployOptions) -> int:
     command = checked_command(options)
     environment = environment_of(options.env, options.policy)
     note_untrained([options.policy])
-    settings = robot_options(options)
-    keywords = {
-        "backend": "dynamixel",
-        "hardware": settings,
-        "robot": driven_robot(options),
-        "episode_length": options.seconds,
-    }
+    hardware, robot = robot_options(options), driven_robot(options)
+    keywords = {"backend": "dynamixel", "hardware": hardware, "robot": robot, "episode_length": options.seconds}
     policy = _make_policy(options.policy, environment, keywords, command)
     console = Console()
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
         if options.emulated and not options.stepped:
-            ports = stack.enter_context(_emulator(options, console, keywords["robot"]))
-            poses = ports.pop(_POSES, None)
-            keywords["hardware"] = replace(settings, ports=ports, poses=None if poses is None else Path(poses))
+            ports, poses = stack.enter_context(_emulator(options, console, robot))
+            keywords["hardware"] = replace(hardware, ports=ports, poses=poses)
         core = make_core(environment, 1, environment_for(options.policy, keywords))
         stack.callback(core.close)
         _say_what_is_not_known(core, options.policy, console)
@@ -145,9 +132,16 @@ def run(options: DeployOptions) -> int:
             require_ports(loop.hardware)
             wait_for_enter(console, "The robot will move. Wheels off the ground? Hand on the switch?")
         if options.stepped:
+            from wlr_gym.hardware.emulator.link import EmulatedWorld
+
+            assert isinstance(loop.clock, EmulatedWorld)
             for fault in options.fault:
-                _machine_of(loop).inject(fault)
-        stream = _stream(options.mcap, loop, last)
+                loop.clock.machine.inject(fault)
+        recorder = loop.recorder
+        if options.mcap is not None:
+            from wlr_gym.data.logs.write import McapStream
+
+            recorder.stream = last.enter_context(McapStream(options.mcap, recorder.columns[1:], recorder.meta, loop.robot))
         keys = stack.enter_context(Keys())
         if keys.is_terminal:
             console.print(HELP, style="dim")
@@ -158,23 +152,17 @@ def run(options: DeployOptions) -> int:
         print_json(_results(result, loop))
     else:
         _report(result, loop, console)
-    if stream is not None:
-        _report_stream(stream, console)
+    if recorder.stream is not None:
+        _report_stream(recorder.stream, console)
     console.print(busy_note(options, result.reason), style="yellow", end="")
     return OK if result.well else FAILED
 
 
 def checked_command(options: DeployOptions) -> dict[str, float]:
-    """Return the held command, from options that make sense: before an operator is asked or a robot started.
-
-    Raises:
-        InputError: the first option that does not.
-    """
-    from wlr_gym.hardware.config import load_hardware, require_deadman
+    """Return the held command, from options that make sense: before an operator is asked or a robot started."""
+    from wlr_gym.hardware.config import load_hardware
     from wlr_gym.hardware.timing import require_priority
 
-    if options.deadman is not None:
-        require_deadman("--deadman", options.deadman)
     if options.realtime is not None:
         require_priority("--realtime", options.realtime)
     if not options.emulated:
@@ -203,20 +191,24 @@ def checked_command(options: DeployOptions) -> dict[str, float]:
         require_ending(options.mcap, (".mcap",), "--mcap")
     command = pairs("--command", options.command, "yaw_rate=0.1")
     try:
-        numbers = {name: float(text) for name, text in command.items()}
+        return {name: float(text) for name, text in command.items()}
     except ValueError:
-        numbers = {"": float("nan")}
-    if not all(map(math.isfinite, numbers.values())):
-        raise InputError(f"--command {' '.join(options.command)}: expected name=number")
-    return numbers
+        raise InputError(f"--command {' '.join(options.command)}: expected name=number") from None
 
 
 def _results(result: Deployment, loop: ControlLoop) -> dict[str, Any]:
     """Return what ``--json`` prints; ``statistics`` count the steps of the ramp to the start pose too."""
-    found = {name: getattr(result, name) for name in ("reason", "well", "run")} | {"files": loop.recorder.files}
     statistics = {f"{name}_ms" if _is_time(value) else name: value for name, value in result.statistics.items()}
-    steps = {"steps": result.ticks, "steps_with_ramp": statistics.pop("ticks")}
-    return found | steps | {"statistics": statistics, "limited": dict(loop.interventions)}
+    return {
+        "reason": result.reason,
+        "well": result.well,
+        "run": result.run,
+        "files": loop.recorder.files,
+        "steps": result.ticks,
+        "steps_with_ramp": statistics.pop("ticks"),
+        "statistics": statistics,
+        "limited": dict(loop.interventions),
+    }
 
 
 def _is_time(value: object) -> bool:
@@ -255,25 +247,18 @@ def robot_options(options: DeployOptions) -> RobotOptions:
     """Return which robot is driven, and how it is connected; an emulated one in real time gets its ports once it runs."""
     from wlr_gym.physics.plants.base import RobotOptions
 
-    return RobotOptions(
-        hardware=options.hardware,
-        ports=pairs("--port", options.port, PORT),
-        emulated=options.emulated and options.stepped,
-        dry_run=options.dry_run,
-        log=options.out,
-        deadman=_PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
-        effects=options.patch() if options.stepped else None,
-        camera=options.camera,
-        seed=options.seed,
-    )
+    own = {
+        "ports": pairs("--port", options.port, PORT),
+        "emulated": options.stepped,
+        "log": options.out,
+        "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
+        "effects": options.patch() if options.stepped else None,
+    }
+    return RobotOptions(**handed(options, RobotOptions, **own))
 
 
 def _make_policy(source: str, environment: str, keywords: Mapping[str, Any], command: Mapping[str, float]) -> Policy:
-    """Return the policy; it needs no robot, so names and what does not fit are told before one is started.
-
-    Raises:
-        InputError: an unknown environment or command, a command out of range, or a policy that does not fit the environment.
-    """
+    """Return the policy; it needs no robot, so names and what does not fit are told before one is started."""
     from wlr_gym.envs.core import make_task
     from wlr_gym.envs.settings import read_settings
     from wlr_gym.envs.tasks import contract
@@ -281,13 +266,10 @@ def _make_policy(source: str, environment: str, keywords: Mapping[str, Any], com
 
     task = make_task(task_source_of(environment), read_settings(environment_for(source, keywords)))
     for name, value in command.items():
-        if name not in task.commands:
-            raise unknown_name("command", name, task.commands, "--command")
+        check_name("command", name, task.commands, "--command")
         low, high = task.config.commands.terms[name]
         if not low <= value <= high:
-            raise InputError(
-                f"--command {name}={value:g}: expected {low:g} to {high:g} ({COMMANDS[name].unit}), the range of the task"
-            )
+            raise InputError(f"--command: {name} = {value:g}: expected {COMMANDS[name].words(low, high)}")
     return make_policy(source, contract(task, {}))
 
 
@@ -304,16 +286,6 @@ def _gamepads(options: DeployOptions, core: Core, loop: ControlLoop, console: Co
     return [DrivingPad(options.gamepad, buttons, ranges)]
 
 
-def _stream(path: Path | None, loop: ControlLoop, stack: contextlib.ExitStack) -> McapStream | None:
-    """Return what writes the run into an MCAP file while it goes on, or None."""
-    if path is None:
-        return None
-    from wlr_gym.data.logs.write import McapStream
-
-    loop.recorder.stream = stack.enter_context(McapStream(path, loop.recorder.columns[1:], loop.recorder.meta, loop.robot))
-    return loop.recorder.stream
-
-
 def _report_stream(stream: McapStream, console: Console) -> None:
     if not (stream.path.is_file() or stream.trouble):
         return
@@ -322,16 +294,8 @@ def _report_stream(stream: McapStream, console: Console) -> None:
     console.print(f"written: {stream.path}{problem and '; '}{problem}", style="yellow" if problem else "", soft_wrap=True)
 
 
-def _machine_of(loop: ControlLoop) -> Machine:
-    """Return the emulated robot that a loop drives."""
-    from wlr_gym.hardware.emulator.link import EmulatedWorld
-
-    assert isinstance(loop.clock, EmulatedWorld)
-    return loop.clock.machine
-
-
 @contextlib.contextmanager
-def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> Iterator[dict[str, str]]:
+def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> Iterator[tuple[dict[str, str], Path | None]]:
     """Start ``wlr emulate`` as a process of its own; yield its ports, and the file of its poses where a camera needs it."""
     import subprocess
     import tempfile
@@ -341,23 +305,18 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
 
     hardware = load_hardware(options.hardware)
     with tempfile.TemporaryDirectory(prefix="wlr-robot-") as folder:
-        links = Path(folder) / "ports"
+        links, poses = Path(folder) / "ports", None if options.camera is None else Path(folder) / "poses"
         words = ["--links", str(links), "--hardware", options.hardware, "--seed", str(options.seed)]
-        if options.camera is not None:
-            words += ["--poses", str(Path(folder) / _POSES)]
         if robot is not None:
             write_robot(Path(folder) / "robot.yaml", load_robot(robot))
             words += ["--robot", str(Path(folder) / "robot.yaml")]
-        if options.fault:
-            words += ["--fault", *options.fault]
-        if options.effects:
-            words += ["--effects", *options.effects]
+        words += ["--poses", str(poses)] if poses is not None else []
+        words += ["--fault", *options.fault] if options.fault else []
+        words += ["--effects", *options.effects] if options.effects else []
         modules = [word for module in IMPORTED for word in ("--import", module)]
         main = "import sys; from wlr_gym.cli import main; sys.exit(main())"
-        command = [sys.executable, "-c", main, *modules, "emulate", *words]
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-        )
+        command, pipe = [sys.executable, "-c", main, *modules, "emulate", *words], subprocess.PIPE
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
         assert process.stdout is not None
         assert process.stderr is not None
         try:
@@ -367,7 +326,7 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
             ports = {name: str(links / name) for name in hardware.port_names}
             if missing := [name for name in ports if not (links / name).exists()]:  # a port of the file may be a real robot's
                 raise InputError(f"the emulated robot has no port '{missing[0]}', which {options.hardware} has")
-            yield ports | ({_POSES: str(Path(folder) / _POSES)} if options.camera is not None else {})
+            yield ports, poses
         finally:
             process.terminate()
             process.communicate()
@@ -423,8 +382,7 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
         print_table(console, ("", "p50", "p95", "p99", "max"), rows, f"{steps}, {statistics['missed']} missed; ms")
     else:  # in emulated time nothing takes any
         console.print(steps)
-    limited = ", ".join(f"{rule} {count}" for rule, count in loop.interventions.most_common()) or "none"
-    console.print(f"command limiter, steps: {limited}")
+    console.print(f"command limiter, steps: {_counted(loop.interventions)}")
     if camera := statistics.get("camera"):
         console.print(camera_line(camera))
     if written := [result.run] if result.run is not None else loop.recorder.files:
@@ -435,12 +393,7 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
 
 
 class RobotView:
-    """What a driver wants to see now.
-
-    Args:
-        loop: drives the robot.
-        core: what it is asked to follow.
-    """
+    """What a driver wants to see now: of the loop that drives the robot, and the core that says what it is asked to follow."""
 
     def __init__(self, loop: ControlLoop, core: Core) -> None:
         self._loop, self._core = loop, core
@@ -464,16 +417,11 @@ class RobotView:
             table.add_row(joint, *numbers, style="red" if status.silence[k] > 0 else "")
         command = "  ".join(f"{name} {value:+.2f}" for name, value in zip(core.task.commands, core.command[0], strict=True))
         camera = [] if status.camera is None else [camera_state(status)]
-        table.caption = "\n".join([command, supervised(loop, status), *camera, self._interventions()])
+        acts = ", ".join(sorted(loop.interventions - self._seen)) or "nothing"
+        limiter = f"command limiter acts on: {acts}; steps in all: {_counted(loop.interventions)}"
+        self._seen = loop.interventions.copy()  # what it changed or stopped since the last look
+        table.caption = "\n".join([command, supervised(loop, status), *camera, limiter])
         return table
-
-    def _interventions(self) -> str:
-        """What the command limiter changed or stopped since the last look, and in all."""
-        counts = self._loop.interventions
-        now = ", ".join(sorted(counts - self._seen)) or "nothing"
-        in_all = ", ".join(f"{rule} {count}" for rule, count in counts.most_common()) or "none"
-        self._seen = counts.copy()
-        return f"command limiter acts on: {now}; steps in all: {in_all}"
 
 
 def supervised(loop: ControlLoop, status: RobotStatus) -> str:
@@ -519,8 +467,9 @@ def camera_line(found: dict[str, Any]) -> str:
         line += f"; from exposure to the control step {latency['p50']:.0f} ms {tail}"
     if lag := found.get("lag"):
         line += f"; pictures older than their stamps by {lag['ms']:.0f} +- {lag['std']:.0f} ms, by the gyroscope"
-    reasons = ", ".join(
-        f"{reason} {count}" for reason, count in sorted(found["without_pose"].items(), key=lambda item: -item[1])
-    )
     doubt = f"; {found['doubt']}" if "doubt" in found else ""
-    return f"{line}; frames without a believed pose: {reasons or 'none'}{doubt}"
+    return f"{line}; frames without a believed pose: {_counted(Counter(found['without_pose']))}{doubt}"
+
+
+def _counted(counts: Counter[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from dataclasses import dataclass
@@ -50,16 +51,11 @@ COUNTS = 4096
 
 @dataclass(frozen=True)
 class RestPose:
-    """An IMU at rest in one pose, sensor axes, uncalibrated.
+    """An IMU at rest in one pose, sensor axes, uncalibrated."""
 
-    Attributes:
-        gyro, accelerometer: (3,) means, rad/s and m/s2.
-        temperature: degC.
-    """
-
-    gyro: Array
-    accelerometer: Array
-    temperature: float
+    gyro: Array  #: (3,) rad/s, mean
+    accelerometer: Array  #: (3,) m/s2, mean
+    temperature: float  #: degC
 
 
 def rest_pose(gyro: ArrayLike, accelerometer: ArrayLike, temperature: float) -> RestPose:
@@ -85,22 +81,16 @@ def motion(values: Array) -> float:
     return float(max(values.std(axis=0).max(), drift.max()))
 
 
-def mean_pose(poses: list[RestPose]) -> RestPose:
-    """Return the mean of several poses: of use for what does not depend on the pose, the gyroscope's bias."""
-    return RestPose(
-        *(np.mean([vars(pose)[name] for pose in poses], axis=0) for name in ("gyro", "accelerometer", "temperature"))
-    )
-
-
-def gyro_bias(pose: RestPose) -> Vector:
-    """Return what the gyroscope reads at rest, rad/s.
+def gyro_bias(*poses: RestPose) -> Vector:
+    """Return what the gyroscope reads at rest, rad/s: the mean of all poses.
 
     Raises:
         InputError: more than any healthy chip: the robot turned, or the range is not the one in the hardware file.
     """
-    if (worst := float(np.abs(pose.gyro).max())) > LARGEST_BIAS:
+    bias = np.mean([pose.gyro for pose in poses], axis=0)
+    if (worst := float(np.abs(bias).max())) > LARGEST_BIAS:
         raise InputError(f"gyroscope reads {worst:.2f} rad/s at rest, expected below {LARGEST_BIAS:g}: is gyro_range right?")
-    return _vector(pose.gyro)
+    return _vector(bias)
 
 
 def six_positions(poses: list[RestPose]) -> tuple[Vector, Vector]:
@@ -195,20 +185,19 @@ def find_sign(joint: str, before: ArrayLike, after: ArrayLike, turn: int = COUNT
     """Return the sign of a joint that was moved by hand in its positive direction.
 
     Args:
-        joint: which one was to be moved.
-        before, after: (8,) counts of all joints.
+        before, after: (8,) counts of all joints. turn: counts per turn.
 
     Raises:
         InputError: it moved too little, or another joint moved instead.
     """
     moved = np.asarray(after, np.float64) - np.asarray(before, np.float64)
     own = moved[JOINTS.index(joint)]
-    others = np.where(np.arange(len(JOINTS)) == JOINTS.index(joint), 0.0, np.abs(moved))
-    other = JOINTS[int(others.argmax())]
+    others = {name: abs(way) for name, way in zip(JOINTS, moved.tolist(), strict=True) if name != joint}
+    other = max(others, key=lambda name: others[name])
     least = round(LEAST_MOVE * turn)
-    if others.max() > max(least, LARGEST_SHARE * abs(own)):
+    if others[other] > max(least, LARGEST_SHARE * abs(own)):
         raise InputError(
-            f"{other} moved by {others.max():.0f} counts while {joint} was asked for: hold it still, or its id is swapped"
+            f"{other} moved by {others[other]:.0f} counts while {joint} was asked for: hold it still, or its id is swapped"
         )
     if abs(own) < least:
         raise InputError(f"{joint} moved by {abs(own):.0f} counts, expected {least} (20 deg) or more")
@@ -240,29 +229,18 @@ def with_mountings(hardware: Hardware, mountings: dict[str, Mounting]) -> Hardwa
     return hardware.model_copy(update={"joints": {joint: mountings.get(joint, hardware.joints[joint]) for joint in JOINTS}})
 
 
-def with_imu_calibration(hardware: Hardware, calibration: ImuCalibration) -> Hardware:
-    """Return the hardware with another calibration of its IMU."""
-    return hardware.model_copy(update={"imu": hardware.imu.model_copy(update={"calibration": calibration})})
-
-
-def with_flow_calibration(hardware: Hardware, calibration: FlowCalibration) -> Hardware:
-    """Return the hardware with another calibration of its optical-flow sensor."""
-    assert hardware.flow is not None
-    return hardware.model_copy(update={"flow": hardware.flow.model_copy(update={"calibration": calibration})})
+def with_calibration(hardware: Hardware, calibration: ImuCalibration | FlowCalibration) -> Hardware:
+    """Return the hardware with another calibration of its IMU or optical-flow sensor."""
+    name = "imu" if isinstance(calibration, ImuCalibration) else "flow"
+    return hardware.model_copy(update={name: getattr(hardware, name).model_copy(update={"calibration": calibration})})
 
 
 def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, note: str) -> None:
     """Write a hardware file in one step: the source's text with one section replaced, so that comments elsewhere stay.
 
     Args:
-        path: file to write; may be the source.
-        source: file the hardware was loaded from.
-        hardware: what its section shall say.
-        section: ``joints``, ``imu``, ``flow`` or ``measured``: the only part that is changed.
-        note: comment for the section.
-
-    Raises:
-        InputError: it cannot be written.
+        path: file to write; may be the source, which the hardware was loaded from.
+        hardware: what its section (``joints``, ``imu``, ``flow`` or ``measured``) shall say. note: comment for it.
     """
     changed = hardware.model_dump(mode="json", exclude_unset=True)[section]
     content = {**read_yaml(source), section: changed}
@@ -282,17 +260,12 @@ def save_hardware(path: Path, source: Path, hardware: Hardware, section: str, no
 
     def write(temporary: Path) -> None:
         temporary.write_text(patched, encoding="utf-8")
-        if not _says(temporary, content):  # a layout that cannot be patched
-            temporary.write_text(f"# {note}\n" + _yaml(content), encoding="utf-8")
+        with contextlib.suppress(InputError):
+            if read_yaml(temporary) == content:
+                return
+        temporary.write_text(f"# {note}\n" + _yaml(content), encoding="utf-8")  # a layout that cannot be patched
 
     replace_file(path, write)
-
-
-def _says(path: Path, content: dict[str, Any]) -> bool:
-    try:
-        return read_yaml(path) == content
-    except InputError:
-        return False
 
 
 def _yaml(content: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from wlr_gym.base.errors import InputError, check_name, nearest
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.paths import find_config, named_by, named_in
 from wlr_gym.base.settings import SettingsModel, expected, parse_config, read_config
 from wlr_gym.hardware.dynamixel.tables import BAUD_RATES, POSITION_MODE, VELOCITY_MODE, ControlTable, load_table
@@ -32,84 +32,54 @@ MOST_SERVOS = 4
 # ---- the safety limits ----
 
 
-def _limit(default: float | None, unit: str, *, le: float, **low: Any) -> Any:
+def _limit(default: float | None, unit: str, doc: str, *, le: float, **low: Any) -> Any:
     """Return the field of a limit; ``le`` is far above what anyone sets on purpose: a value beyond it has another unit."""
-    return Field(default=default, le=le, json_schema_extra={"unit": unit}, **low)
+    return Field(default=default, le=le, description=doc, json_schema_extra={"unit": unit}, **low)
 
 
 class SafetyLimits(SettingsModel):
-    """Limits of a robot, SI units; the reasons stand in ``configs/hardware/nominal.yaml``.
+    """Limits of a robot, SI units; the reasons stand in ``configs/hardware/nominal.yaml``."""
 
-    Attributes:
-        leg_margin, leg_taper: rad that leg setpoints stay inside the robot file's limits, and over which they slow down before.
-        leg_speed: rad/s that leg setpoints may change by.
-        leg_lead: rad that a leg's setpoint may be ahead of the leg.
-        wheel_speed, wheel_acceleration: rad/s and rad/s2 of wheel setpoints.
-        load, load_time: share of stall torque, and for how long (s) a motor may be above it.
-        current, current_time: A of all motors together, and for how long (s) they may be above it.
-        tilt, tilt_time, tilt_horizon: rad the body may lean, s it must last, s that the tilt is predicted ahead.
-        warm, hot: degC from which wheels are slowed down, and at which the robot stops.
-        low_voltage, low_voltage_time: V, and for how long (s) the supply may be below.
-        coast, silence: s without an answer for which old setpoints hold, and after which torque goes off.
-        imu_silence: s without a reading of the IMU.
-        imu_frozen: s that the IMU may repeat exactly the same values.
-        jump_speed, jump_noise: fastest believable speed of a joint, over its motor's no-load speed, and rad on top of it: a
-            reading beyond, confirmed by a second one, is a fault.
-        frozen_leg, frozen_wheel: rad a joint should have turned while its reading stayed exactly the same.
-        leg_error, leg_error_time: rad that a leg may be away from its setpoint without coming nearer, and for how long (s).
-        wheel_error, wheel_error_time: rad/s that a wheel may be off its speed, and for how long (s).
-        late, late_share: ticks in a row, and share of the last second's, that may start more than a period late.
-        deadman: s that the operator may be silent; None = no operator needed.
-        watchdog: s of silence on the line after which servos stop by themselves.
-        heartbeat: s between control steps after which the watchdog process kills this one and switches torque off.
-        patience: s an answer may take beyond its time on the wire.
-        read_time: s that 99 of 100 reads of all joints may take at the start.
-        start_speed: rad/s of the legs on the way to the start pose, on average.
-        start_error: rad that a leg may be away from the start pose when the way there is over.
-        stop_time: s from wheels ordered to stop until torque goes off.
-        off_time: s to go on trying to switch torque off where servos do not confirm it.
-    """
-
-    leg_margin: float = _limit(0.05, "rad", ge=0.0, le=0.5)
-    leg_taper: float = _limit(0.1, "rad", gt=0.0, le=1.0)
-    leg_speed: float = _limit(8.0, "rad/s", gt=0.0, le=20.0)
-    leg_lead: float = _limit(0.45, "rad", gt=0.0, le=1.6)
-    wheel_speed: float = _limit(6.4, "rad/s", gt=0.0, le=40.0)
-    wheel_acceleration: float = _limit(200.0, "rad/s2", gt=0.0, le=2000.0)
-    load: float = _limit(0.7, "of stall torque", gt=0.0, le=1.0)
-    load_time: float = _limit(1.0, "s", gt=0.0, le=5.0)
-    current: float = _limit(10.0, "A", gt=0.0, le=100.0)
-    current_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
-    tilt: float = _limit(0.7, "rad", gt=0.0, le=1.6)
-    tilt_time: float = _limit(0.1, "s", ge=0.0, le=2.0)
-    tilt_horizon: float = _limit(0.2, "s", ge=0.0, le=2.0)
-    warm: float = _limit(62.0, "degC", le=80.0)
-    hot: float = _limit(68.0, "degC", le=80.0)
-    low_voltage: float = _limit(10.2, "V", gt=0.0, le=30.0)
-    low_voltage_time: float = _limit(0.5, "s", ge=0.0, le=5.0)
-    coast: float = _limit(0.06, "s", ge=0.0, le=1.0)
-    silence: float = _limit(0.4, "s", gt=0.0, le=3.0)
-    imu_silence: float = _limit(0.1, "s", gt=0.0, le=3.0)
-    imu_frozen: float = _limit(0.1, "s", gt=0.0, le=3.0)
-    jump_speed: float = _limit(1.5, "of no-load speed", ge=1.0, le=10.0)
-    jump_noise: float = _limit(0.03, "rad", ge=0.0, le=0.5)
-    frozen_leg: float = _limit(0.03, "rad", gt=0.0, le=0.5)
-    frozen_wheel: float = _limit(0.5, "rad", gt=0.0, le=6.3)
-    leg_error: float = _limit(0.2, "rad", gt=0.0, le=1.6)
-    leg_error_time: float = _limit(0.3, "s", gt=0.0, le=5.0)
-    wheel_error: float = _limit(2.0, "rad/s", gt=0.0, le=10.0)
-    wheel_error_time: float = _limit(0.5, "s", gt=0.0, le=5.0)
-    late: int = _limit(5, "ticks", ge=1, le=10_000)
-    late_share: float = _limit(0.1, "of the ticks", gt=0.0, le=1.0)
-    deadman: float | None = _limit(None, "s", gt=0.0, le=LONGEST_DEADMAN)
-    watchdog: float = _limit(0.2, "s", ge=0.02, le=2.54)
-    heartbeat: float = _limit(0.8, "s", gt=0.0, le=10.0)
-    patience: float = _limit(0.004, "s", gt=0.0, le=1.0)
-    read_time: float = _limit(0.014, "s", gt=0.0, le=1.0)
-    start_speed: float = _limit(1.0, "rad/s", gt=0.0, le=10.0)
-    start_error: float = _limit(0.3, "rad", gt=0.0, le=1.0)
-    stop_time: float = _limit(0.6, "s", ge=0.0, le=5.0)
-    off_time: float = _limit(2.0, "s", ge=0.0, le=10.0)
+    leg_margin: float = _limit(0.05, "rad", "that leg setpoints stay inside the robot file's limits", ge=0.0, le=0.5)
+    leg_taper: float = _limit(0.1, "rad", "over which leg setpoints slow down before that", gt=0.0, le=1.0)
+    leg_speed: float = _limit(8.0, "rad/s", "that leg setpoints may change by", gt=0.0, le=20.0)
+    leg_lead: float = _limit(0.45, "rad", "that a leg's setpoint may be ahead of the leg", gt=0.0, le=1.6)
+    wheel_speed: float = _limit(6.4, "rad/s", "of wheel setpoints", gt=0.0, le=40.0)
+    wheel_acceleration: float = _limit(200.0, "rad/s2", "of wheel setpoints", gt=0.0, le=2000.0)
+    load: float = _limit(0.7, "of stall torque", "that a motor may give for long", gt=0.0, le=1.0)
+    load_time: float = _limit(1.0, "s", "for which it may give more", gt=0.0, le=5.0)
+    current: float = _limit(10.0, "A", "of all motors together that may last", gt=0.0, le=100.0)
+    current_time: float = _limit(0.5, "s", "for which it may be more", gt=0.0, le=5.0)
+    tilt: float = _limit(0.7, "rad", "that the body may lean", gt=0.0, le=1.6)
+    tilt_time: float = _limit(0.1, "s", "that a larger tilt must last", ge=0.0, le=2.0)
+    tilt_horizon: float = _limit(0.2, "s", "that the tilt is predicted ahead", ge=0.0, le=2.0)
+    warm: float = _limit(62.0, "degC", "of a servo from which wheels are slowed down", le=80.0)
+    hot: float = _limit(68.0, "degC", "of a servo at which the robot stops", le=80.0)
+    low_voltage: float = _limit(10.2, "V", "of the least supply that may last", gt=0.0, le=30.0)
+    low_voltage_time: float = _limit(0.5, "s", "for which it may be below", ge=0.0, le=5.0)
+    coast: float = _limit(0.06, "s", "without an answer for which old setpoints hold", ge=0.0, le=1.0)
+    silence: float = _limit(0.4, "s", "without an answer after which torque goes off", gt=0.0, le=3.0)
+    imu_silence: float = _limit(0.1, "s", "without a reading of the IMU", gt=0.0, le=3.0)
+    imu_frozen: float = _limit(0.1, "s", "that the IMU may repeat exactly the same values", gt=0.0, le=3.0)
+    jump_speed: float = _limit(1.5, "of no-load speed", "that is believed of a joint; more, twice, is a fault", ge=1.0, le=10.0)
+    jump_noise: float = _limit(0.03, "rad", "on top of that", ge=0.0, le=0.5)
+    frozen_leg: float = _limit(0.03, "rad", "a leg should have turned while its reading stayed the same", gt=0.0, le=0.5)
+    frozen_wheel: float = _limit(0.5, "rad", "a wheel should have turned meanwhile", gt=0.0, le=6.3)
+    leg_error: float = _limit(0.2, "rad", "a leg may be off its setpoint without coming nearer", gt=0.0, le=1.6)
+    leg_error_time: float = _limit(0.3, "s", "for which it may be", gt=0.0, le=5.0)
+    wheel_error: float = _limit(2.0, "rad/s", "that a wheel may be off its speed", gt=0.0, le=10.0)
+    wheel_error_time: float = _limit(0.5, "s", "for which it may be", gt=0.0, le=5.0)
+    late: int = _limit(5, "ticks", "in a row that may start more than a period late", ge=1, le=10_000)
+    late_share: float = _limit(0.1, "of the ticks", "of the last second that may start so late", gt=0.0, le=1.0)
+    deadman: float | None = _limit(None, "s", "the operator may be silent; None = none is needed", gt=0.0, le=LONGEST_DEADMAN)
+    watchdog: float = _limit(0.2, "s", "of silence on the line after which servos stop by themselves", ge=0.02, le=2.54)
+    heartbeat: float = _limit(0.8, "s", "between control steps, or the watchdog process kills this one", gt=0.0, le=10.0)
+    patience: float = _limit(0.004, "s", "an answer may take beyond its time on the wire", gt=0.0, le=1.0)
+    read_time: float = _limit(0.014, "s", "that 99 of 100 reads of all joints may take at the start", gt=0.0, le=1.0)
+    start_speed: float = _limit(1.0, "rad/s", "of the legs on the way to the start pose, on average", gt=0.0, le=10.0)
+    start_error: float = _limit(0.3, "rad", "that a leg may be off the start pose when the way is over", gt=0.0, le=1.0)
+    stop_time: float = _limit(0.6, "s", "from wheels ordered to stop until torque goes off", ge=0.0, le=5.0)
+    off_time: float = _limit(2.0, "s", "to go on trying where servos do not confirm that torque is off", ge=0.0, le=10.0)
 
     @field_validator("*", mode="wrap")
     @classmethod
@@ -135,12 +105,6 @@ class SafetyLimits(SettingsModel):
         return self
 
 
-def require_deadman(name: str, seconds: float) -> None:
-    """Raise :class:`InputError` where the silence that an operator is allowed is none, or so long that it has another unit."""
-    if not 0.0 < seconds <= LONGEST_DEADMAN:
-        raise InputError(f"{name} {seconds:g} s: expected more than 0 and at most {LONGEST_DEADMAN:g} s")
-
-
 def unit_of(limit: str) -> str:
     """Return the unit of a limit."""
     extra = SafetyLimits.model_fields[limit].json_schema_extra
@@ -151,57 +115,40 @@ def unit_of(limit: str) -> str:
 
 
 class MeasuredValue(SettingsModel):
-    """One value that was measured on the robot.
-
-    Attributes:
-        value: in ``unit``.
-        unit: SI unit; ``-`` is a pure number.
-        date: day it was measured.
-    """
+    """One value that was measured on the robot."""
 
     value: float
-    unit: str
-    date: str
+    unit: str  #: SI unit; ``-`` is a pure number
+    date: str  #: day it was measured
 
 
 #: Joint or bus -> value.
 MeasuredValues = dict[str, MeasuredValue]
 
 
+def _measured(doc: str) -> Any:
+    return Field(default_factory=dict, description=doc)
+
+
 class Measured(SettingsModel):
-    """What ``wlr commission`` measured on this robot, by joint or bus; docs/robot.md says how. For people and analyses.
+    """What ``wlr commission`` measured on this robot, by joint or bus; docs/robot.md says how. For people and analyses."""
 
-    Attributes:
-        adapter_latency, adapter_jitter: s of a ping beyond its bytes' time on the wire: median; 99th percentile beyond it.
-        answers_behind_ordinary, answers_behind_fast: part of the servos that answer behind a silent one, by kind of read.
-        wheel_follows_given, wheel_follows_kept: speed at torque-on, over a setpoint written before, and one left from before.
-        leg_follows_given, leg_follows_kept: way at torque-on, over the way to such setpoints.
-        watchdog_stop_time: s from the last packet until the Bus Watchdog has stopped a wheel: its way over its speed.
-        velocity_loop_time: s, time constant of a wheel's way to a new speed.
-        integral_cycle: s, control cycle of the wheel's servo that this means.
-        load_per_pwm: Present Load over PWM from speed to speed of a free wheel: 0 = it is torque, 1 = it is PWM.
-        running_load: load of a free wheel, or of a leg on its way, part of stall torque.
-        stall_load: load of a held wheel or leg over PWM and supply.
-        stall_current: A of a held wheel, at full voltage.
-        joint_zero: rad that a leg reads when it hangs straight down, less pi/2.
-    """
-
-    adapter_latency: MeasuredValues = Field(default_factory=dict)
-    adapter_jitter: MeasuredValues = Field(default_factory=dict)
-    answers_behind_ordinary: MeasuredValues = Field(default_factory=dict)
-    answers_behind_fast: MeasuredValues = Field(default_factory=dict)
-    wheel_follows_given: MeasuredValues = Field(default_factory=dict)
-    wheel_follows_kept: MeasuredValues = Field(default_factory=dict)
-    leg_follows_given: MeasuredValues = Field(default_factory=dict)
-    leg_follows_kept: MeasuredValues = Field(default_factory=dict)
-    watchdog_stop_time: MeasuredValues = Field(default_factory=dict)
-    velocity_loop_time: MeasuredValues = Field(default_factory=dict)
-    integral_cycle: MeasuredValues = Field(default_factory=dict)
-    load_per_pwm: MeasuredValues = Field(default_factory=dict)
-    running_load: MeasuredValues = Field(default_factory=dict)
-    stall_load: MeasuredValues = Field(default_factory=dict)
-    stall_current: MeasuredValues = Field(default_factory=dict)
-    joint_zero: MeasuredValues = Field(default_factory=dict)
+    adapter_latency: MeasuredValues = _measured("s of a ping beyond its bytes' time on the wire: median")
+    adapter_jitter: MeasuredValues = _measured("s that 99 of 100 pings take at most beyond the median")
+    answers_behind_ordinary: MeasuredValues = _measured("part of the servos that answer behind a silent one, ordinary read")
+    answers_behind_fast: MeasuredValues = _measured("the same, fast read")
+    wheel_follows_given: MeasuredValues = _measured("speed at torque-on, over a setpoint written before")
+    wheel_follows_kept: MeasuredValues = _measured("speed at torque-on, over a setpoint left from before")
+    leg_follows_given: MeasuredValues = _measured("way at torque-on, over the way to a setpoint written before")
+    leg_follows_kept: MeasuredValues = _measured("way at torque-on, over the way to a setpoint left from before")
+    watchdog_stop_time: MeasuredValues = _measured("s from the last packet until a wheel stands: its way over its speed")
+    velocity_loop_time: MeasuredValues = _measured("s, time constant of a wheel's way to a new speed")
+    integral_cycle: MeasuredValues = _measured("s, control cycle of the wheel's servo that this means")
+    load_per_pwm: MeasuredValues = _measured("Present Load over PWM of a free wheel: 0 = it is torque, 1 = it is PWM")
+    running_load: MeasuredValues = _measured("load of a free wheel, or of a leg on its way, part of stall torque")
+    stall_load: MeasuredValues = _measured("load of a held wheel or leg over PWM and supply")
+    stall_current: MeasuredValues = _measured("A of a held wheel, at full voltage")
+    joint_zero: MeasuredValues = _measured("rad that a leg reads when it hangs straight down, less pi/2")
 
 
 # ---- wiring and mounting ----
@@ -232,42 +179,27 @@ class Bus(SettingsModel):
 
 
 class ImuCalibration(SettingsModel):
-    """Errors of an IMU and how it is mounted: mounting * scale * (measured - offset). ``wlr calibrate imu`` writes it.
+    """Errors of an IMU and how it is mounted: mounting * scale * (measured - offset). ``wlr calibrate imu`` writes it."""
 
-    Attributes:
-        gyro_bias, accel_offset: rad/s, m/s2, sensor axes.
-        accel_scale: per sensor axis.
-        mounting: roll, pitch, yaw (rad) that turn sensor axes into body axes: Rz(yaw) Ry(pitch) Rx(roll).
-        temperature, date: degC of the chip, and day it was made.
-    """
-
-    gyro_bias: Vector3 = (0.0, 0.0, 0.0)
-    accel_offset: Vector3 = (0.0, 0.0, 0.0)
-    accel_scale: Vector3 = (1.0, 1.0, 1.0)
-    mounting: Vector3 = (0.0, 0.0, 0.0)
-    temperature: float | None = None
-    date: str | None = None
+    gyro_bias: Vector3 = (0.0, 0.0, 0.0)  #: rad/s, sensor axes
+    accel_offset: Vector3 = (0.0, 0.0, 0.0)  #: m/s2, sensor axes
+    accel_scale: Vector3 = (1.0, 1.0, 1.0)  #: per sensor axis
+    mounting: Vector3 = (0.0, 0.0, 0.0)  #: roll, pitch, yaw (rad) from sensor to body axes: Rz(yaw) Ry(pitch) Rx(roll)
+    temperature: float | None = None  #: degC of the chip
+    date: str | None = None  #: day it was made
 
 
 class ImuPort(SettingsModel):
-    """The IMU: frames from a microcontroller's serial port (``stream``), or the chip on this computer's I2C bus (``i2c``).
+    """The IMU: frames from a microcontroller's serial port (``stream``), or the chip on this computer's I2C bus (``i2c``)."""
 
-    Attributes:
-        port: serial device, or I2C bus (``/dev/i2c-1``).
-        baud_rate: of the stream, bit/s.
-        rate: readings per second.
-        gyro_range, accel_range: full scale, deg/s and g.
-        address, bandwidth: of the chip on I2C: address, filter (Hz). The microcontroller sets up its own.
-    """
-
-    port: str
+    port: str  #: serial device, or I2C bus (``/dev/i2c-1``)
     driver: Literal["stream", "i2c"] = "stream"
-    baud_rate: int = Field(default=115200, gt=0)
-    rate: float = Field(gt=0, le=1000)
-    gyro_range: Literal[250, 500, 1000, 2000] = 500
-    accel_range: Literal[2, 4, 8, 16] = 4
-    address: Literal[0x68, 0x69] = 0x68
-    bandwidth: Literal[184, 94, 44, 21, 10, 5] = 44
+    baud_rate: int = Field(default=115200, gt=0)  #: of the stream, bit/s
+    rate: float = Field(gt=0, le=1000)  #: readings per second
+    gyro_range: Literal[250, 500, 1000, 2000] = 500  #: full scale, deg/s
+    accel_range: Literal[2, 4, 8, 16] = 4  #: full scale, g
+    address: Literal[0x68, 0x69] = 0x68  #: of the chip on I2C
+    bandwidth: Literal[184, 94, 44, 21, 10, 5] = 44  #: Hz, of its filter; the microcontroller sets up its own
     calibration: ImuCalibration = ImuCalibration()
 
     @model_validator(mode="after")
@@ -279,35 +211,23 @@ class ImuPort(SettingsModel):
 
 
 class FlowCalibration(SettingsModel):
-    """How an optical-flow sensor is mounted, and how much it is off. ``wlr calibrate flow`` writes it.
+    """How an optical-flow sensor is mounted, and how much it is off. ``wlr calibrate flow`` writes it."""
 
-    Attributes:
-        scale: measured over true flow.
-        mount_yaw: rotation about body z from body to sensor (rad), beyond what ``axes`` says.
-        date: day it was made.
-    """
-
-    scale: float = Field(default=1.0, gt=0.2, lt=5.0)
-    mount_yaw: float = Field(default=0.0, gt=-3.2, lt=3.2)
-    date: str | None = None
+    scale: float = Field(default=1.0, gt=0.2, lt=5.0)  #: measured over true flow
+    mount_yaw: float = Field(default=0.0, gt=-3.2, lt=3.2)  #: rad about body z, from body to sensor, beyond what ``axes`` says
+    date: str | None = None  #: day it was made
 
 
 FlowAxis = Literal["x", "-x", "y", "-y"]
 
 
 class FlowPort(SettingsModel):
-    """The optical-flow sensor: frames from a microcontroller's serial port. Its numbers stand in the robot's file.
+    """The optical-flow sensor: frames from a microcontroller's serial port. Its numbers stand in the robot's file."""
 
-    Attributes:
-        port: serial device.
-        baud_rate: bit/s.
-        axes: which of the chip's axes count up when the robot drives along body +x, and along body +y.
-    """
-
-    port: str
+    port: str  #: serial device
     driver: Literal["stream"] = "stream"
-    baud_rate: int = Field(default=115200, gt=0)
-    axes: tuple[FlowAxis, FlowAxis] = ("-y", "-x")
+    baud_rate: int = Field(default=115200, gt=0)  #: bit/s
+    axes: tuple[FlowAxis, FlowAxis] = ("-y", "-x")  #: axes of the chip that count up as the robot drives along body +x and +y
     calibration: FlowCalibration = FlowCalibration()
 
     @model_validator(mode="after")
@@ -325,17 +245,11 @@ class Mounting(SettingsModel):
 
 
 class PadButtons(SettingsModel):
-    """Buttons of the gamepad (``wlr deploy --gamepad``), counted as ``jstest`` does.
+    """Buttons of the gamepad (``wlr deploy --gamepad``), counted as ``jstest`` does."""
 
-    Attributes:
-        deadman: the robot drives while it is held.
-        stop: stops in good order.
-        motors_off: at once.
-    """
-
-    deadman: int = Field(default=4, ge=0)
-    stop: int = Field(default=0, ge=0)
-    motors_off: int = Field(default=1, ge=0)
+    deadman: int = Field(default=4, ge=0)  #: the robot drives while it is held
+    stop: int = Field(default=0, ge=0)  #: in good order
+    motors_off: int = Field(default=1, ge=0)  #: at once
 
     @model_validator(mode="after")
     def _are_three(self) -> PadButtons:
@@ -367,14 +281,10 @@ class Hardware(SettingsModel):
         return (*self.buses, "imu", *(["flow"] if self.flow is not None else []))
 
     @model_validator(mode="after")
-    def _what_was_measured_is_of_this_robot(self) -> Hardware:
-        for name in Measured.model_fields:
-            for place in getattr(self.measured, name):
-                check_name("joint or bus", place, (*JOINTS, *self.buses), f"measured.{name}")
-        return self
-
-    @model_validator(mode="after")
     def _every_joint_is_wired_once(self) -> Hardware:
+        for name, values in self.measured:
+            for place in values:
+                check_name("joint or bus", place, (*JOINTS, *self.buses), f"measured.{name}")
         places = {f"buses.{name}.joints": bus.joints for name, bus in self.buses.items()} | {"joints": tuple(self.joints)}
         for where, joints in places.items():
             for joint in joints:
@@ -390,15 +300,14 @@ class Hardware(SettingsModel):
     def _registers_are_those_of_the_setpoints(self) -> Hardware:
         for name, bus in self.buses.items():
             table = load_table(bus.model)
-            turn = table.counts.turn
             for joint in bus.joints:
                 mode = POSITION_MODE if joint in LEGS else VELOCITY_MODE  # in another one, setpoints would be another quantity
                 for item, fixed in {"operating_mode": mode, **FIXED_REGISTERS}.items():
                     if (found := bus.eeprom.get(item, table[item].default)) != fixed:
                         where = f"buses.{name}.eeprom.{item}"
                         raise ValueError(f"{where} is {found}, expected {fixed}: {joint} is driven with that")
-                if self.joints[joint].zero >= turn:
-                    raise ValueError(f"joints.{joint}.zero = {self.joints[joint].zero}: expected 0 to {turn - 1}")
+                if (zero := self.joints[joint].zero) >= table.counts.turn:
+                    raise ValueError(f"joints.{joint}.zero = {zero}: expected 0 to {table.counts.turn - 1}")
         return self
 
 
@@ -415,7 +324,10 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
         raise InputError(
             f"{where}: a robot file; expected a hardware file (buses, joints, imu); a robot file goes with --robot"
         )
-    data = _with_servo_files(data, where)
+    buses = data.get("buses") if isinstance(data, dict) else None
+    for bus in buses.values() if isinstance(buses, dict) else ():
+        if isinstance(bus, dict) and str(bus.get("model", "")).endswith((".yaml", ".yml")):
+            bus["model"] = str(named_in(where, bus["model"]))
     hardware = parse_config(Hardware, data, where)
     if hardware.robot is None:
         return hardware
@@ -425,32 +337,18 @@ def load_hardware(source: str | Path | Hardware = "nominal") -> Hardware:
     return hardware.model_copy(update={"robot": str(robot)})
 
 
-def _with_servo_files(data: Any, where: str) -> Any:
-    """Return a hardware file's content with servo models that are files named by their place."""
-    if not isinstance(data, dict) or not isinstance(data.get("buses"), dict):
-        return data
-    buses = {
-        name: {**bus, "model": str(named_in(where, bus["model"]))}
-        if isinstance(bus, dict) and str(bus.get("model", "")).endswith((".yaml", ".yml"))
-        else bus
-        for name, bus in data["buses"].items()
-    }
-    return {**data, "buses": buses}
-
-
 def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
     """Return the same hardware on other ports: bus name, ``imu`` or ``flow`` -> path.
 
     Raises:
         InputError: a name that is no bus.
     """
-    if unknown := set(ports) - {*hardware.port_names}:
-        name = sorted(unknown)[0]
-        raise InputError(f"no bus '{name}'{nearest(name, hardware.port_names)}; the buses are {', '.join(hardware.port_names)}")
-    buses = {name: bus.model_copy(update={"port": ports.get(name, bus.port)}) for name, bus in hardware.buses.items()}
-    imu = hardware.imu.model_copy(update={"port": ports.get("imu", hardware.imu.port)})
-    flow = None if hardware.flow is None else hardware.flow.model_copy(update={"port": ports.get("flow", hardware.flow.port)})
-    return hardware.model_copy(update={"buses": buses, "imu": imu, "flow": flow})
+    changed: dict[str, Any] = dict(hardware.buses)
+    for name, port in ports.items():
+        check_name("port", name, hardware.port_names)
+        changed[name] = (changed.get(name) or getattr(hardware, name)).model_copy(update={"port": port})
+    sensors = {name: changed.pop(name) for name in ("imu", "flow") if name in changed}
+    return hardware.model_copy(update={"buses": changed, **sensors})
 
 
 # ---- robot and wiring together ----
@@ -497,12 +395,8 @@ def _problem(robot: Robot, table: ControlTable, joint: str) -> str:
     low, high = table.voltage_range()
     if not low <= robot.servo.supply_voltage <= high:
         return f"servo.supply_voltage is {robot.servo.supply_voltage:g} V, {table.model} takes {low:g} to {high:g} V"
-    encoder = robot.sensors.encoder
-    for key, stated, item in (
-        ("position", encoder.position, "present_position"),
-        ("velocity", encoder.velocity, "present_velocity"),
-    ):
-        count = table.per_count(item)
+    for key in ("position", "velocity"):
+        stated, count = getattr(robot.sensors.encoder, key), table.per_count(f"present_{key}")
         if stated > 0.0 and not math.isclose(stated, count, rel_tol=SAME):  # 0: an ideal one
             return f"sensors.encoder.{key} is {stated:g}, a count of {table.model} is {count:g}"
     has_current = measures_current(robot)[0 if is_leg else 1]

@@ -31,23 +31,32 @@ REHEARSALS = 20
 
 
 @dataclass(frozen=True)
-class Deployment:
-    """How a run ended.
+class DriveResult:
+    """How a drive ended.
 
     Attributes:
-        reason: why it ended; ``time is over`` when nothing happened.
-        well: it ended as it was asked to: time over, key or signal; and torque is confirmed off.
-        ticks: control steps that the policy drove.
-        run: its log; None = none was written.
-        statistics: of the control loop.
-        inference: s that the policy took per step, (ticks,).
+        run: its log, whole or up to where it stopped; None where nothing was logged.
+        reason: why it ended; of a motion: empty = at its end, in good order. Drive no other motion then.
+        well: it ended at its end, or because somebody asked for it; and torque is confirmed off.
+        ticks: control steps driven.
+        statistics: of the control loop, with what the command limiter changed.
     """
 
+    run: Path | None
     reason: str
     well: bool
     ticks: int
-    run: Path | None
     statistics: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Deployment(DriveResult):
+    """How a policy's drive ended; ``time is over`` when nothing happened.
+
+    Attributes:
+        inference: s that the policy took per step, (ticks,).
+    """
+
     inference: NDArray[np.float64]
 
 
@@ -56,7 +65,6 @@ class DriveWatcher(Protocol):
 
     def begin(self) -> None:
         """The robot stands where its episode begins."""
-        ...
 
     def take(self, command: NDArray[np.float64]) -> str:
         """A control step is over in which the robot followed ``command`` (1, C); return why the run is to end, or nothing."""
@@ -64,11 +72,7 @@ class DriveWatcher(Protocol):
 
 
 def loop_of(core: Core) -> ControlLoop:
-    """Return the control loop of a core that drives the real robot.
-
-    Raises:
-        InputError: it drives a simulator.
-    """
+    """Return the control loop of a core that drives the real robot."""
     if not isinstance(core.plant, RobotPlant):
         raise InputError(f"backend '{core.settings.backend}' is no robot: expected 'dynamixel'")
     return core.plant.loop
@@ -124,7 +128,7 @@ def deploy(
             pass  # it is in the loop's reason
         finally:
             loop.stop("exception")
-    return Deployment(loop.reason, loop.ended_well, len(inference), loop.recorder.run, loop.statistics(), np.array(inference))
+    return Deployment(loop.recorder.run, loop.reason, loop.ended_well, len(inference), loop.statistics(), np.array(inference))
 
 
 @contextmanager
@@ -140,31 +144,8 @@ def _no_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-@dataclass(frozen=True)
-class DriveResult:
-    """How a drive ended.
-
-    Attributes:
-        run: its log, whole or up to where it stopped; None where nothing was logged.
-        reason: why it stopped early, or not in good order; empty = neither. Drive no other motion then.
-        well: it ended at the motion's end, or because somebody asked for it; and torque is confirmed off.
-        ticks: control steps driven.
-        statistics: of the control loop, with what the command limiter changed.
-    """
-
-    run: Path | None
-    reason: str
-    well: bool
-    ticks: int
-    statistics: dict[str, Any]
-
-
 def refuse_deadman(plant: RobotPlant) -> None:
-    """Refuse a robot that waits for an operator's signs, where nobody gives any: it would only be held.
-
-    Raises:
-        InputError: it does.
-    """
+    """Refuse a robot that waits for an operator's signs, where nobody gives any: it would only be held."""
     if (seconds := plant.loop.limits.deadman) is not None:
         raise InputError(
             f"safety.deadman = {seconds:g} s: there is no key or stick for an operator's sign: leave it empty, and give wlr "
@@ -178,17 +159,13 @@ def drive_robot(plant: RobotPlant, motion: Motion) -> DriveResult:
     Args:
         plant: the robot, torque off.
         motion: setpoints; NaN = that motor off. Its servo profile must be the plant's.
-
-    Raises:
-        InputError: the robot waits for an operator's signs, which nobody gives here.
     """
     refuse_deadman(plant)
     loop, robot = plant.loop, plant.robot
     state = standing_state(robot, Parameters.nominal(robot))
     state.joint_position[0, LEG_SLICE] = motion.start(robot)[LEG_SLICE]
     reason, ticks = "", 0
-    torque_on = np.isfinite(motion.setpoints)
-    setpoints = np.nan_to_num(motion.setpoints)
+    setpoints, torque_on = np.nan_to_num(motion.setpoints), np.isfinite(motion.setpoints)
     with stop_on_request(loop.operator):
         try:
             plant.reset(state=state)

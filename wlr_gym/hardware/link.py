@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.hardware.camera.live import LiveCamera
-from wlr_gym.hardware.camera.reading import CameraFile, CameraReader
+from wlr_gym.hardware.camera.reading import CameraFile, CameraReader, LiveCamera
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.flow import FlowStream
 from wlr_gym.hardware.flow_comparison import FlowSupervision

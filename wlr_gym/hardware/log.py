@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from wlr_gym.data.logs.write import McapStream
 
 PARTIAL = "partial_"
+#: Of a log, finished or not, with its number.
+_NAME = re.compile(rf"(?:{PARTIAL})?(?:run|ramp)_(\d+)\.")
 #: Phases of the control loop that begin a table, and its kind.
 _TABLES = {"ramp": "ramp", "running": "run"}
 
@@ -49,12 +51,7 @@ def _append(file: io.FileIO, line: str) -> None:
 
 
 class CsvTable:
-    """A CSV file that grows row by row, under its partial name until it is finished.
-
-    Args:
-        path: final name.
-        header: names of the columns.
-    """
+    """A CSV file that grows row by row, under a partial name until it is finished and gets its own (``path``)."""
 
     def __init__(self, path: Path, header: list[str]) -> None:
         self.path = path
@@ -89,8 +86,7 @@ class RunRecorder:
     Args:
         folder: of the logs, made if it is not there; runs are numbered on from those in it. None = none is written.
         meta: of the runs; written as ``meta.yaml``, with the robot.
-        robot: whose runs they are.
-        link: to it: the clock of the runs, whether there is a camera, whose poses are logged then, the seed of an emulated one.
+        robot: whose runs they are. link: to it; has the clock, the camera whose poses are logged, an emulated one's seed.
 
     Attributes:
         columns: of a row.
@@ -107,17 +103,15 @@ class RunRecorder:
         left_out = (*CAMERA, *LIVE_CAMERA) if link.camera is None else ()
         self.columns: list[str] = [name for name in COLUMNS if name in given and name not in left_out]
         self._order = [given.index(name) for name in self.columns]
-        self.number = 0
-        self.trouble = ""
+        self.number, self.trouble = 0, ""
         self.stream: McapStream | None = None
         self.origin: RobotStatus | None = None
         self._clock, self._seed = link.clock, link.seed
         self._checks: list[str] = []
         self._tables: dict[str, CsvTable] = {}
-        self._current = ""  # table that rows go to
-        self._last = -np.inf  # time of the last row
+        self._current, self._last = "", -np.inf  # table that rows go to, and time of the last row
         self._events: io.FileIO | None = None
-        self._rules: frozenset[str] = frozenset()
+        self._rules: set[str] = set()
         self._flow_trouble = ""
         self._camera: str | None = None  # why it gave no pose in the last control step
 
@@ -150,7 +144,8 @@ class RunRecorder:
         make_output_folder(self.folder)
         write_meta(self.folder, note_robot(self.folder, self._robot, self.meta))
         self.trouble = ""
-        self.number = 1 + max((_number(path) for path in self.folder.iterdir()), default=0)
+        used = (_NAME.match(path.name) for path in self.folder.iterdir())
+        self.number = 1 + max((int(name[1]) for name in used if name), default=0)
         self._tables, self._current, self._last = {}, "", -np.inf
         self._events = _partial(self.path(ending=".events.jsonl")).open("xb", buffering=0)
         self._event(self._clock.now(), "checks", found=self._checks)
@@ -190,7 +185,7 @@ class RunRecorder:
             rules |= {rule: {"joints": [JOINTS[k] for k in np.flatnonzero(mask)]} for rule, mask in decision.limited.items()}
             for rule in rules.keys() - self._rules:
                 self._event(status.time, "intervention", rule=rule, row=count, **rules[rule])
-            self._rules = frozenset(rules)
+            self._rules = set(rules)
             self._note_sensors(status, count)
 
     def _note_sensors(self, status: RobotStatus, count: int) -> None:
@@ -246,11 +241,7 @@ class RunRecorder:
 
 
 def read_events(run: Path) -> list[dict[str, Any]]:
-    """Return the events beside a run, finished or partial.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Return the events beside a run, finished or partial."""
     path = run.with_name(run.stem + ".events.jsonl")
     try:
         return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
@@ -279,11 +270,6 @@ def sensors_of(status: RobotStatus, origin: RobotStatus | None) -> Sensors:
         sensors.camera_pose[0], sensors.camera_age[0] = camera.pose, status.time - camera.time
         sensors.camera_is_new[0] = camera.is_new
     return sensors
-
-
-def _number(path: Path) -> int:
-    found = re.match(rf"(?:{PARTIAL})?(?:run|ramp)_(\d+)\.", path.name)
-    return int(found.group(1)) if found else 0
 
 
 def _partial(path: Path) -> Path:

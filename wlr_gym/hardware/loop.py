@@ -90,6 +90,7 @@ class ControlLoop:
         reason: why it stopped; with what was asked for meanwhile, and with the servos whose torque is not confirmed off.
         ended_well: nothing went wrong in the last run, which may have been stopped on request; torque is confirmed off.
         operator, pacer, recorder: requests; deadlines and statistics; logs.
+        interventions: rule -> control steps in which it changed or stopped something.
     """
 
     def __init__(
@@ -115,6 +116,7 @@ class ControlLoop:
         self.recorder: RunRecorder = RunRecorder(options.log, meta, robot, link)
         self._link, self._is_open = link, False
         self._limiter = CommandLimiter(link.servos, robot, hardware, link.clock, period, options.dry_run, meta.profile)
+        self.interventions: Counter[str] = self._limiter.interventions
         self._sensing = Sensing(self._limiter, link, period)
         self._guard = Guard(robot, hardware, options.guard and link.is_serial and not options.dry_run)
         self._idle = self._read_at = 0.0  # s for which nothing was sent before the last reading, and when that was there
@@ -134,11 +136,6 @@ class ControlLoop:
     def setpoints(self) -> Array:
         """Setpoints (8,) last sent, rad and rad/s."""
         return self._limiter.setpoints.copy()
-
-    @property
-    def interventions(self) -> Counter[str]:
-        """Rule -> control steps in which it changed or stopped something."""
-        return self._limiter.interventions
 
     def sensors(self) -> Sensors:
         """Return what was last read as a plant's sensors; wheels from where they stood at the run's start."""
@@ -394,7 +391,10 @@ class ControlLoop:
         finally:
             self._note_end(not (is_fault or left))
             if left:
-                self.reason = f"{self.reason}; {_demand(left)}"
+                demand = f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}"
+                self.reason = f"{self.reason}; {demand}"
+                with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
+                    print(demand, file=sys.stderr, flush=True)  # who ended the run may not look at the reason
             self.operator.is_switching_off = False
             self._enter(Phase.FAULT if is_fault or left else Phase.TORQUE_OFF)
             self.recorder.end(self.reason, self.statistics())
@@ -427,11 +427,3 @@ def minimum_jerk(begin: Array, target: Array, speed: float, period: float) -> li
     times = [step / steps for step in range(1, steps + 1)]
     shares = [s**3 * (10.0 - 15.0 * s + 6.0 * s * s) for s in times]
     return [np.concatenate([begin + share * (target - begin), np.zeros(len(WHEELS))]) for share in shares]
-
-
-def _demand(left: list[str]) -> str:
-    """Print what has to be done about joints that are not confirmed off, and return it."""
-    text = f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}"
-    with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
-        print(text, file=sys.stderr, flush=True)  # who ended the run may not look at the reason
-    return text

@@ -41,9 +41,6 @@ _END = 32767
 class Operator:
     """Requests of the operator, until the control loop has met them.
 
-    Args:
-        clock: of the run.
-
     Attributes:
         asked_to_stop, asked_off: why a stop was asked for, and why torque is to go off at once; empty = not asked.
         spare: called before torque comes on, and in every control step between writing and waiting, while there is time (keys,
@@ -100,11 +97,7 @@ class Operator:
 
 
 class Keys:
-    """Reads keys from a terminal, or bytes from a pipe. Use as a context manager.
-
-    Args:
-        source: file descriptor; None = the standard input.
-    """
+    """Reads keys from a terminal, or bytes from a pipe (a file descriptor; None = standard input). Use as a context manager."""
 
     def __init__(self, source: int | None = None) -> None:
         self._source = source
@@ -177,8 +170,7 @@ def stop_on_signals(operator: Operator) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    numbers = [getattr(signal, name) for name in STOP_SIGNALS if hasattr(signal, name)]
-    before = {number: signal.signal(number, take) for number in numbers}
+    before = {number: signal.signal(number, take) for name in STOP_SIGNALS if (number := getattr(signal, name, None))}
     try:
         yield
     finally:
@@ -190,11 +182,7 @@ def stop_on_signals(operator: Operator) -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_on_request(operator: Operator) -> Iterator[None]:
-    """Let signals stop the robot, and a terminal's keys, which are read in the time that is left in each control step.
-
-    Raises:
-        KeyboardInterrupt: as of :func:`stop_on_signals`.
-    """
+    """Let signals stop the robot, and a terminal's keys, which are read in the time that is left in each control step."""
     with stop_on_signals(operator), Keys() as keys:
         if keys.is_terminal:
             operator.spare = lambda: keys.serve(operator)
@@ -205,9 +193,7 @@ class DrivingPad:
     """Steers while its dead-man button is held: full deflection is the end of a command's range. Use as a context manager.
 
     Args:
-        device: such as ``/dev/input/js0``.
-        buttons: their numbers.
-        ranges: command -> (low, high).
+        device: such as ``/dev/input/js0``. buttons: their numbers. ranges: command -> (low, high).
 
     Attributes:
         is_held: the dead-man button is down.
@@ -242,11 +228,7 @@ class DrivingPad:
         return stick_commands(self._ranges, self._sticks if self.is_held else ())
 
     def serve(self, operator: Operator) -> None:
-        """Take what has happened, and pass it on: signs of the operator, requests.
-
-        Raises:
-            OSError: the gamepad is gone.
-        """
+        """Take what has happened, and pass it on: signs of the operator, requests."""
         self._take_events()
         if self.is_held:
             operator.note_sign()
@@ -258,7 +240,11 @@ class DrivingPad:
 
     def _take_events(self) -> None:
         try:
-            self._rest += self._read()
+            while data := os.read(self._file, 64 * _EVENT.size):
+                self._rest += data
+            raise OSError(errno.ENODEV, f"gamepad {self._device} is gone")
+        except BlockingIOError:
+            pass
         except OSError:
             self.is_held = False
             raise
@@ -272,13 +258,3 @@ class DrivingPad:
             elif kind == _BUTTON and value:
                 self._pressed.add(number)
         self._rest = self._rest[whole:]
-
-    def _read(self) -> bytes:
-        """Return what has come in since the last look."""
-        found = b""
-        try:
-            while data := os.read(self._file, 64 * _EVENT.size):
-                found += data
-        except BlockingIOError:
-            return found
-        raise OSError(errno.ENODEV, f"gamepad {self._device} is gone")

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError
+from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.data.format import RunMeta
 from wlr_gym.hardware.camera.reading import load_camera_file
-from wlr_gym.hardware.config import Hardware, load_hardware, require_deadman, require_leg_range, with_ports
+from wlr_gym.hardware.config import LONGEST_DEADMAN, Hardware, load_hardware, require_leg_range, with_ports
 from wlr_gym.hardware.link import Link, serial_link
 from wlr_gym.hardware.loop import ControlLoop
 from wlr_gym.physics.plants.base import Capabilities, PlantOptions, PlantState, RobotOptions, Sensors, Truth
@@ -34,11 +34,8 @@ class RobotPlant:
     :class:`wlr_gym.hardware.loop.StoppedError`.
 
     Args:
-        robot: the robot.
-        count: 1.
-        options: ``control_period``; the rest is for simulators.
-        hardware: which robot, how it is connected.
-        link: connections to use instead of those ``hardware`` names.
+        robot: its numbers. count: 1. options: ``control_period``; the rest is for simulators.
+        hardware: which robot, how it is connected. link: connections to use instead of those it names.
         meta: of the log; its profile is the servos'. None = robot's name, no profile.
 
     Attributes:
@@ -67,7 +64,7 @@ class RobotPlant:
         description = with_ports(load_hardware(chosen.hardware), dict(chosen.ports))
         require_leg_range(description, robot, chosen.hardware)
         if chosen.deadman is not None:
-            require_deadman("deadman", chosen.deadman)
+            check_number("deadman", chosen.deadman, "s", above=0.0, most=LONGEST_DEADMAN)
             safety = description.safety.model_copy(update={"deadman": chosen.deadman})
             description = description.model_copy(update={"safety": safety})
         if link is None:
@@ -86,14 +83,11 @@ class RobotPlant:
         """Bring the robot to its start pose and return what it reads there; wheel angles count from here.
 
         Args:
-            seeds: not used: the world draws.
-            parameters: must be the robot file's: nothing can be set about a robot.
-            mask: (1,) False leaves the robot alone.
+            seeds: not used: the world draws. parameters: must be the robot file's. mask: (1,) False leaves the robot alone.
             state: its leg angles are the start pose; where the robot stands is where it stands. None = home.
 
         Raises:
             StoppedError: a preflight check failed, or the robot had to stop.
-            InputError: parameters that differ, ports that cannot be opened.
         """
         if parameters is not None:
             self.set_parameters(parameters)
@@ -102,10 +96,7 @@ class RobotPlant:
         return self.loop.sensors()
 
     def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Send setpoints through the command limiter, wait for the deadline, read; see
-        :meth:`wlr_gym.physics.plants.base.Plant.step`.
-
-        Setpoints that are no numbers stop the robot.
+        """Send setpoints through the command limiter, wait for the deadline, read. What are no numbers stops the robot.
 
         Raises:
             StoppedError: the robot has stopped, and torque is off.
@@ -119,11 +110,7 @@ class RobotPlant:
         return self.loop.sensors()
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
-        """Refuse whatever differs from the robot file.
-
-        Raises:
-            InputError: parameters that differ; names the first.
-        """
+        """Refuse whatever differs from the robot file."""
         if len(parameters) != 1:
             raise InputError(f"parameters hold {len(parameters)} robots, the plant 1")
         different = np.flatnonzero((parameters.values[0] != self.parameters.values[0]) & ~_IS_CONNECTED)
@@ -154,11 +141,7 @@ class RobotPlant:
 
 
 def link_of(robot: Robot, hardware: Hardware, options: RobotOptions, sensor_noise: bool = True) -> Link:
-    """Return connections to the robot that the options describe, closed; ``sensor_noise``: of an emulated one.
-
-    Raises:
-        InputError: effects or a camera that cannot be read.
-    """
+    """Return connections to the robot that the options describe, closed; ``sensor_noise``: of an emulated one."""
     camera = None if options.camera is None else load_camera_file(options.camera)
     if not options.emulated:
         return serial_link(robot, hardware, camera, options.poses)

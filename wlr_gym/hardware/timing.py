@@ -9,7 +9,7 @@ import os
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -19,8 +19,6 @@ from wlr_gym.base.errors import InputError
 
 #: Parts of a control step that are timed; latency is from the readings to the setpoints that answer them.
 PARTS = ("read", "think", "write", "slack", "latency")
-#: s for which a program works without a pause to learn its share of the processor.
-_SHARE_TIME = 0.2
 
 
 class Clock(Protocol):
@@ -46,22 +44,6 @@ class MonotonicClock:
         """Sleep until then."""
         if (left := moment - time.monotonic()) > 0.0:
             time.sleep(left)
-
-
-def processor_share(clock: Callable[[], float]) -> float:
-    """Return the share of one processor that this program gets while it works without a pause; 1 = no other one wants it.
-
-    Args:
-        clock: s, of whoever is slow. Where it does not pass by itself (emulated time) no computer is too slow: 1.
-    """
-    before = clock()
-    time.sleep(1e-3)
-    if clock() == before:
-        return 1.0
-    start, used = time.perf_counter(), time.thread_time()
-    while (passed := time.perf_counter() - start) < _SHARE_TIME:
-        pass
-    return min(1.0, (time.thread_time() - used) / passed)
 
 
 def percentiles(milliseconds: np.ndarray) -> dict[str, float]:

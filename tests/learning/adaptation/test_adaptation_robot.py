@@ -72,7 +72,7 @@ def test_a_real_robot_is_scored_by_the_pose_of_its_observer_too():
         core.step(action, core.everyone)
         for score in (estimated, true):
             score.take(command)
-    driven = Deployment("time is over", True, 150, None, {}, np.zeros(150))
+    driven = Deployment(None, "time is over", True, 150, {}, np.zeros(150))
     found, expected = (score.episode(0, driven).measures for score in (estimated, true))
     for name in ("lateral_error", "heading_error"):
         assert expected[name] > 0.005

@@ -10,20 +10,23 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, CameraFile, StampClock, pack, reading_of
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, CameraFile, CameraReading
 from wlr_gym.hardware.camera.rendered import PoseFeed, RenderedCamera
+from wlr_gym.hardware.timing import MonotonicClock
 from wlr_gym.perception.markers.detection import Image
-from wlr_gym.perception.vision.tracking import PoseFinder, VideoFrame
+from wlr_gym.perception.vision.tracking import MEANINGS, PoseFinder, VideoFrame
 from wlr_gym.perception.vision.video import grey, open_device
 from wlr_gym.robot import Robot
 
@@ -31,6 +34,71 @@ from wlr_gym.robot import Robot
 _NICE = 5
 #: s without a frame from the driver after which the camera counts as gone.
 _GONE = 2.0
+
+
+# ---- when a frame was exposed, and where the robot is in it ----
+
+
+#: s within which a driver's stamp and the arrival are taken to be of one clock (Linux drivers stamp by the monotonic one).
+SAME_CLOCK = 0.5
+#: Frames over which the offset of another clock is the least (arrival - stamp).
+WINDOW = 300
+
+
+class StampClock:
+    """Tell capture times from time stamps and arrivals.
+
+    A driver that stamps by this computer's monotonic clock is believed. One with a clock of its own is related to it by the
+    least of (arrival - stamp) over the last frames: what is on top of it is delay on the way, and the least delay cannot be
+    told from the offset (``delay`` of the camera's file is for that). Without stamps (0, or none that move) arrivals count.
+
+    Args:
+        delay: s from mid-exposure to the stamp or, at the least, to the arrival.
+
+    Attributes:
+        source: ``driver``, ``driver's own clock`` or ``arrival``, as the last frame was dated.
+        offset: s, this computer's clock minus the stamps'; 0 where they are of one clock.
+    """
+
+    def __init__(self, delay: float) -> None:
+        self.delay, self.source, self.offset = delay, "arrival", 0.0
+        self._lags: deque[float] = deque(maxlen=WINDOW)
+        self._last = math.nan
+
+    def time(self, stamp: float, arrival: float) -> float:
+        """Return when a frame was exposed (s) that the driver dates ``stamp`` and that came at ``arrival``."""
+        moves = stamp != self._last and stamp > 0.0 and math.isfinite(stamp)
+        self._last = stamp
+        if not moves:
+            self.source = "arrival"
+            return arrival - self.delay
+        if -0.001 <= arrival - stamp < SAME_CLOCK:
+            self.source, self.offset = "driver", 0.0
+            self._lags.clear()
+            return stamp - self.delay
+        self._lags.append(arrival - stamp)
+        self.source, self.offset = "driver's own clock", min(self._lags)
+        return stamp + self.offset - self.delay
+
+
+class FrameReader:
+    """Finds the robot in the frames of a camera, in the order in which they come; ``clock`` tells when each was exposed."""
+
+    def __init__(self, file: CameraFile) -> None:
+        self.clock: StampClock = StampClock(file.delay)
+        self._finder = PoseFinder(file.calibration, file.body, file.floor)
+
+    def read(self, number: int, image: Image, stamp: float, arrival: float, found: float | None = None) -> CameraReading:
+        """Return the reading of a frame that the driver dates ``stamp`` (s, 0 = not) and that came at ``arrival`` (s).
+
+        ``found`` (s) is when its pose is there; None = now.
+        """
+        sample = self._finder(VideoFrame(number, self.clock.time(stamp, arrival), image))
+        found, reason = time.monotonic() if found is None else found, MEANINGS.get(sample.status, "")
+        return CameraReading(number, sample.time, arrival, found, reason, sample.pose, sample.covariance)
+
+
+# ---- frames ----
 
 
 class Taken(NamedTuple):
@@ -70,8 +138,17 @@ def frames_of_device(file: CameraFile) -> Iterator[Taken | None]:
         capture.release()
 
 
+def due_frames(rate: float) -> Iterator[int]:
+    """Yield the numbers of the frames that are due by this computer's clock; those for which there was no time are left out."""
+    number = int(time.monotonic() * rate) + 1
+    while True:
+        yield number
+        number = max(number + 1, int(time.monotonic() * rate))
+
+
 def rendered_frames(file: CameraFile, robot: Robot, feed: PoseFeed) -> Iterator[Taken | None]:
     """Yield frames of an emulated robot at the pace of the clock; those that take too long to render are left out."""
+    clock = MonotonicClock()
 
     def fault(kind: str) -> float | None:
         last = feed.last()
@@ -82,11 +159,9 @@ def rendered_frames(file: CameraFile, robot: Robot, feed: PoseFeed) -> Iterator[
     while feed.last() is None:
         time.sleep(0.01)
         yield None
-    number = int(time.monotonic() * file.rate) + 1
-    while True:
+    for number in due_frames(file.rate):
         exposure = camera.exposure(number)
-        if (wait := exposure.time + file.emulated.exposure - time.monotonic()) > 0.0:
-            time.sleep(wait)
+        clock.wait_until(exposure.time + file.emulated.exposure)
         if fault("camera_dead") is not None:
             os.kill(os.getpid(), signal.SIGKILL)
         poses = [pose for instant in camera.instants(exposure) if (pose := feed.at(instant)) is not None]
@@ -94,10 +169,8 @@ def rendered_frames(file: CameraFile, robot: Robot, feed: PoseFeed) -> Iterator[
             yield None
         else:
             image = camera.picture(exposure, poses)
-            if (wait := exposure.arrival - time.monotonic()) > 0.0:
-                time.sleep(wait)
+            clock.wait_until(exposure.arrival)
             yield Taken(image, exposure.stamp, time.monotonic())
-        number = max(number + 1, int(time.monotonic() * file.rate))
 
 
 def frames_of_film(file: CameraFile) -> Iterator[Taken | None]:
@@ -108,17 +181,13 @@ def frames_of_film(file: CameraFile) -> Iterator[Taken | None]:
     """
     import numpy as np
 
-    rate = file.rate
     try:
         film = np.load(Path(str(file.device)))
     except (OSError, ValueError) as error:
         raise InputError(f"camera {file.device}: no film: {error}") from None
-    number = int(time.monotonic() * rate) + 1
-    while True:
-        if (wait := number / rate - time.monotonic()) > 0.0:
-            time.sleep(wait)
-        yield Taken(np.array(film[number % len(film)]), number / rate, time.monotonic())
-        number = max(number + 1, int(time.monotonic() * rate))
+    for number in due_frames(file.rate):
+        MonotonicClock().wait_until(number / file.rate)
+        yield Taken(np.array(film[number % len(film)]), number / file.rate, time.monotonic())
 
 
 def serve(frames: Iterator[Taken | None], file: CameraFile) -> None:
@@ -127,22 +196,19 @@ def serve(frames: Iterator[Taken | None], file: CameraFile) -> None:
     Raises:
         InputError: see :func:`frames_of_device`.
     """
-    finder, clock = PoseFinder(file.calibration, file.body, file.floor), StampClock(file.delay)
-    number = 0
+    reader, number = FrameReader(file), 0
     for taken in frames:
         if select.select([sys.stdin], [], [], 0.0)[0]:
             return
         if taken is None:
             continue
         number += 1
-        moment = clock.time(taken.stamp, taken.arrival)
-        sample = finder(VideoFrame(number, moment, taken.image))
-        reading = reading_of(sample, number, taken.arrival, time.monotonic())
+        reading = reader.read(number, *taken)
         if number == 1:
-            _answer(f"ready {clock.source}")
+            _answer(f"ready {reader.clock.source}")
             os.set_blocking(sys.stdout.fileno(), False)
         with contextlib.suppress(BlockingIOError):
-            os.write(sys.stdout.fileno(), pack(reading))  # shorter than PIPE_BUF: whole, or not at all
+            os.write(sys.stdout.fileno(), reading.pack())  # shorter than PIPE_BUF: whole, or not at all
 
 
 def main() -> int:

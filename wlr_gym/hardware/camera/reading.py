@@ -1,13 +1,17 @@
-"""A camera above the floor: its file (``configs/camera/*.yaml``), its readings, and when each frame was exposed.
+"""A camera above the floor: its file (``configs/camera/*.yaml``), its readings, and the process that takes them, from outside.
 
 One reading per frame, with a pose or with the reason why there is none.
 """
 
 from __future__ import annotations
 
-import math
+import contextlib
+import json
+import os
+import select
 import struct
-from collections import deque
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -16,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import named_by, named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_config, require_keys
 from wlr_gym.perception.markers.camera import Camera, load_camera
 from wlr_gym.perception.markers.targets import Target, load_target
-from wlr_gym.perception.vision.tracking import MEANINGS, OK, PARTIAL, Sample
+from wlr_gym.robot import Robot
 
 #: What a calibration without a readout costs: a film tells it, a live pose cannot.
 UNKNOWN_READOUT = "its calibration states no readout: with a rolling shutter its poses are off while the robot moves"
@@ -45,42 +50,27 @@ CAMERA_FAULTS: dict[str, tuple[str, float, str]] = {
 
 
 class EmulatedScene(SettingsModel):
-    """How the camera of an emulated robot is set up; of no meaning to a real one.
+    """How the camera of an emulated robot is set up; of no meaning to a real one."""
 
-    Attributes:
-        height: m of the lens above the floor. tilt: rad from straight down.
-        blur: px, 1 sigma of the lens's blur. noise: grey levels, 1 sigma.
-        exposure: s. latency: s from mid-exposure until the frame has arrived.
-        dropout: share of frames that are lost on the way.
-        clutter: things on the floor that are no markers: discs, rings of other radii, boxes.
-        samples: rays a side in pixels with an edge.
-        seed: of noise, losses, clutter.
-    """
-
-    height: float = Field(default=2.5, gt=0.2, le=20.0)
-    tilt: float = Field(default=0.0, ge=-1.2, le=1.2)
-    blur: float = Field(default=0.8, ge=0.0, le=10.0)
-    noise: float = Field(default=4.0, ge=0.5, le=50.0)
-    exposure: float = Field(default=0.005, ge=0.0, le=0.05)
-    latency: float = Field(default=0.04, ge=0.0, le=0.5)
-    dropout: float = Field(default=0.0, ge=0.0, lt=1.0)
-    clutter: int = Field(default=0, ge=0, le=500)
-    samples: int = Field(default=4, ge=1, le=16)
-    seed: int = Field(default=0, ge=0)
+    height: float = Field(default=2.5, gt=0.2, le=20.0)  #: m of the lens above the floor
+    tilt: float = Field(default=0.0, ge=-1.2, le=1.2)  #: rad from straight down
+    blur: float = Field(default=0.8, ge=0.0, le=10.0)  #: px, 1 sigma of the lens's blur
+    noise: float = Field(default=4.0, ge=0.5, le=50.0)  #: grey levels, 1 sigma
+    exposure: float = Field(default=0.005, ge=0.0, le=0.05)  #: s
+    latency: float = Field(default=0.04, ge=0.0, le=0.5)  #: s from mid-exposure until the frame has arrived
+    dropout: float = Field(default=0.0, ge=0.0, lt=1.0)  #: share of frames that are lost on the way
+    clutter: int = Field(default=0, ge=0, le=500)  #: things on the floor: discs, boxes, rings that are no markers
+    samples: int = Field(default=4, ge=1, le=16)  #: rays a side in pixels with an edge
+    seed: int = Field(default=0, ge=0)  #: of noise, losses, clutter
 
 
 class CameraFile(SettingsModel):
     """A camera above the floor, as one ``configs/camera/*.yaml`` describes it.
 
-    Attributes:
-        name: of it.
-        device: number of the camera (0 = /dev/video0), or its path; a path that ends in ``.npy`` is a recorded film, an array
-            (frames, H, W) of grey levels that is shown over and over.
-        calibration: file of ``wlr calibrate camera``, seen from this file first, or its content.
-        body, floor: markers on the robot and on the floor: files, seen from this file first, or names in ``configs/vision/``.
-        rate: frames per second that are asked for.
-        delay: s from mid-exposure to a frame's time stamp (or, where the driver has none, to its arrival), where it is known.
-        emulated: how it is set up over an emulated robot.
+    ``device`` is the number of the camera (0 = /dev/video0), or its path; a path that ends in ``.npy`` is a recorded film, an
+    array (frames, H, W) of grey levels that is shown over and over. ``calibration`` is the file of ``wlr calibrate camera``,
+    or its content; ``body`` and ``floor`` are the markers: files, or names in ``configs/vision/``. Files are seen from this
+    one first.
     """
 
     name: str
@@ -88,9 +78,10 @@ class CameraFile(SettingsModel):
     calibration: Camera
     body: Target
     floor: Target
-    rate: float = Field(default=30.0, gt=1.0, le=500.0)
+    rate: float = Field(default=30.0, gt=1.0, le=500.0)  #: frames per second that are asked for
+    #: s from mid-exposure to a frame's time stamp (or, where the driver has none, to its arrival), where it is known
     delay: float = Field(default=0.0, ge=0.0, le=0.2)
-    emulated: EmulatedScene = EmulatedScene()
+    emulated: EmulatedScene = EmulatedScene()  #: how it is set up over an emulated robot
 
     @property
     def doubt(self) -> str:
@@ -129,37 +120,35 @@ def load_camera_file(source: str | Path | CameraFile) -> CameraFile:
 
 Array = NDArray[np.float64]
 
-#: Status by its number in a packed reading.
-STATUSES = (OK, PARTIAL, *MEANINGS)
-_NUMBERS = struct.Struct("<QdddB6d36d")
+#: A packed reading: number, three times, why there is no pose, pose, covariance.
+_PACKED = struct.Struct("<Qddd64s6d36d")
 #: Bytes of a packed reading.
-SIZE = _NUMBERS.size
+SIZE = _PACKED.size
 
 
 @dataclass(frozen=True, eq=False)
 class CameraReading:
-    """One frame.
+    """One frame; times are on this computer's monotonic clock."""
 
-    Attributes:
-        number: of frames until this one; 0 = none yet.
-        time: s, mid-exposure. arrival: when it was there. found: when its pose was. All on this computer's monotonic clock.
-        status: ``ok``, ``partial``, or a key of :data:`wlr_gym.perception.vision.tracking.MEANINGS`.
-        pose: (6,) x, y, z (m), yaw, pitch, roll (rad) of the body in the floor frame; NaN without one.
-        covariance: (6, 6) of it.
-    """
+    number: int  #: of frames until this one; 0 = none yet
+    time: float  #: s, mid-exposure
+    arrival: float  #: s, when it was there
+    found: float  #: s, when its pose was
+    reason: str  #: why it has no pose, in words; empty = it has one
+    pose: Array  #: (6,) x, y, z (m), yaw, pitch, roll (rad) of the body in the floor frame; NaN without one
+    covariance: Array  #: (6, 6) of it
 
-    number: int
-    time: float
-    arrival: float
-    found: float
-    status: str
-    pose: Array
-    covariance: Array
+    def pack(self) -> bytes:
+        """Return it as :data:`SIZE` bytes."""
+        times, numbers = (self.time, self.arrival, self.found), (*self.pose, *self.covariance.ravel())
+        return _PACKED.pack(self.number, *times, self.reason.encode(), *numbers)
 
-    @property
-    def has_pose(self) -> bool:
-        """Whether the frame shows where the robot is."""
-        return self.status in (OK, PARTIAL)
+    @classmethod
+    def unpack(cls, data: bytes) -> CameraReading:
+        """Return the reading in packed bytes."""
+        number, time, arrival, found, reason, *values = _PACKED.unpack(data)
+        pose, covariance = np.array(values[:6]), np.array(values[6:]).reshape(6, 6)
+        return cls(number, time, arrival, found, reason.rstrip(b"\0").decode(), pose, covariance)
 
 
 class CameraReader(Protocol):
@@ -189,64 +178,88 @@ class CameraReader(Protocol):
         ...
 
 
-def reading_of(sample: Sample, number: int, arrival: float, found: float) -> CameraReading:
-    """Return a sample whose time is on this computer's clock as a reading."""
-    return CameraReading(number, sample.time, arrival, found, sample.status, sample.pose, sample.covariance)
+# ---- the camera process, seen from the one that drives the robot ----
 
 
-def pack(reading: CameraReading) -> bytes:
-    """Return a reading as :data:`SIZE` bytes."""
-    times, status = (reading.time, reading.arrival, reading.found), STATUSES.index(reading.status)
-    return _NUMBERS.pack(reading.number, *times, status, *reading.pose, *reading.covariance.ravel())
+#: s that the camera may take until its first frame.
+START_TIME = 60.0
 
 
-def unpack(data: bytes) -> CameraReading:
-    """Return the reading in packed bytes."""
-    number, time, arrival, found, status, *values = _NUMBERS.unpack(data)
-    pose, covariance = np.array(values[:6]), np.array(values[6:]).reshape(6, 6)
-    return CameraReading(number, time, arrival, found, STATUSES[status], pose, covariance)
-
-
-# ---- when a frame was exposed ----
-
-
-#: s within which a driver's stamp and the arrival are taken to be of one clock (Linux drivers stamp by the monotonic one).
-SAME_CLOCK = 0.5
-#: Frames over which the offset of another clock is the least (arrival - stamp).
-WINDOW = 300
-
-
-class StampClock:
-    """Tell capture times from time stamps and arrivals.
-
-    A driver that stamps by this computer's monotonic clock is believed. One with a clock of its own is related to it by the
-    least of (arrival - stamp) over the last frames: what is on top of it is delay on the way, and the least delay cannot be
-    told from the offset (``delay`` of the camera's file is for that). Without stamps (0, or none that move) arrivals count.
+class LiveCamera:
+    """A :class:`CameraReader` in a process of its own: :mod:`wlr_gym.hardware.camera.process`.
 
     Args:
-        delay: s from mid-exposure to the stamp or, at the least, to the arrival.
+        file: the camera. robot: what it films where it is an emulated one.
+        feed: file with the poses of an emulated robot, which is filmed by rendering.
 
     Attributes:
-        source: ``driver``, ``driver's own clock`` or ``arrival``, as the last frame was dated.
-        offset: s, this computer's clock minus the stamps'; 0 where they are of one clock.
+        process: None = not open.
+        stamps: whose time stamps count: ``driver``, ``driver's own clock`` or ``arrival``.
     """
 
-    def __init__(self, delay: float) -> None:
-        self.delay, self.source, self.offset = delay, "arrival", 0.0
-        self._lags: deque[float] = deque(maxlen=WINDOW)
-        self._last = math.nan
+    def __init__(self, file: CameraFile, robot: Robot, feed: Path | None = None) -> None:
+        self.file = file
+        self.process: subprocess.Popen[bytes] | None = None
+        self.stamps = ""
+        self._spec = {
+            "camera": file.model_dump(mode="json"),
+            "robot": robot.model_dump(mode="json"),
+            "feed": None if feed is None else str(feed),
+        }
 
-    def time(self, stamp: float, arrival: float) -> float:
-        """Return when a frame was exposed (s) that the driver dates ``stamp`` and that came at ``arrival``."""
-        moves = stamp != self._last and stamp > 0.0 and math.isfinite(stamp)
-        self._last = stamp
-        if not moves:
-            self.source = "arrival"
-            return arrival - self.delay
-        if -0.001 <= arrival - stamp < SAME_CLOCK:
-            self.source, self.offset = "driver", 0.0
-            self._lags.clear()
-            return stamp - self.delay
-        self._lags.append(arrival - stamp)
-        self.source, self.offset = "driver's own clock", min(self._lags)
-        return stamp + self.offset - self.delay
+    def open(self) -> None:
+        """Start the process, and wait for its first frame.
+
+        Raises:
+            InputError: the camera gives none.
+        """
+        command, pipe = [sys.executable, "-m", "wlr_gym.hardware.camera.process"], subprocess.PIPE
+        self.process = process = subprocess.Popen(command, stdin=pipe, stdout=pipe, bufsize=0, start_new_session=True)
+        try:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            with contextlib.suppress(OSError):
+                process.stdin.write(json.dumps(self._spec).encode() + b"\n")
+            is_up = select.select([process.stdout], [], [], START_TIME)[0]
+            answer = process.stdout.readline().decode("utf-8", "replace").strip() if is_up else ""
+            if not answer.startswith("ready"):
+                raise InputError(answer.removeprefix("error: ") or f"camera '{self.file.name}': no frame in {START_TIME:g} s")
+            os.set_blocking(process.stdout.fileno(), False)
+        except BaseException:
+            self.close()
+            raise
+        self.stamps = answer.removeprefix("ready ")
+
+    def close(self) -> None:
+        """End the process."""
+        process, self.process = self.process, None
+        if process is None:
+            return
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+        try:
+            process.wait(0.5)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+
+    def read(self, now: float) -> CameraReading | None:
+        """Return the newest reading that was not returned yet; None = there is none."""
+        newest = b""
+        if self.process is not None and self.process.stdout is not None:
+            with contextlib.suppress(BlockingIOError):
+                while data := os.read(self.process.stdout.fileno(), 100 * SIZE):
+                    newest = data[-SIZE:]
+        return CameraReading.unpack(newest) if newest else None
+
+    @property
+    def trouble(self) -> str:
+        """Why no reading will come any more; empty = the process runs."""
+        if self.process is None:
+            return "the camera process does not run"
+        if self.process.poll() is None:
+            return ""
+        return f"the camera process has ended (exit code {self.process.returncode})"

@@ -46,16 +46,12 @@ _COUNT = struct.Struct("<Q")
 
 
 class RobotPose(NamedTuple):
-    """Where an emulated robot is.
+    """Where an emulated robot is."""
 
-    Attributes:
-        time: s. position: (3,) m. quaternion: (4,) w, x, y, z. legs: (4,) rad.
-    """
-
-    time: float
-    position: Array
-    quaternion: Array
-    legs: Array
+    time: float  #: s
+    position: Array  #: (3,) m
+    quaternion: Array  #: (4,) w, x, y, z
+    legs: Array  #: (4,) rad
 
 
 class PoseFeed:
@@ -129,19 +125,14 @@ Faults = Callable[[str], float | None]
 
 
 class Exposure(NamedTuple):
-    """A frame that will come.
-
-    Attributes:
-        number: of it. time: s of mid-exposure. shown: s at which the robot is shown. stamp: s that the driver writes on it.
-        arrival: s at which it is there. is_lost: it never is.
-    """
+    """A frame that will come."""
 
     number: int
-    time: float
-    shown: float
-    stamp: float
-    arrival: float
-    is_lost: bool
+    time: float  #: s of mid-exposure
+    shown: float  #: s at which the robot is shown
+    stamp: float  #: s that the driver writes on it
+    arrival: float  #: s at which it is there
+    is_lost: bool  #: it never is
 
 
 class RenderedCamera:
@@ -178,22 +169,33 @@ class RenderedCamera:
 
     def picture(self, exposure: Exposure, poses: list[RobotPose]) -> Image:
         """Render the frame of an exposure that shows the robot at :meth:`instants`."""
-        if self._last is not None and self._faults("camera_frozen") is not None:
+        scene, faults = self.file.emulated, self._faults
+        if self._last is not None and faults("camera_frozen") is not None:
             return self._last
-        if self._faults("camera_covered") is not None:
-            noise = np.random.default_rng([self.file.emulated.seed, 3, exposure.number])
+        if faults("camera_covered") is not None:
+            noise = np.random.default_rng([scene.seed, 3, exposure.number])
             shape = self.file.calibration.height, self.file.calibration.width
             return np.clip(np.rint(noise.normal(12.0, 2.0, shape)), 0, 255).astype(np.uint8)
-        plate = self._plate()
-        parts = [*robot_facets(self.robot, poses[0].legs), plate]
+        plate = plate_facet(self.file.body)
+        circles = plate.circles.copy()
+        if (scale := faults("camera_sheet")) is not None:
+            circles *= scale
+        if faults("camera_back_to_front") is not None:
+            circles[:, :2] *= -1.0
+        parts = [*robot_facets(self.robot, poses[0].legs), replace(plate, circles=circles)]
         moving = [[facet.moved(at.position, at.rotation) for facet in parts] for at in map(scene_pose, poses)]
-        scene = self.file.emulated
-        blur = self._faults("camera_blurred")
+        blur = faults("camera_blurred")
         look = Look(blur=scene.blur if blur is None else blur, noise=scene.noise)
         seed = int(np.random.default_rng([scene.seed, 4, exposure.number]).integers(2**62))
         image = self.renderer().frame(moving, look, seed)
-        self._last = self._spoilt(image)
-        return self._last
+        if faults("camera_glare") is not None:
+            image = _glaring(image)
+        if faults("camera_mirrored") is not None:
+            image = np.ascontiguousarray(image[:, ::-1])
+        if faults("camera_rotated") is not None:
+            image = np.ascontiguousarray(image[::-1, ::-1])
+        self._last = image
+        return image
 
     def renderer(self) -> Renderer:
         """Return the renderer of where the camera hangs now, and of what lies on the floor."""
@@ -202,33 +204,12 @@ class RenderedCamera:
             scene = self.file.emulated
             still = [*floor_facets(self.file.floor), *_clutter(scene.clutter, scene.seed)]
             if decoy:
-                flat = replace(plate_facet(self.file.body), centre=np.array([*_DECOY, 2e-4]))
-                still.append(flat)
+                still.append(replace(plate_facet(self.file.body), centre=np.array([*_DECOY, 2e-4])))
             eye = view(scene.tilt, scene.height / math.cos(scene.tilt), (0.0, 0.0, 0.0))
             knock = rotation_of(turned, 0.3 * turned)  # about the camera's own axes: z is its optical axis
             floor = ScenePose(knock @ eye.position, knock @ eye.rotation)
             self._renderers[turned, decoy] = Renderer(self.file.calibration, floor, still, scene.samples)
         return self._renderers[turned, decoy]
-
-    def _plate(self) -> Facet:
-        """The plate on the robot, with the markers that are on it."""
-        plate = plate_facet(self.file.body)
-        circles = plate.circles.copy()
-        if (scale := self._faults("camera_sheet")) is not None:
-            circles *= scale
-        if self._faults("camera_back_to_front") is not None:
-            circles[:, :2] *= -1.0
-        return replace(plate, circles=circles)
-
-    def _spoilt(self, image: Image) -> Image:
-        """What the faults do to the picture itself."""
-        if self._faults("camera_glare") is not None:
-            image = _glaring(image)
-        if self._faults("camera_mirrored") is not None:
-            image = np.ascontiguousarray(image[:, ::-1])
-        if self._faults("camera_rotated") is not None:
-            image = np.ascontiguousarray(image[::-1, ::-1])
-        return image
 
 
 def _glaring(image: Image) -> Image:

@@ -8,16 +8,25 @@ from __future__ import annotations
 import contextlib
 import datetime
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.data.format import RunMeta
 from wlr_gym.data.runs import next_run, write_run
-from wlr_gym.hardware.commissioning.stand import Person, PowerError, QuitError, SkippedError, Stand, TrippedError, TroubleError
-from wlr_gym.hardware.commissioning.stand_tests import PartlyError, Reading, StandQuantity, StandTest
+from wlr_gym.hardware.commissioning.stand import (
+    EmulatedPerson,
+    PartlyError,
+    Person,
+    PowerError,
+    QuitError,
+    SkippedError,
+    Stand,
+    TrippedError,
+    TroubleError,
+)
+from wlr_gym.hardware.commissioning.stand_tests import StandTest
 from wlr_gym.hardware.config import Hardware, Measured, MeasuredValue
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
 from wlr_gym.hardware.emulator.link import emulated_link
@@ -35,50 +44,50 @@ DONE, SKIPPED, FAILED, STOPPED = "done", "skipped", "failed", "stopped"
 TRIES = 3
 #: Of the emulated robot's sensor noise: other noise than that of an emulated robot under test, whose seed is 0.
 _SEED = 1
+#: Name of a quantity, and joint, bus or ``imu`` -> value.
+Readings = dict[tuple[str, str], float]
 _TROUBLE = (TroubleError, NoAnswerError, RefusedError, ConnectionError, InputError)
 
 
 @dataclass(frozen=True)
 class StandFinding:
-    """A measured value beside the expected one.
+    """A measured value beside the expected one."""
 
-    Attributes:
-        test: name of the test.
-        quantity: what was measured.
-        where: joint, bus, or ``imu``.
-        measured, expected: in the quantity's unit.
-    """
-
-    test: str
-    quantity: StandQuantity
-    where: str
-    measured: float
-    expected: float
-
-    @property
-    def room(self) -> float:
-        """By how much the value may differ."""
-        return self.quantity.tolerance + self.quantity.relative * abs(self.expected)
+    quantity: str  #: name of what was measured
+    where: str  #: joint, bus, or ``imu``
+    unit: str  #: SI unit of the numbers
+    measured: float  #: on this robot
+    expected: float  #: on the emulated one
+    tolerance: float  #: by which they may differ
+    verdict: str  #: ``as expected`` or ``differs``, as a value does that is no number
+    remedy: str  #: what to do where it differs
 
     @property
     def is_expected(self) -> bool:
-        """Whether it differs by no more; a value that is no number differs."""
-        return abs(self.measured - self.expected) <= self.room
+        """Whether nothing is wrong with it."""
+        return self.verdict == "as expected"
+
+
+@dataclass(frozen=True)
+class StandResult:
+    """How a test went."""
+
+    test: str  #: name
+    state: str  #: one of :data:`DONE`, :data:`SKIPPED`, :data:`FAILED`, :data:`STOPPED` (nothing follows)
+    reason: str = ""  #: why it is not done
+    repeated: tuple[str, ...] = ()  #: why it was begun anew, once for each time
+    run: str = ""  #: name of its measured run; empty = it has no rows
+    time: str = field(default_factory=lambda: _now().isoformat(timespec="seconds"))  #: when it was over
+    findings: tuple[StandFinding, ...] = ()  #: what was measured beside what was expected; of a failed test, where it was made
 
     @property
-    def verdict(self) -> str:
-        """In words."""
-        return "as expected" if self.is_expected else "differs"
+    def is_good(self) -> bool:
+        """Whether it was made, or left out on purpose, and nothing differs."""
+        return self.state in (DONE, SKIPPED) and all(finding.is_expected for finding in self.findings)
 
 
-def compare(test: StandTest, measured: Sequence[Reading], expected: Sequence[Reading]) -> list[StandFinding]:
-    """Return what was measured beside what the emulated robot showed, in the order it was measured."""
-    quantities = {quantity.name: quantity for quantity in test.quantities}
-    known = {(reading.quantity, reading.where): reading.value for reading in expected}
-    return [
-        StandFinding(test.name, quantities[one.quantity], one.where, one.value, known[one.quantity, one.where])
-        for one in measured
-    ]
+def _now() -> datetime.datetime:
+    return datetime.datetime.now().astimezone()
 
 
 def with_measurements(hardware: Hardware, findings: Iterable[StandFinding], earlier: Measured | None = None) -> Hardware:
@@ -88,90 +97,33 @@ def with_measurements(hardware: Hardware, findings: Iterable[StandFinding], earl
         for where, value in getattr(earlier or Measured(), name).items():
             if where not in values or value.date >= values[where].date:
                 values[where] = value
-    today = datetime.datetime.now().astimezone().date().isoformat()
+    today = _now().date().isoformat()
     for one in findings:
-        if one.quantity.name in kept:
+        if one.quantity in kept:
             value = float(f"{one.measured:.4g}")
-            kept[one.quantity.name][one.where] = MeasuredValue(value=value, unit=one.quantity.unit, date=today)
+            kept[one.quantity][one.where] = MeasuredValue(value=value, unit=one.unit, date=today)
     return hardware.model_copy(update={"measured": Measured(**{name: values for name, values in kept.items() if values})})
 
 
-@dataclass(frozen=True)
-class StandResult:
-    """How a test went.
-
-    Attributes:
-        test: name.
-        state: one of :data:`DONE`, :data:`SKIPPED`, :data:`FAILED`, :data:`STOPPED` (nothing follows).
-        reason: why it is not done.
-        findings: what was measured, and what was expected; of a failed test, where it could be made.
-        run: name of its measured run; empty = it has no rows.
-        repeated: why it was begun anew, once for each time.
-    """
-
-    test: str
-    state: str
-    reason: str = ""
-    findings: tuple[StandFinding, ...] = field(default=())
-    run: str = ""
-    repeated: tuple[str, ...] = ()
-
-    @property
-    def is_good(self) -> bool:
-        """Whether it was made, or left out on purpose, and nothing differs."""
-        return self.state in (DONE, SKIPPED) and all(finding.is_expected for finding in self.findings)
-
-
-class EmulatedPerson:
-    """Does with an emulated robot what is asked for, and never asks."""
-
-    def __init__(self, stand: EmulatedStand) -> None:
-        self._stand = stand
-        self._current = 0.0
-
-    def ready(self, test: str) -> None:
-        """Agree."""
-
-    def turn(self, joint: str, angle: float) -> None:
-        """Turn it."""
-        self._stand.machine.turn(joint, angle)
-
-    def straighten(self, leg: str) -> None:
-        """Hold it straight."""
-        self._stand.machine.straighten(leg)
-
-    def tilt(self, seconds: float, **angles: float) -> None:
-        """Tilt the body; it is there in about 2 s."""
-        self._stand.tilt(**angles)
-
-    def brake(self, joint: str, trouble: str = "") -> None:
-        """Hold it."""
-        self._stand.brake(joint)
-
-    def release(self, joint: str) -> None:
-        """Let go."""
-        self._stand.release(joint)
-
-    def watch_supply(self) -> None:
-        """Note the current."""
-        self._current = self._stand.wheel_current()
-
-    def supply_current(self) -> float | None:
-        """Return what was noted."""
-        return self._current
+def compare(test: StandTest, measured: Readings, expected: Readings) -> tuple[StandFinding, ...]:
+    """Return what was measured beside what the emulated robot showed, in the order it was measured."""
+    quantities = {quantity.name: quantity for quantity in test.quantities}
+    found = []
+    for (name, where), value in measured.items():
+        quantity, known = quantities[name], expected[name, where]
+        tolerance = quantity.tolerance + quantity.relative * abs(known)
+        is_expected = abs(value - known) <= tolerance
+        verdict, remedy = ("as expected", "") if is_expected else ("differs", quantity.remedy)
+        found.append(StandFinding(name, where, quantity.unit, value, known, tolerance, verdict, remedy))
+    return tuple(found)
 
 
 class Commissioning:
-    """A robot on a stand, and an emulated one beside it that is put through the same.
-
-    Use as a context manager.
+    """A robot on a stand, and an emulated one beside it that is put through the same. Use as a context manager.
 
     Args:
-        robot, hardware: of the robot.
-        link: to it, closed.
-        person: beside it.
-        folder: for runs and samples.
-        meta: of the runs.
+        robot, hardware, link: of the robot; closed. person: beside it.
+        folder, meta: of runs and samples.
     """
 
     def __init__(self, robot: Robot, hardware: Hardware, link: Link, person: Person, folder: Path, meta: RunMeta) -> None:
@@ -181,21 +133,20 @@ class Commissioning:
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Commissioning:
+        emulated = EmulatedStand(self._robot, self._hardware, options=MachineOptions(seed=_SEED))
         with contextlib.ExitStack() as stack:
-            self._stand = Stand(self._robot, self._hardware, self._opened(self._link, stack))
-            emulated = EmulatedStand(self._robot, self._hardware, options=MachineOptions(seed=_SEED))
-            self._model = Stand(self._robot, self._hardware, self._opened(emulated_link(emulated.machine), stack))
+            stands = []
+            for link in (self._link, emulated_link(emulated.machine)):
+                stack.callback(link.close)
+                link.open()
+                stands.append(Stand(self._robot, self._hardware, link))
+            self._stand, self._model = stands
             self._model_person = EmulatedPerson(emulated)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *error: object) -> None:
         self._stack.close()
-
-    def _opened(self, link: Link, stack: contextlib.ExitStack) -> Link:
-        stack.callback(link.close)
-        link.open()
-        return link
 
     def faults(self) -> list[str]:
         """Return what stands against switching motors on, by the preflight checks."""
@@ -228,13 +179,15 @@ class Commissioning:
 
     def _try(self, test: StandTest, repeated: tuple[str, ...]) -> StandResult:
         again = f"Once more, for {repeated[-1]}. " if repeated else ""
+        state, reason = DONE, ""
+        readings: Readings = {}
+        expected: Readings = {}
         try:
             self._person.ready(f"{again}{test.title}. {test.moves} {test.asks or 'Hands off.'}")
         except SkippedError:
             return StandResult(test.name, SKIPPED, repeated=repeated)
         except QuitError:
-            return StandResult(test.name, STOPPED, "asked to", repeated=repeated)
-        state, reason, readings = DONE, "", []
+            return StandResult(test.name, STOPPED, "asked to", repeated)
         try:
             readings = run_test(test, self._stand, self._person)
         except TrippedError as error:
@@ -243,40 +196,35 @@ class Commissioning:
             state, reason = FAILED, f"{error}, in {TRIES} tries"
             self._stand.begin()  # no run: motors that were stopped did not follow its commands
         except SkippedError:
-            return StandResult(test.name, SKIPPED, "no consent to go on", repeated=repeated)
+            return StandResult(test.name, SKIPPED, "no consent to go on", repeated)
         except QuitError as asked:
             state, reason = STOPPED, str(asked) or "asked to"
         except PowerError as error:
             self._is_off = False
             state, reason = STOPPED, str(error)
-        except PartlyError as error:
-            state, reason, readings = FAILED, str(error), error.readings
         except _TROUBLE as error:
             state, reason = FAILED, str(error)
-        expected: list[Reading] = []
+            readings = self._stand.readings if isinstance(error, PartlyError) else {}
         try:
-            expected = run_test(test, self._model, self._model_person) if readings else []
+            expected = run_test(test, self._model, self._model_person) if readings else {}
         except QuitError as asked:  # a signal, while the emulated robot was put through it
-            state, reason, readings = STOPPED, str(asked) or "asked to", []
-        findings = tuple(compare(test, readings, expected))
-        result = StandResult(test.name, state, reason, findings, self._log_run(), repeated)
+            state, reason, readings = STOPPED, str(asked) or "asked to", {}
+        findings = compare(test, readings, expected)
+        result = StandResult(test.name, state, reason, repeated, self._log_run(), findings=findings)
         path = self._folder / f"{test.name}.json"
         if state != STOPPED or not path.exists():  # what an earlier session measured is not lost for a test that was not made
-            write_json(path, content_of(result) | {"samples": self._stand.samples})
+            write_json(path, asdict(result) | {"samples": self._stand.samples})
         return result
 
     def _log_run(self) -> str:
         """Write the test's rows as a measured run; return its name, or nothing where there is none or it is refused as one."""
-        table = self._stand.table()
-        if not table:
-            return ""
-        try:
-            return write_run(next_run(self._folder, ".csv"), table, self._meta, robot=self._robot).name
-        except InputError:
-            return ""
+        if table := self._stand.table():
+            with contextlib.suppress(InputError):
+                return write_run(next_run(self._folder, ".csv"), table, self._meta, robot=self._robot).name
+        return ""
 
 
-def run_test(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
+def run_test(test: StandTest, stand: Stand, person: Person) -> Readings:
     """Make a test and switch every motor off, whatever happens; signals end it in good order.
 
     Raises:
@@ -289,7 +237,7 @@ def run_test(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
     with stop_on_signals(stand.operator):
         try:
             try:
-                readings = test.measure(stand, person)
+                test.measure(stand, person)
             except (TroubleError, NoAnswerError, RefusedError):
                 with contextlib.suppress(ConnectionError):
                     stand.check_watchdogs()  # a refused setpoint, a wheel that stands: it may be why
@@ -298,31 +246,4 @@ def run_test(test: StandTest, stand: Stand, person: Person) -> list[Reading]:
         finally:
             if left := stand.off():
                 raise PowerError(f"CUT THE POWER: torque is not confirmed off at {', '.join(left)}")
-    return readings
-
-
-def content_of(result: StandResult) -> dict[str, Any]:
-    """Return a result as plain data, for JSON."""
-    findings = [
-        {
-            "quantity": one.quantity.name,
-            "where": one.where,
-            "unit": one.quantity.unit,
-            "measured": one.measured,
-            "expected": one.expected,
-            "tolerance": one.room,
-            "verdict": one.verdict,
-            "remedy": "" if one.is_expected else one.quantity.remedy,
-        }
-        for one in result.findings
-    ]
-    time = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
-    return {
-        "test": result.test,
-        "state": result.state,
-        "reason": result.reason,
-        "repeated": list(result.repeated),
-        "run": result.run,
-        "time": time,
-        "findings": findings,
-    }
+    return stand.readings

@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import COMMANDS
 from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError
+from wlr_gym.hardware.emulator.stand import EmulatedStand
 from wlr_gym.hardware.imu import ImuGoneError
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.operator import Operator
-from wlr_gym.hardware.safety.limiter import CALM_PATIENCE, WATCHDOG_UNIT, watchdog_count
+from wlr_gym.hardware.safety.limiter import CALM_PATIENCE, WATCHDOG_UNIT, switch_off, watchdog_count
 from wlr_gym.hardware.safety.preflight import reset_tuning
 from wlr_gym.hardware.servos import JointReadings
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, full_name
@@ -42,8 +42,6 @@ _READING = 0.01
 LOW_PWM = 0.2
 #: Part of the stall torque above which a motor that should turn freely is blocked, and rows in a row.
 BLOCKED, BLOCKED_ROWS = 0.4, 3
-#: Times to switch off servos that do not confirm it, and s between them.
-_OFF_TRIES, _OFF_PAUSE = 20, 0.05
 #: s beyond its waits that a stand is busy between two signs of life; and while it switches off.
 LONGEST_BUSY, LONGEST_OFF = 2.0, 20.0
 
@@ -60,6 +58,10 @@ class SlippedError(TroubleError):
     """A joint that was to be held gave way."""
 
 
+class PartlyError(TroubleError):
+    """A test could not be made at some joints; what it measured is of the others."""
+
+
 class SkippedError(Exception):
     """The person does not want this test."""
 
@@ -72,47 +74,12 @@ class PowerError(Exception):
     """Torque is not confirmed off: nothing more is tried."""
 
 
-class Person(Protocol):
-    """Hands and eyes. Nobody is asked anything while a motor is on, but :meth:`watch_supply` wants eyes only."""
-
-    def ready(self, test: str) -> None:
-        """Agree to a test, told in words; raises :class:`SkippedError` or :class:`QuitError`."""
-        ...
-
-    def turn(self, joint: str, angle: float) -> None:
-        """Turn a joint by ``angle`` (rad) in its positive direction, and keep it there."""
-        ...
-
-    def straighten(self, leg: str) -> None:
-        """Hold a leg straight down."""
-        ...
-
-    def tilt(self, seconds: float, **angles: float) -> None:
-        """Begin to turn the body to ``roll``, ``pitch`` or ``yaw`` (rad), be there within ``seconds``; none = level again."""
-        ...
-
-    def brake(self, joint: str, trouble: str = "") -> None:
-        """Hold a wheel or a leg so that it does not turn, until :meth:`release`; ``trouble``: why it is asked for again."""
-        ...
-
-    def release(self, joint: str) -> None:
-        """Let go of it."""
-        ...
-
-    def watch_supply(self) -> None:
-        """Look at the current that the supply shows, now."""
-        ...
-
-    def supply_current(self) -> float | None:
-        """Return what it showed, A; None = not read."""
-        ...
-
-
-class TerminalPerson:
-    """Asks a human.
+class Person:
+    """Hands and eyes beside a robot: a human, asked at a terminal. Nobody is asked anything while a motor is on.
 
     Args:
-        ask: shows a text, waits for Enter, returns what was typed.
+        ask: shows a text, waits for Enter, returns what was typed: ``q`` ends (:class:`QuitError`), anything but Enter or
+            ``y`` is no consent (:class:`SkippedError`).
         is_asked_before: every test is asked for before it begins.
     """
 
@@ -127,17 +94,16 @@ class TerminalPerson:
         return answer
 
     def _enter(self, text: str) -> None:
-        """Show a text and wait for Enter; whatever else is typed is no consent."""
         if self._answer(text) not in ("", "y", "yes"):
             raise SkippedError
 
     def ready(self, test: str) -> None:
-        """Say what the test is; Enter starts it, ``q`` ends, anything else, such as ``s``, skips it."""
+        """Agree to a test, told in words."""
         if self._is_asked_before:
             self._enter(f"{test} Enter starts, s skips, q ends.")
 
     def turn(self, joint: str, angle: float) -> None:
-        """Ask for a turn by hand."""
+        """Turn a joint by ``angle`` (rad) in its positive direction, and leave it there."""
         if joint in LEGS:
             way = f"swing its foot to the {'back' if angle > 0 else 'front'}"
         else:
@@ -145,38 +111,72 @@ class TerminalPerson:
         self._enter(f"{full_name(joint)}: {way} by about {abs(math.degrees(angle)):.0f} deg, leave it there, then Enter.")
 
     def straighten(self, leg: str) -> None:
-        """Ask for a leg that hangs straight."""
+        """Hold a leg straight down."""
         self._enter(f"{full_name(leg)}: hold it straight down, wheel's centre under the hip, then Enter.")
 
     def tilt(self, seconds: float, **angles: float) -> None:
-        """Ask for a body that is turned."""
+        """Begin to turn the body to ``roll``, ``pitch`` or ``yaw`` (rad), be there within ``seconds``; none = level again."""
         names = {"roll": "right side down", "pitch": "nose down", "yaw": "nose to the left"}
         ways = [f"{names[name]} by about {math.degrees(angle):.0f} deg" for name, angle in angles.items()]
         way = " and ".join(ways) or "level, as it was before"
         self._enter(f"Robot: press Enter, then turn it {way}, smoothly within {seconds:g} s, and keep it still there.")
 
     def brake(self, joint: str, trouble: str = "") -> None:
-        """Ask for a hand on a wheel, or at a leg's end."""
+        """Hold a wheel or a leg's end so that it does not turn, until :meth:`release`; ``trouble``: why it is asked again."""
         where = "the tyre firmly, away from gears and leg; watch the supply"
         if joint in LEGS:
             where = "its end firmly, away from the hip; it will push to the back"
         self._enter(f"{trouble}{full_name(joint)}: hold {where}. Then Enter.")
 
     def release(self, joint: str) -> None:
-        """Say that it may be let go."""
+        """Let go of it."""
         self._answer(f"{full_name(joint)}: its motor is off, let go, then Enter.")
 
     def watch_supply(self) -> None:
-        """Do nothing: a human looks by himself."""
+        """Look at the current that the supply shows, now: a human does by himself."""
 
     def supply_current(self) -> float | None:
-        """Ask for a number."""
+        """Return what it showed, A; None = not read."""
         while answer := self._answer("The supply's current while it was held, less the one before, A (Enter: not read)?"):
-            try:
+            with contextlib.suppress(ValueError):
                 return float(answer)
-            except ValueError:
-                continue
         return None
+
+
+class EmulatedPerson(Person):
+    """Does with an emulated robot what is asked for, and agrees to everything."""
+
+    def __init__(self, stand: EmulatedStand) -> None:
+        super().__init__(lambda text: "")
+        self._stand, self._current = stand, 0.0
+
+    def turn(self, joint: str, angle: float) -> None:
+        """Turn it."""
+        self._stand.machine.turn(joint, angle)
+
+    def straighten(self, leg: str) -> None:
+        """Hold it straight."""
+        self._stand.machine.straighten(leg)
+
+    def tilt(self, seconds: float, **angles: float) -> None:
+        """Tilt the body; it is there in about 2 s."""
+        self._stand.tilt(**angles)
+
+    def brake(self, joint: str, trouble: str = "") -> None:
+        """Hold it."""
+        self._stand.brake(joint)
+
+    def release(self, joint: str) -> None:
+        """Let go."""
+        self._stand.release(joint)
+
+    def watch_supply(self) -> None:
+        """Note the current."""
+        self._current = self._stand.wheel_current()
+
+    def supply_current(self) -> float | None:
+        """Return what was noted."""
+        return self._current
 
 
 class Stand:
@@ -190,7 +190,8 @@ class Stand:
         servos: for reading; tests write with the methods below only.
         clock: of the link.
         operator: Ctrl-C and signals.
-        samples: what a test notes beyond the rows.
+        readings: what a test measured: name of the quantity, and joint, bus or ``imu`` -> value in the quantity's unit.
+        samples: what it notes beyond that and the rows.
         sign_of_life: told, while a motor is on, within how many seconds the next sign comes (inf: no motor is on). It is for
             the watchdog process.
     """
@@ -199,6 +200,7 @@ class Stand:
         self.robot, self.hardware = robot, hardware
         self.servos, self.clock = link.servos, link.clock
         self.operator: Operator = Operator(link.clock)
+        self.readings: dict[tuple[str, str], float] = {}
         self.samples: dict[str, list[float]] = {}
         self.sign_of_life: Callable[[float], None] = lambda seconds: None
         self._imu = link.imu
@@ -208,8 +210,7 @@ class Stand:
         self._silent = self._blocked = 0
         self._armed: set[str] = set()
         self._on: set[str] = set()
-        stall = robot.servo.leg.stall_torque, robot.servo.wheel.stall_torque
-        self._stall = np.repeat(stall, 4)
+        self._stall = np.repeat([robot.servo.leg.stall_torque, robot.servo.wheel.stall_torque], 4)
         self._last = np.zeros(3 * len(JOINTS))
         self.servos.set_patience(max(CALM_PATIENCE, hardware.safety.patience))
 
@@ -217,10 +218,15 @@ class Stand:
 
     def begin(self) -> None:
         """Begin a new run: no rows, nothing noted."""
-        self._rows, self.samples = [], {}
+        self._rows, self.readings, self.samples = [], {}, {}
         self._next = self.clock.now()
         self._silent = self._blocked = 0
         self._armed.clear()
+
+    def note(self, quantity: str, places: str | Sequence[str], values: ArrayLike) -> None:
+        """Take what was measured of a quantity: a value for a place, or one for each of several."""
+        places, numbers = [places] if isinstance(places, str) else places, np.ravel(values).astype(float).tolist()
+        self.readings |= {(quantity, place): value for place, value in zip(places, numbers, strict=True)}
 
     def step(self) -> JointReadings:
         """Wait for the next row's time, read everything, and note it; one lost answer leaves the values of the row before.
@@ -228,7 +234,6 @@ class Stand:
         Raises:
             TroubleError: a servo is silent, restarted, blocked or has an error.
             QuitError: somebody asked for a stop.
-            BusGoneError: a port is gone.
         """
         self._next = max(self._next + PERIOD, self.clock.now())
         self.wait_until(self._next)
@@ -269,7 +274,6 @@ class Stand:
 
         Raises:
             TrippedError: one has.
-            BusGoneError: a port is gone.
         """
         held = self.servos.get_all("bus_watchdog") if self._armed else {}
         if len(held) < len(JOINTS):  # waiting for the silent one took the time: it is the reason, not this computer
@@ -341,20 +345,20 @@ class Stand:
 
         Raises:
             QuitError: somebody asked for a stop, during a question too.
-            TroubleError: a leg would go farther than :data:`LARGEST_LEAN`.
+            PartlyError: a leg would go farther than :data:`LARGEST_LEAN`.
         """
         if asked := self.operator.take():
             raise QuitError(asked)
         joints = list(joints)
         for leg in [joint for joint in joints if joint in LEGS]:
-            way = self._goal(leg) - self._register(leg, "present_position")
+            way = self._register(leg, "goal_position") - self._register(leg, "present_position")
             if not abs(way) <= LARGEST_LEAN + _READING:  # a hand may have moved it
-                raise TroubleError(f"{leg}: {way:+.2f} rad from its setpoint, expected {LARGEST_LEAN:g} at most: turn it less")
+                raise PartlyError(f"{leg}: {way:+.2f} rad from its setpoint, expected {LARGEST_LEAN:g} at most: turn it less")
         self._on.update(joints)
         self.sign_of_life(LONGEST_BUSY)
         for joint in joints:
-            k = JOINTS.index(joint)
-            self._setpoints[k] = self._goal(joint)
+            goal = self._register(joint, "goal_position" if joint in LEGS else "goal_velocity")
+            self._setpoints[JOINTS.index(joint)] = goal
             self.servos.set(joint, "torque_enable", 1)
         self._armed.update(joints)
         for joint in sorted(joints, key=lambda joint: JOINTS.index(joint) % len(LEGS)):  # no bus is silent for long meanwhile
@@ -375,10 +379,6 @@ class Stand:
         if not self._on:
             self.sign_of_life(math.inf)
 
-    def _goal(self, joint: str) -> float:
-        """Return the setpoint a servo holds, rad or rad/s."""
-        return self._register(joint, "goal_position" if joint in LEGS else "goal_velocity")
-
     def _register(self, joint: str, item: str) -> float:
         """Return a register of a servo: an angle of a leg, rad, or a rate of a wheel, rad/s."""
         counts = np.zeros(len(JOINTS))
@@ -392,7 +392,6 @@ class Stand:
 
         Raises:
             InputError: faster than the stand allows.
-            RefusedError: the servo does not take it.
         """
         limit = min(TOP_SPEED, self.hardware.safety.wheel_speed)
         for wheel, speed in speeds.items():
@@ -406,11 +405,9 @@ class Stand:
         Raises:
             InputError: farther than the stand allows, or out of the leg's range.
         """
-        k = JOINTS.index(leg)
-        goal = float(self.servos.read().position[k]) + angle
-        low, high = (
-            end + way * self.hardware.safety.leg_margin for end, way in zip(self.robot.leg_limits, (1, -1), strict=True)
-        )
+        goal = float(self.servos.read().position[JOINTS.index(leg)]) + angle
+        margin = self.hardware.safety.leg_margin
+        low, high = self.robot.leg_limits[0] + margin, self.robot.leg_limits[1] - margin
         if leg not in LEGS or not abs(angle) <= LARGEST_LEAN or not low <= goal <= high:
             raise InputError(
                 f"{leg}: by {angle:g} rad to {goal:.2f}, expected a leg, {LARGEST_LEAN:g} rad at most, and a goal in "
@@ -446,23 +443,14 @@ class Stand:
 
     def off(self) -> list[str]:
         """Switch every motor off and put the registers back, whatever happened; return the joints that did not confirm."""
-        servos = self.servos
         self.operator.is_switching_off = True
         try:
-            for _ in range(2):
-                servos.torque_off_unacknowledged()
             self.sign_of_life(LONGEST_OFF)
-            left = servos.torque_off(1)
-            for _ in range(_OFF_TRIES):
-                if not left:
-                    break
-                self.clock.wait_until(self.clock.now() + _OFF_PAUSE)
-                servos.reopen_gone()
-                left = servos.torque_off(1, left)
+            left = switch_off(self.servos, self.clock, self.hardware.safety.off_time)
             with contextlib.suppress(ConnectionError, NoAnswerError, RefusedError):
                 is_off = [joint for joint in JOINTS if joint not in left]
                 for joint in is_off:
-                    servos.set(joint, "bus_watchdog", 0)
+                    self.servos.set(joint, "bus_watchdog", 0)
                 self.prepare(is_off)
             self._on.clear()
             self.sign_of_life(math.inf)

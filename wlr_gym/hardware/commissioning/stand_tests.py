@@ -3,85 +3,57 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.hardware.calibration import find_sign
-from wlr_gym.hardware.commissioning.stand import LARGEST_LEAN, LOW_PWM, PERIOD, Person, SlippedError, Stand, TroubleError
+from wlr_gym.hardware.commissioning.stand import (
+    LARGEST_LEAN,
+    LOW_PWM,
+    PERIOD,
+    PartlyError,
+    Person,
+    SlippedError,
+    Stand,
+    TroubleError,
+)
 from wlr_gym.hardware.dynamixel.bus import Block
 from wlr_gym.hardware.dynamixel.protocol import RefusedError
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS
 
-Measure = Callable[[Stand, Person], "list[Reading]"]
+Array = NDArray[np.float64]
+Measure = Callable[[Stand, Person], None]
 
 
 @dataclass(frozen=True)
 class StandQuantity:
-    """Something that a test measures.
+    """Something that a test measures."""
 
-    Attributes:
-        name: goes into the hardware file where its ``measured`` section has a field of this name.
-        unit: SI unit; ``-`` is a pure number.
-        doc: what it is.
-        tolerance: by how much it may differ from what the emulated robot shows, in its unit ...
-        relative: ... and beyond that as a part of it.
-        remedy: what to do where it differs.
-    """
-
-    name: str
-    unit: str
-    doc: str
-    tolerance: float
-    remedy: str
-    relative: float = 0.0
-
-
-class Reading(NamedTuple):
-    """A measured value.
-
-    Attributes:
-        quantity: name of a :class:`StandQuantity` of the test.
-        where: joint, bus, or ``imu``.
-        value: in the quantity's unit.
-    """
-
-    quantity: str
-    where: str
-    value: float
-
-
-class PartlyError(TroubleError):
-    """A test could not be made at some joints; ``readings`` are of the others."""
-
-    def __init__(self, message: str, readings: Sequence[Reading]) -> None:
-        super().__init__(message)
-        self.readings: list[Reading] = list(readings)
+    name: str  #: goes into the hardware file where its ``measured`` section has a field of this name
+    unit: str  #: SI unit; ``-`` is a pure number
+    doc: str  #: what it is
+    tolerance: float  #: by how much it may differ from what the emulated robot shows, in its unit ...
+    remedy: str  #: what to do where it differs
+    relative: float = 0.0  #: ... and beyond the tolerance as a part of it
 
 
 @dataclass(frozen=True)
 class StandTest:
     """A test of a robot on a stand.
 
-    Attributes:
-        name: for ``--tests``.
-        title: what it shows, in a few words.
-        asks: what the person has to do; empty = keep hands off.
-        moves: what will move, for the question before the test.
-        quantities: what it measures.
-        measure: does it; torque may be on when it returns or fails: who calls switches off. Raises
-            :class:`PartlyError` with the readings it has where it could not be made at some joints.
+    ``measure`` makes it, and notes what it measures (:meth:`Stand.note`). Torque may be on when it returns or fails: who calls
+    switches off. It raises :class:`PartlyError` where it could not be made at some joints.
     """
 
-    name: str
-    title: str
-    asks: str
-    moves: str
-    quantities: tuple[StandQuantity, ...]
+    name: str  #: for ``--tests``
+    title: str  #: what it shows, in a few words
+    asks: str  #: what the person has to do; empty = keep hands off
+    moves: str  #: what will move, for the question before the test
+    quantities: tuple[StandQuantity, ...]  #: what it measures
     measure: Measure
 
 
@@ -100,19 +72,10 @@ def stand_test(name: str, title: str, asks: str, moves: str, *quantities: StandQ
 
 
 def choose(names: Sequence[str]) -> list[StandTest]:
-    """Return the named tests in the order they are made; no name = all.
-
-    Raises:
-        InputError: an unknown name.
-    """
+    """Return the named tests in the order they are made; no name = all."""
     for name in names:
         check_name("test", name, TESTS)
     return [test for test in TESTS.values() if not names or test.name in names]
-
-
-def _each(quantity: str, places: Sequence[str], values: Iterable[float]) -> list[Reading]:
-    """Return a reading per place."""
-    return [Reading(quantity, place, float(value)) for place, value in zip(places, values, strict=True)]
 
 
 # ---- the line: adapters, and a servo that does not answer ----
@@ -125,6 +88,7 @@ _PING_BYTES, _BITS = 10 + 14, 10
 #: An id that no servo has.
 _GHOST = 250
 _TIMER = "Set the adapter's latency timer to 1 ms (docs/robot.md), use a port without a hub, end what loads the computer."
+_ANSWERS = "part of the servos named {} the silent one that answer, {} read"
 _CHAIN = "The emulator has this otherwise: report it. Reads that miss a servo cost another time than on the emulator."
 
 
@@ -137,25 +101,19 @@ _CHAIN = "The emulator has this otherwise: report it. Reads that miss a servo co
     StandQuantity("adapter_jitter", "s", "99 of 100 pings take at most so much longer than the median", 0.002, _TIMER),
     StandQuantity("lost_answers", "-", "part of the pings without an answer", 0.005, "Check cable, ground and termination."),
 )
-def _measure_latency(stand: Stand, person: Person) -> list[Reading]:
-    found = []
+def _measure_latency(stand: Stand, person: Person) -> None:
     for name, bus in stand.hardware.buses.items():
-        joint, group = bus.joints[0], stand.servos.groups[name]
-        lost = sum(group.statistics.missing.values())
-        times = []
+        missing = stand.servos.groups[name].statistics.missing
+        lost, times = sum(missing.values()), []
         for _ in range(_PINGS):
             start = stand.clock.now()
-            stand.servos.ping(joint)
+            stand.servos.ping(bus.joints[0])
             times.append(stand.clock.now() - start - _PING_BYTES * _BITS / bus.baud_rate)
         median, slow = np.percentile(times, [50, 99]).tolist()
         stand.samples[f"ping_{name}"] = times
-        lost = sum(group.statistics.missing.values()) - lost
-        found += [
-            Reading("adapter_latency", name, median),
-            Reading("adapter_jitter", name, slow - median),
-            Reading("lost_answers", name, lost / _PINGS),
-        ]
-    return found
+        stand.note("adapter_latency", name, median)
+        stand.note("adapter_jitter", name, slow - median)
+        stand.note("lost_answers", name, (sum(missing.values()) - lost) / _PINGS)
 
 
 @stand_test(
@@ -164,19 +122,12 @@ def _measure_latency(stand: Stand, person: Person) -> list[Reading]:
     "",
     "Nothing moves.",
     *(
-        StandQuantity(
-            f"answers_{place}_{kind}",
-            "-",
-            f"part of the servos named {place} the silent one that answer, {kind} read",
-            0.1,
-            _CHAIN,
-        )
+        StandQuantity(f"answers_{place}_{kind}", "-", _ANSWERS.format(place, kind), 0.1, _CHAIN)
         for kind in ("ordinary", "fast")
         for place in ("before", "behind")
     ),
 )
-def _measure_silent_servo(stand: Stand, person: Person) -> list[Reading]:
-    found = []
+def _measure_silent_servo(stand: Stand, person: Person) -> None:
     for name, group in stand.servos.groups.items():
         first, *others = group.servos
         if not others:  # nobody is behind or before the silent one
@@ -190,10 +141,9 @@ def _measure_silent_servo(stand: Stand, person: Person) -> list[Reading]:
             asked.ask_all(block)
             answered = asked.answers()
             stand.samples[f"{kind}_read_{name}"] = [stand.clock.now() - start]
-            found.append(Reading(f"answers_behind_{kind}", name, sum(id in answered for id in others) / len(others)))
-            found.append(Reading(f"answers_before_{kind}", name, float(first in answered)))
+            stand.note(f"answers_behind_{kind}", name, sum(id in answered for id in others) / len(others))
+            stand.note(f"answers_before_{kind}", name, first in answered)
         stand.servos.read()  # the line is quiet again
-    return found
 
 
 # ---- moved by hand, motors off: signs, zeros, the IMU's axes ----
@@ -219,14 +169,12 @@ _MOUNTING = "Run wlr calibrate imu --mounting (and --poses 6 for the scale); imu
     StandQuantity("joint_sign", "-", "1: the joint turns the way the hardware file says", 0.1, _CALIBRATE),
     StandQuantity("joint_zero", "rad", "reading of a leg that is held straight down, less pi/2", 0.04, _CALIBRATE),
 )
-def _measure_joints(stand: Stand, person: Person) -> list[Reading]:
-    found = []
+def _measure_joints(stand: Stand, person: Person) -> None:
     for joint in JOINTS:
-        found.append(Reading("joint_sign", joint, float(_sign(stand, person, joint) * stand.hardware.joints[joint].sign)))
+        stand.note("joint_sign", joint, _sign(stand, person, joint) * stand.hardware.joints[joint].sign)
         if joint in LEGS:
             person.straighten(joint)
-            found.append(Reading("joint_zero", joint, float(stand.step().position[JOINTS.index(joint)] - math.pi / 2)))
-    return found
+            stand.note("joint_zero", joint, stand.step().position[JOINTS.index(joint)] - math.pi / 2)
 
 
 def _sign(stand: Stand, person: Person, joint: str) -> int:
@@ -242,12 +190,12 @@ def _sign(stand: Stand, person: Person, joint: str) -> int:
     raise TroubleError(reason)
 
 
-def _counts(stand: Stand) -> list[float]:
+def _counts(stand: Stand) -> list[int]:
     stand.step()
     counts = stand.servos.get_all("present_position")
-    if len(counts) < len(JOINTS):
-        raise TroubleError(f"no answer from {', '.join(joint for joint in JOINTS if joint not in counts)}")
-    return [float(counts[joint]) for joint in JOINTS]
+    if missing := [joint for joint in JOINTS if joint not in counts]:
+        raise TroubleError(f"no answer from {', '.join(missing)}")
+    return [counts[joint] for joint in JOINTS]
 
 
 @stand_test(
@@ -268,40 +216,31 @@ def _counts(stand: Stand) -> list[float]:
         for name in ("roll", "pitch")
     ),
 )
-def _measure_imu(stand: Stand, person: Person) -> list[Reading]:
+def _measure_imu(stand: Stand, person: Person) -> None:
     level = _at_rest(stand)
-    found = [
-        Reading("gravity", "imu", float(np.linalg.norm(level))),
-        Reading("level_tilt", "imu", math.acos(min(1.0, float(level[2] / np.linalg.norm(level))))),
-    ]
+    stand.note("gravity", "imu", np.linalg.norm(level))
+    stand.note("level_tilt", "imu", math.acos(min(1.0, float(level[2] / np.linalg.norm(level)))))
     for k, name in enumerate(("roll", "pitch", "yaw")):
         person.tilt(_TILT_TIME, **{name: _TILT})
-        turned = _turned(stand)
+        rows = len(stand.run(_TILT_TIME))
+        turned = stand.imu_rows(rows)[0].mean(axis=0) * rows * PERIOD
         whole = float(np.linalg.norm(turned))
         if whole < _LEAST_TILT:
             raise TroubleError(f"{name}: the gyroscope saw {math.degrees(whole):.0f} deg only, expected 20: turn the body")
-        found.append(Reading(f"gyro_{name}", "imu", float(turned[k] / whole)))
+        stand.note(f"gyro_{name}", "imu", turned[k] / whole)
         if name != "yaw":
-            found.append(Reading(f"tilt_{name}", "imu", _tilt(name, _at_rest(stand), level) / whole))
+            stand.note(f"tilt_{name}", "imu", _tilt(name, _at_rest(stand), level) / whole)
         person.tilt(_TILT_TIME)
         stand.run(_TILT_TIME)
-    return found
 
 
-def _turned(stand: Stand) -> np.ndarray:
-    """Return by how much (3,) the body turned about its axes by the gyroscope, rad."""
-    rows = len(stand.run(_TILT_TIME))
-    gyro, _ = stand.imu_rows(rows)
-    return gyro.mean(axis=0) * rows * PERIOD
-
-
-def _at_rest(stand: Stand) -> np.ndarray:
+def _at_rest(stand: Stand) -> Array:
     """Return the accelerometer's mean (3,), m/s2."""
     stand.run(_REST_ROWS * PERIOD)
     return stand.imu_rows(_REST_ROWS)[1].mean(axis=0)
 
 
-def _tilt(name: str, force: np.ndarray, level: np.ndarray) -> float:
+def _tilt(name: str, force: Array, level: Array) -> float:
     """Return the roll or pitch (rad) since ``level`` that the accelerometer shows: right side down and nose down positive."""
     angles = [
         math.atan2(up[1], up[2]) if name == "roll" else math.atan2(-up[0], math.hypot(up[1], up[2])) for up in (force, level)
@@ -332,49 +271,39 @@ _GOAL = "The start-up order (setpoint first, then torque) is right for neither c
     StandQuantity("leg_follows_given", "-", "way over the way asked for before torque came on", 0.2, _LEG_WEAK + _GOAL),
     StandQuantity("leg_follows_kept", "-", "way over the way back to the setpoint from before torque went off", 0.2, _GOAL),
 )
-def _measure_torque_on(stand: Stand, person: Person) -> list[Reading]:
-    found = _wheels_torque_on(stand) + _legs_torque_on(stand)
-    person.turn(LEGS[0], -_LEAN)
-    start = stand.step().position[0]
-    try:
-        stand.switch_on(LEGS[:1])
-    except TroubleError as error:  # turned too far: only this value is missing
-        raise PartlyError(str(error), found) from None
-    end = stand.run(_LEAN_TIME)[-1].position[0]
-    stand.switch_off(LEGS[:1])
-    return [*found, Reading("leg_follows_kept", LEGS[0], float((end - start) / _LEAN))]
-
-
-def _wheels_torque_on(stand: Stand) -> list[Reading]:
+def _measure_torque_on(stand: Stand, person: Person) -> None:
     stand.prepare(WHEELS)
     stand.spin(dict.fromkeys(WHEELS, _SLOW))
     stand.switch_on(WHEELS)
-    given = _speed(stand)
+    stand.note("wheel_follows_given", WHEELS, _even_speed(stand) / _SLOW)
     stand.switch_off(WHEELS)
     stand.run(0.4)
     stand.switch_on(WHEELS)
-    kept = _speed(stand)
+    stand.note("wheel_follows_kept", WHEELS, _even_speed(stand) / _SLOW)
     stand.switch_off(WHEELS)
-    return _each("wheel_follows_given", WHEELS, given / _SLOW) + _each("wheel_follows_kept", WHEELS, kept / _SLOW)
+    stand.prepare(LEGS)
+    for leg in LEGS:
+        stand.note("leg_follows_given", leg, _way(stand, leg, _LEAN) / _LEAN)
+    person.turn(LEGS[0], -_LEAN)
+    stand.note("leg_follows_kept", LEGS[0], _way(stand, LEGS[0]) / _LEAN)
 
 
-def _speed(stand: Stand) -> np.ndarray:
+def _way(stand: Stand, leg: str, asked: float = 0.0) -> float:
+    """Return by how much (rad) a leg moves when its torque comes on; 0 = nothing is asked for, an old setpoint counts."""
+    k = JOINTS.index(leg)
+    start = stand.step().position[k]
+    if asked:
+        stand.lean(leg, asked)
+    stand.switch_on([leg])
+    end = stand.run(_LEAN_TIME)[-1].position[k]
+    stand.switch_off([leg])
+    return float(end - start)
+
+
+def _even_speed(stand: Stand) -> Array:
     """Return the wheels' mean speed (4,) once they turn evenly, rad/s."""
     stand.run(_STEADY)
     return np.mean([readings.velocity[WHEEL_SLICE] for readings in stand.run(0.2)], axis=0)
-
-
-def _legs_torque_on(stand: Stand) -> list[Reading]:
-    found = []
-    stand.prepare(LEGS)
-    for k, leg in enumerate(LEGS):
-        start = stand.step().position[k]
-        stand.lean(leg, _LEAN)
-        stand.switch_on([leg])
-        end = stand.run(_LEAN_TIME)[-1].position[k]
-        stand.switch_off([leg])
-        found.append(Reading("leg_follows_given", leg, float((end - start) / _LEAN)))
-    return found
 
 
 @stand_test(
@@ -390,23 +319,21 @@ def _legs_torque_on(stand: Stand) -> list[Reading]:
     StandQuantity("watchdog_holds_torque", "-", "1: torque stays on", 0.1, "The emulator has this otherwise: report it."),
     StandQuantity("watchdog_refuses", "-", "1: setpoints are refused until it is cleared", 0.1, _STOP),
 )
-def _measure_watchdog(stand: Stand, person: Person) -> list[Reading]:
+def _measure_watchdog(stand: Stand, person: Person) -> None:
     stand.prepare(JOINTS)
     stand.switch_on(JOINTS)
     stand.spin(dict.fromkeys(WHEELS, _SPEED))
     before = stand.run(_STEADY)[-1]
-    speed = np.mean([readings.velocity for readings in stand.run(0.2)], axis=0)[WHEEL_SLICE]
+    speed = np.mean([readings.velocity[WHEEL_SLICE] for readings in stand.run(0.2)], axis=0)
     if (np.abs(speed) < 0.5 * _SPEED).any():
         raise TroubleError(f"wheels turn at {np.round(speed, 2).tolist()} rad/s, asked for {_SPEED:g}")
     last = stand.fall_silent(_SILENCE)
     after = stand.step()
-    rolled = (after.position - last.position)[WHEEL_SLICE]
-    found = _each("watchdog_stop_time", WHEELS, rolled / speed)
-    found += _each("watchdog_leg_move", LEGS, np.abs(after.position - before.position)[LEG_SLICE])
-    for joint in JOINTS:
-        found.append(Reading("watchdog_latched", joint, float(stand.servos.get(joint, "bus_watchdog") < 0)))
-        found.append(Reading("watchdog_holds_torque", joint, float(stand.servos.get(joint, "torque_enable"))))
-    return found + _each("watchdog_refuses", WHEELS, [_refuses(stand, wheel) for wheel in WHEELS])
+    stand.note("watchdog_stop_time", WHEELS, (after.position - last.position)[WHEEL_SLICE] / speed)
+    stand.note("watchdog_leg_move", LEGS, np.abs(after.position - before.position)[LEG_SLICE])
+    stand.note("watchdog_latched", JOINTS, [stand.servos.get(joint, "bus_watchdog") < 0 for joint in JOINTS])
+    stand.note("watchdog_holds_torque", JOINTS, [stand.servos.get(joint, "torque_enable") for joint in JOINTS])
+    stand.note("watchdog_refuses", WHEELS, [_refuses(stand, wheel) for wheel in WHEELS])
 
 
 def _refuses(stand: Stand, wheel: str) -> bool:
@@ -448,7 +375,7 @@ _STALL = "Its motor is weaker or stronger than the file's: check supply and plug
     StandQuantity("integral_cycle", "s", "control cycle that this means, by the robot file's gains", 0.0, _LOOP, 0.1),
     StandQuantity("velocity_error", "-", "part of the speed that is missing in the end", 0.03, _LOOP),
 )
-def _measure_velocity_step(stand: Stand, person: Person) -> list[Reading]:
+def _measure_velocity_step(stand: Stand, person: Person) -> None:
     stand.prepare(WHEELS)
     stand.switch_on(WHEELS)
     stand.run(0.2)
@@ -460,18 +387,18 @@ def _measure_velocity_step(stand: Stand, person: Person) -> list[Reading]:
         speeds.append(readings.velocity[WHEEL_SLICE])
         # when the servo took it: where an answer is waited for in vain, the others have been there for long
         times.append(stand.clock.now() - start - readings.age[WHEEL_SLICE])
-    found = []
+    # Motor and rotor settle at once, so that speed, proportional and integral term balance: time = (K + kd) / kp, with K of the
+    # torque-speed line. The robot file's kp holds for a cycle of 1 ms.
+    servo = stand.robot.servo
+    line = servo.supply_voltage / servo.wheel.no_load_speed
     for wheel, moments, speed in zip(WHEELS, np.array(times).T, np.array(speeds).T, strict=True):
         time = _time_constant(wheel, moments, speed)
-        found += [
-            Reading("velocity_loop_time", wheel, time),
-            Reading("integral_cycle", wheel, _integral_cycle(stand, time)),
-            Reading("velocity_error", wheel, float(1.0 - speed[-_ROWS:].mean() / _STEP)),
-        ]
-    return found
+        stand.note("velocity_loop_time", wheel, time)
+        stand.note("integral_cycle", wheel, 1e-3 * time * servo.wheel.kp / (line + servo.wheel.kd))
+        stand.note("velocity_error", wheel, 1.0 - speed[-_ROWS:].mean() / _STEP)
 
 
-def _time_constant(wheel: str, times: NDArray[np.float64], speed: NDArray[np.float64]) -> float:
+def _time_constant(wheel: str, times: Array, speed: Array) -> float:
     """Return the time constant (s) of the error's decay, fitted on the wheel's way; times of lost answers are NaN."""
     part = speed / _STEP
     late = np.flatnonzero(part > _FITTED[1])
@@ -480,17 +407,6 @@ def _time_constant(wheel: str, times: NDArray[np.float64], speed: NDArray[np.flo
     if way.sum() < 3:
         raise TroubleError(f"{wheel}: {way.sum()} rows on the way to {_STEP:g} rad/s, expected 3 or more: it does not follow")
     return float(-1.0 / np.polyfit(times[way], np.log(1.0 - part[way]), 1)[0])
-
-
-def _integral_cycle(stand: Stand, time: float) -> float:
-    """Return the servo's control cycle (s) that a time constant means.
-
-    Motor and rotor settle at once, so that speed, proportional and integral term balance: time = (K + kd) / kp, with K of the
-    torque-speed line. The robot file's kp holds for a cycle of 1 ms.
-    """
-    servo = stand.robot.servo
-    line = servo.supply_voltage / servo.wheel.no_load_speed
-    return 1e-3 * time * servo.wheel.kp / (line + servo.wheel.kd)
 
 
 @stand_test(
@@ -506,7 +422,7 @@ def _integral_cycle(stand: Stand, time: float) -> float:
         "running_load", "-", "load of the free wheel, or of the leg on its way, part of stall torque", 0.01, _FRICTION
     ),
 )
-def _measure_load(stand: Stand, person: Person) -> list[Reading]:
+def _measure_load(stand: Stand, person: Person) -> None:
     stand.prepare(WHEELS)
     stand.switch_on(WHEELS)
     loads, pwms = np.empty((2, len(_SPEEDS), len(WHEELS)))
@@ -519,14 +435,16 @@ def _measure_load(stand: Stand, person: Person) -> list[Reading]:
             values = readings.velocity, stand.load(readings.effort), stand.pwm()
             seen.append([value[WHEEL_SLICE] for value in values])
         reached, loads[row], pwms[row] = np.nanmean(np.array(seen), axis=0)
-        _require_speed(speed, reached)
-    found = []
+        is_off = np.abs(reached - speed) > _OFF_SPEED * speed  # what it loads then says nothing
+        if off := ", ".join(f"{WHEELS[k]} turns at {reached[k]:.2f}" for k in np.flatnonzero(is_off)):
+            raise TroubleError(f"{off} rad/s after {_EVEN:g} s, expected {speed:g} within {_OFF_SPEED:.0%}: {_WEAK}")
     for k, wheel in enumerate(WHEELS):
         stand.samples |= {f"load_{wheel}": loads[:, k].tolist(), f"pwm_{wheel}": pwms[:, k].tolist()}
-        slope = float(np.polyfit(pwms[:, k], loads[:, k], 1)[0])
-        found += [Reading("load_per_pwm", wheel, slope), Reading("running_load", wheel, float(loads[:, k].mean()))]
+        stand.note("load_per_pwm", wheel, np.polyfit(pwms[:, k], loads[:, k], 1)[0])
+        stand.note("running_load", wheel, loads[:, k].mean())
     stand.switch_off(WHEELS)  # before legs are prepared: on a slow line that takes longer than the watchdogs wait
-    return found + [Reading("running_load", leg, _leg_load(stand, leg)) for leg in LEGS]
+    for leg in LEGS:
+        stand.note("running_load", leg, _leg_load(stand, leg))
 
 
 def _leg_load(stand: Stand, leg: str) -> float:
@@ -546,14 +464,6 @@ def _leg_load(stand: Stand, leg: str) -> float:
     return float(np.mean(loads))
 
 
-def _require_speed(asked: float, reached: NDArray[np.float64]) -> None:
-    """Raise :class:`TroubleError` where wheels are not at their speed: what they load then says nothing."""
-    off = [(wheel, speed) for wheel, speed in zip(WHEELS, reached, strict=True) if abs(speed - asked) > _OFF_SPEED * asked]
-    if off:
-        slow = [f"{wheel} turns at {speed:.2f}" for wheel, speed in off]
-        raise TroubleError(f"{', '.join(slow)} rad/s after {_EVEN:g} s, expected {asked:g} within {_OFF_SPEED:.0%}: {_WEAK}")
-
-
 @stand_test(
     "stall",
     "Stall of held wheels and legs",
@@ -563,36 +473,23 @@ def _require_speed(asked: float, reached: NDArray[np.float64]) -> None:
     StandQuantity("stall_load", "-", "load of the held joint over PWM and supply", 0.05, _STALL, 0.1),
     StandQuantity("stall_current", "A", "current at full voltage, from the supply's display", 0.1, _STALL, 0.25),
 )
-def _measure_stall(stand: Stand, person: Person) -> list[Reading]:
-    found: list[Reading] = []
+def _measure_stall(stand: Stand, person: Person) -> None:
     slipped = []
     for joint in (*WHEELS, *LEGS):
         try:
-            found += _stall(stand, person, joint)
+            try:
+                _pull(stand, person, joint)
+            except SlippedError as error:  # once
+                _pull(stand, person, joint, f"{error}. Once more. ")
         except SlippedError as error:
             slipped.append(str(error))
         person.release(joint)
     if slipped:
-        raise PartlyError(f"not measured: {'; '.join(slipped)}", found)
-    return found
+        raise PartlyError(f"not measured: {'; '.join(slipped)}")
 
 
-def _stall(stand: Stand, person: Person, joint: str) -> list[Reading]:
-    """Return what a held joint shows; a person may let it slip once."""
-    try:
-        found, share = _pull(stand, person, joint)
-    except SlippedError as error:
-        found, share = _pull(stand, person, joint, f"{error}. Once more. ")
-    current = person.supply_current() if joint in WHEELS else None  # legs measure theirs: it is their load
-    return found if current is None else [*found, Reading("stall_current", joint, current / share)]
-
-
-def _pull(stand: Stand, person: Person, joint: str, trouble: str = "") -> tuple[list[Reading], float]:
-    """Return the readings of a joint that a person holds, and what part of the stall current the supply gives meanwhile.
-
-    Raises:
-        SlippedError: it gave way.
-    """
+def _pull(stand: Stand, person: Person, joint: str, trouble: str = "") -> None:
+    """Measure a joint that a person holds; :class:`SlippedError` where it gives way."""
     k = JOINTS.index(joint)
     person.brake(joint, trouble)
     stand.prepare([joint])  # now: a hand may have moved it
@@ -612,6 +509,8 @@ def _pull(stand: Stand, person: Person, joint: str, trouble: str = "") -> tuple[
     speed, way = float(np.mean([readings.velocity[k] for readings in rows])), rows[-1].position[k] - start
     if abs(speed) > _HELD_SPEED or (joint in LEGS and abs(way) > _HELD_WAY):
         raise SlippedError(f"{joint} turned by {way:.2f} rad, in the end at {speed:.2f} rad/s: hold it firmly")
-    load = float(np.mean([stand.load(readings.effort)[k] for readings in rows]))
-    found = [Reading("stall_pwm", joint, pwm / asked), Reading("stall_load", joint, load / (pwm * supply))]
-    return found, pwm * pwm * supply
+    stand.note("stall_pwm", joint, pwm / asked)
+    stand.note("stall_load", joint, np.mean([stand.load(readings.effort)[k] for readings in rows]) / (pwm * supply))
+    # a wheel draws this part of its stall current; a leg measures its own: it is its load
+    if joint in WHEELS and (current := person.supply_current()) is not None:
+        stand.note("stall_current", joint, current / (pwm * pwm * supply))

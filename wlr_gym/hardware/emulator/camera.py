@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, CameraFile, CameraReading, StampClock, reading_of
+from wlr_gym.hardware.camera.process import FrameReader
+from wlr_gym.hardware.camera.reading import CAMERA_FAULTS, CameraFile, CameraReading
 from wlr_gym.hardware.camera.rendered import Exposure, PoseFeed, RenderedCamera, RobotPose
 from wlr_gym.hardware.emulator.machine import Machine
-from wlr_gym.perception.vision.tracking import PoseFinder, VideoFrame
 from wlr_gym.robot import LEG_SLICE
 
 #: s between two poses in the feed of an emulated robot in real time.
@@ -39,8 +39,7 @@ class EmulatedCamera:
     def __init__(self, machine: Machine, file: CameraFile) -> None:
         self.machine, self.file = machine, file
         self._camera = RenderedCamera(file, machine.robot, lambda kind: camera_fault(machine, kind))
-        self._finder = PoseFinder(file.calibration, file.body, file.floor)
-        self._clock = StampClock(file.delay)
+        self._reader = FrameReader(file)
         self._poses: deque[RobotPose] = deque(maxlen=max(2, round(_REMEMBERED / machine.options.tick)))
         self._due: deque[tuple[Exposure, list[RobotPose]]] = deque()
         self._number = 0
@@ -75,9 +74,7 @@ class EmulatedCamera:
             exposure, poses = self._due.popleft()
             if not (exposure.is_lost or self._is_dead):
                 image = self._camera.picture(exposure, poses)
-                moment = self._clock.time(exposure.stamp, exposure.arrival)
-                sample = self._finder(VideoFrame(exposure.number, moment, image))
-                reading = reading_of(sample, exposure.number, exposure.arrival, exposure.arrival)
+                reading = self._reader.read(exposure.number, image, exposure.stamp, exposure.arrival, exposure.arrival)
         return reading
 
     def _at(self, time: float) -> RobotPose:

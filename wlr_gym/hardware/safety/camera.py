@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from wlr_gym.hardware.camera.reading import CameraReading
 from wlr_gym.hardware.safety.rules import CameraStatus
 from wlr_gym.hardware.timing import percentiles
-from wlr_gym.perception.vision.tracking import MEANINGS
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE, Robot
 
 Array = NDArray[np.float64]
@@ -55,7 +54,7 @@ _LEAST_TURNS = 2.0
 #: s, 1 sigma, from which on the lag is allowed for, and what is the most of it.
 _LAG_SIGMA, _LARGEST_LAG = 0.004, 0.15
 
-# Reasons of its own; the others are those of MEANINGS.
+# Reasons of its own; the others are those of the readings.
 STALLED = "no frame comes"
 TOO_OLD = "the frame is too old"
 FUTURE = "the time stamp is ahead of time"
@@ -80,6 +79,11 @@ class _Seen(NamedTuple):
     rate: float
 
 
+#: What is known of the robot's own motion at a control step: time (s); dead reckoning (m, rad); turn (rad) and way along (m)
+#: that the sensors counted, the latter at least and at most; the body's height (m); slowest and fastest wheel (m/s).
+_MOTION = ("time", "x", "y", "yaw", "turn", "least", "most", "height", "slowest", "fastest")
+
+
 class CameraWatch:
     """Judges the camera's readings, control step by control step, and shows poses in the frame of the run.
 
@@ -101,9 +105,7 @@ class CameraWatch:
         self.reasons: Counter[str] = Counter()
         self.latencies: list[float] = []
         self.work: list[float] = []
-        self._motion: deque[tuple[float, ...]] = deque()  # time, x, y, yaw (dead reckoning), turn, least, most, height
-        self._table: Array | None = None
-        self._speeds: deque[tuple[float, float, float]] = deque()
+        self._motion = np.zeros((0, len(_MOTION)))
         self._believed: deque[_Seen] = deque(maxlen=64)
         self._agreeing: deque[_Seen] = deque(maxlen=512)
         self._frame: tuple[float, float, float] | None = None  # turn and shift from the floor frame to the run's
@@ -123,9 +125,9 @@ class CameraWatch:
 
     def begin_run(self) -> None:
         """Let the present pose be zero."""
-        if not self._motion:
+        if not len(self._motion):
             return
-        self._began, self._before, self._frame = self._motion[-1][0], self.frames, None
+        self._began, self._before, self._frame = float(self._motion[-1, 0]), self.frames, None
         self._correct(self._began, np.zeros(3))
         if self._believed:
             self._place(self._believed[-1])
@@ -143,71 +145,57 @@ class CameraWatch:
         self._move(now, *joints, gyro)
         if self._heard == -math.inf:
             self._heard = now
-        reason, is_new, is_wrong = self.status.reason, False, self.status.is_wrong
+        reason, is_wrong = self.status.reason, self.status.is_wrong
         if reading is not None:
             self._heard = now
             self.frames += 1
             self.work.append(reading.found - reading.arrival)
             reason = self._judge(reading, now)
-            is_new = not reason
+            if not reason:
+                pose, exposed = self._shown(reading.pose[[0, 1, 3]]), self._believed[-1].time
+                self._correct(exposed, pose)
+                self.poses += 1
+                self.latencies.append(now - exposed)
+                self.status = replace(self.status, pose=pose, time=exposed, is_new=True, reason="", is_wrong=False)
+                return self.status
+            self.reasons[reason] += 1
             is_wrong = reason in CONTRADICTIONS or (is_wrong and reason == SETTLING)
-            if reason:
-                self.reasons[reason] += 1
         elif trouble or now - self._heard > SILENCE:
             reason = trouble or STALLED
-        if is_new:
-            assert reading is not None
-            pose = self._shown(reading.pose[[0, 1, 3]])
-            exposed = self._believed[-1].time
-            self._correct(exposed, pose)
-            self.poses += 1
-            self.latencies.append(now - exposed)
-            self.status = replace(self.status, pose=pose, time=exposed, is_new=True, reason="", is_wrong=False)
-        else:
-            self.status = replace(self.status, is_new=False, reason=reason, is_wrong=is_wrong)
+        self.status = replace(self.status, is_new=False, reason=reason, is_wrong=is_wrong)
         return self.status
 
     # ---- the robot's own motion ----
 
     def _move(self, now: float, position: Array, velocity: Array, gyro: Array) -> None:
         """Go on by dead reckoning."""
-        self._table = None
         reach = self._leg * np.sin(position[LEG_SLICE])
-        height = float(reach.mean()) + self._radius - self._hip_height
         rolling = (
             self._radius * velocity[WHEEL_SLICE]
             + velocity[LEG_SLICE] * (reach + self._radius)
             + gyro[2] * self._side
             - gyro[1] * (self._hip_height - reach - self._radius)
         )
-        self._speeds.append((now, float(rolling.min()), float(rolling.max())))
-        while self._speeds[0][0] < now - _COAST:
-            self._speeds.popleft()
-        if not self._motion:
-            self._motion.append((now, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height))
-            return
-        last, x, y, yaw, turn, least, most, _ = self._motion[-1]
-        step = now - last
-        if step <= 0.0:
-            return
-        turned, ahead = float(gyro[2]) * step, float(np.median(rolling)) * step
-        x, y = x + math.cos(yaw + turned / 2) * ahead, y + math.sin(yaw + turned / 2) * ahead
-        least += min(0.0, *(speed[1] for speed in self._speeds)) * step
-        most += max(0.0, *(speed[2] for speed in self._speeds)) * step
-        self._motion.append((now, x, y, yaw + turned, turn + turned, least, most, height))
-        while self._motion[0][0] < now - MEMORY:
-            self._motion.popleft()
-
-    def _rows(self) -> Array:
-        """The motion as an array, made once until it changes."""
-        if self._table is None:
-            self._table = np.array(self._motion)
-        return self._table
+        row = np.zeros(len(_MOTION))
+        row[0], row[7] = now, float(reach.mean()) + self._radius - self._hip_height
+        slowest, fastest = float(rolling.min()), float(rolling.max())
+        row[8:] = slowest, fastest
+        if len(rows := self._motion):
+            last, x, y, yaw, turn, least, most = rows[-1, :7].tolist()
+            if (step := now - last) <= 0.0:
+                return
+            turned, ahead = float(gyro[2]) * step, float(np.median(rolling)) * step
+            recent = rows[rows[:, 0] >= now - _COAST]
+            least += min(0.0, slowest, *recent[:, 8].tolist()) * step
+            most += max(0.0, fastest, *recent[:, 9].tolist()) * step
+            middle = yaw + turned / 2
+            row[1:7] = x + math.cos(middle) * ahead, y + math.sin(middle) * ahead, yaw + turned, turn + turned, least, most
+        self._motion = np.vstack([rows[rows[:, 0] >= now - MEMORY], row])
 
     def _at(self, time: float) -> Array:
         """What was known at a time: x, y, yaw, turn, least, most, height."""
-        rows = self._rows()
-        return np.array([np.interp(time, rows[:, 0], column) for column in rows[:, 1:].T])
+        times, *columns = self._motion[:, :8].T
+        return np.array([np.interp(time, times, column) for column in columns])
 
     # ---- judging ----
 
@@ -219,8 +207,8 @@ class CameraWatch:
             return TOO_OLD
         if reading.time <= self._last_time:
             return BACKWARD
-        if not reading.has_pose:
-            return MEANINGS.get(reading.status, reading.status)
+        if reading.reason:
+            return reading.reason
         sigma = np.sqrt(np.diag(reading.covariance))
         if max(sigma[0], sigma[1]) > LARGEST_SIGMA[0] or sigma[3] > LARGEST_SIGMA[1]:
             return UNCERTAIN
@@ -294,27 +282,19 @@ class CameraWatch:
             return np.zeros(3)
         turn, x, y = self._frame
         cosine, sine = math.cos(turn), math.sin(turn)
-        around = self._motion[-1][3]
+        around = float(self._motion[-1, 3])
         yaw = around + math.remainder(pose[2] + turn - around, 2 * math.pi)
         return np.array([x + cosine * pose[0] - sine * pose[1], y + sine * pose[0] + cosine * pose[1], yaw])
 
     def _correct(self, time: float, pose: Array) -> None:
         """Let dead reckoning have had this pose (3,) at a time, and go on from there."""
-        known = self._at(time).tolist()
-        x0, y0, yaw0 = pose.tolist()
-        turn = yaw0 - known[2]
+        x, y, yaw = self._at(time)[:3].tolist()
+        turn = pose[2] - yaw
         cosine, sine = math.cos(turn), math.sin(turn)
-        self._table = None
-        self._motion = deque(
-            (
-                t,
-                x0 + cosine * (x - known[0]) - sine * (y - known[1]),
-                y0 + sine * (x - known[0]) + cosine * (y - known[1]),
-                yaw + turn,
-                *rest,
-            )
-            for t, x, y, yaw, *rest in self._motion
-        )
+        rows = self._motion
+        dx, dy = rows[:, 1] - x, rows[:, 2] - y
+        rows[:, 1], rows[:, 2] = pose[0] + cosine * dx - sine * dy, pose[1] + sine * dx + cosine * dy
+        rows[:, 3] += turn
 
     # ---- the lag of the pictures ----
 
@@ -333,7 +313,7 @@ class CameraWatch:
 
     def _rate(self, time: float) -> float:
         """Yaw rate (rad/s) of the gyroscope at a time."""
-        rows = self._rows()
+        rows = self._motion
         if len(rows) < 2:
             return 0.0
         k = min(max(1, int(np.searchsorted(rows[:, 0], time))), len(rows) - 1)

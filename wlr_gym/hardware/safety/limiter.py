@@ -43,14 +43,28 @@ def watchdog_count(seconds: float) -> int:
     return math.ceil(seconds / WATCHDOG_UNIT - 1e-9)
 
 
+def switch_off(servos: Servos, clock: Clock, seconds: float) -> list[str]:
+    """Switch every motor off, and go on trying for so long; return the joints that did not confirm it.
+
+    All buses at once and unconfirmed first, so that a dead one does not delay the others; then each servo until it has
+    confirmed. A port that is gone is opened again when it is back.
+    """
+    for _ in range(2):
+        servos.torque_off_unacknowledged()
+    end = clock.now() + seconds
+    left: list[str] = list(JOINTS)
+    while (left := servos.torque_off(1, left)) and clock.now() < end:
+        clock.wait_until(clock.now() + _OFF_PAUSE)
+        servos.reopen_gone()
+    return left
+
+
 class CommandLimiter:
     """Decides, limits and writes what the servos are sent.
 
     Args:
-        servos: taken over; nobody else may keep them.
-        robot, hardware: limits and registers.
-        clock: of the run.
-        period: s of a control step.
+        servos: taken over; nobody else may keep them. robot, hardware: limits and registers.
+        clock: of the run. period: s of a control step.
         dry_run: decide, but write nothing.
         profile: of the servos; all 0 = step references.
 
@@ -58,6 +72,7 @@ class CommandLimiter:
         interventions: rule -> control steps in which it changed or stopped something.
         setpoints: (8,) last setpoints. torque_on: (8,) motors that are on.
         ratings: of the motors, with the limits of the servos' registers.
+        armed: torque may be on.
         is_calm: legs may move no faster than on the way to the start pose, whatever is asked for.
     """
 
@@ -81,8 +96,7 @@ class CommandLimiter:
         self._clock = clock
         self.ratings = rules.ratings_of(robot, period)
         self._memory = Memory()
-        self._armed = False
-        self.is_calm = False
+        self.armed = self.is_calm = False
         speed = min(self.limits.leg_speed, CALM_SPEED * self.limits.start_speed)
         self._calm_limits = self.limits.model_copy(update={"leg_speed": speed})
 
@@ -105,36 +119,26 @@ class CommandLimiter:
         """Return all preflight checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
         self.__servos.unsupervise()  # a servo that had no power meanwhile has lost its indirect addresses
         self.__servos.set_patience(max(CALM_PATIENCE, self.limits.patience))
-        found = self._examine()
-        wrong = [check for check in found if not check.ok and check.is_fatal]
-        if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
-            preflight.mend(self.__servos, wrong)
-            found = self._examine()
+        found: list[Check] = []
+        for is_mended in (False, True):
+            found = preflight.check_servos(self.__servos, self.robot, self.hardware)
             wrong = [check for check in found if not check.ok and check.is_fatal]
-        if not wrong:
-            self.__servos.set_patience(self.limits.patience)
-            found.append(preflight.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
+            if not wrong:
+                self.__servos.set_patience(self.limits.patience)
+                found.append(preflight.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
+            if not wrong or is_mended or self.dry_run or any(check.what != "watchdog" for check in wrong):
+                break
+            preflight.mend(self.__servos, wrong)
         return found
-
-    def _examine(self) -> list[Check]:
-        return preflight.check_servos(self.__servos, self.robot, self.hardware)
 
     # ---- life ----
 
-    @property
-    def armed(self) -> bool:
-        """Whether torque may be on."""
-        return self._armed
-
     def prepare(self) -> None:
-        """Set the registers that a run depends on, with torque off.
-
-        Raises:
-            NoAnswerError, RefusedError, BusGoneError: a servo did not take it.
-        """
+        """Set the registers that a run depends on, with torque off."""
         self._memory = Memory()
         self.__servos.set_patience(max(CALM_PATIENCE, self.limits.patience))
-        self.ratings = rules.ratings_of(self.robot, self.ratings.period, *self._register_limits())
+        low, high = self._register_limits()
+        self.ratings = rules.ratings_of(self.robot, self.ratings.period, low=low, high=high)
         if not self.dry_run:
             goal_pwm = self._prepare()
             self.ratings = replace(
@@ -155,7 +159,7 @@ class CommandLimiter:
         """
         position = self._positions()
         self._check_legs(position)
-        self._armed = True
+        self.armed = True
         self.setpoints = rules.resting(position)
         self.torque_on[:] = True
         if self.dry_run:
@@ -228,8 +232,7 @@ class CommandLimiter:
         ends = np.zeros((2, len(JOINTS)))
         for k, joint in enumerate(JOINTS):
             if joint in WHEELS:
-                ends[:, k] = get(joint, "velocity_limit")
-                ends[0, k] *= -1
+                ends[:, k] = np.array([-1.0, 1.0]) * get(joint, "velocity_limit")
             else:
                 ends[:, k] = get(joint, "min_position_limit"), get(joint, "max_position_limit")
         values = np.where(
@@ -254,7 +257,7 @@ class CommandLimiter:
             BusGoneError, NoAnswerError, RefusedError: a servo did not take it.
             InputError: it is not armed.
         """
-        if not self._armed:
+        if not self.armed:
             raise InputError("the command limiter is not armed: nothing is written")
         limits = self._calm_limits if self.is_calm else self.limits
         decision = rules.decide(limits, self.ratings, status, self._memory, self.setpoints, wanted, torque_on)
@@ -265,34 +268,22 @@ class CommandLimiter:
         self.setpoints = decision.setpoints
         if not self.dry_run:
             self.__servos.write_setpoints(self._within_registers(decision.setpoints))
-            for k in np.flatnonzero(
-                decision.torque_on != self.torque_on
-            ):  # setpoints, just written, ask for what they are to do
+            changed = decision.torque_on != self.torque_on
+            for k in np.flatnonzero(changed):  # setpoints, just written, ask for what they are to do
                 self.__servos.set(JOINTS[k], "torque_enable", int(decision.torque_on[k]))
         self.torque_on = decision.torque_on.copy()
         return decision
 
     def off(self) -> list[str]:
-        """Switch every motor off, whatever happened before; return the joints that did not confirm it.
-
-        All buses at once and unconfirmed first, so that a dead one does not delay the others; then each servo until it has
-        confirmed. A port that is gone is opened again when it is back.
-        """
+        """Switch every motor off, whatever happened before; return the joints that did not confirm it."""
         self.torque_on[:] = False
         if self.dry_run:
-            self._armed = False
+            self.armed = False
             return []
-        servos = self.__servos
-        servos.unsupervise()
-        for _ in range(2):
-            servos.torque_off_unacknowledged()
-        end = self._clock.now() + self.limits.off_time
-        left: list[str] = list(JOINTS)
-        while (left := servos.torque_off(1, left)) and self._clock.now() < end:
-            self._clock.wait_until(self._clock.now() + _OFF_PAUSE)
-            servos.reopen_gone()
+        self.__servos.unsupervise()
+        left = switch_off(self.__servos, self._clock, self.limits.off_time)
         with contextlib.suppress(ConnectionError):
             # it stays armed where a motor may still be on
-            servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
-        self._armed = False  # not before: an interrupted attempt is made again
+            self.__servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
+        self.armed = False  # not before: an interrupted attempt is made again
         return left

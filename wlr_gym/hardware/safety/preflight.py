@@ -12,6 +12,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.hardware.calibration import ACCEL_REST, GYRO_REST, motion
-from wlr_gym.hardware.camera.reading import CameraFile, CameraReader, CameraReading
+from wlr_gym.hardware.camera.reading import CameraFile, CameraReader
 from wlr_gym.hardware.config import FIXED_REGISTERS, Bus, FlowPort, Hardware, ImuPort
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import error_names, load_table
@@ -29,8 +30,7 @@ from wlr_gym.hardware.imu import STANDARD_GRAVITY, Imu, ImuGoneError
 from wlr_gym.hardware.safety.camera import LARGEST_AGE, LARGEST_SIGMA
 from wlr_gym.hardware.serial_frames import PortInUseError, is_pseudo_terminal
 from wlr_gym.hardware.servos import JointMap, Servos
-from wlr_gym.hardware.timing import Clock, processor_share
-from wlr_gym.perception.vision.tracking import MEANINGS, NO_FLOOR
+from wlr_gym.hardware.timing import Clock
 from wlr_gym.robot import JOINTS, LEGS, Robot
 
 #: Oldest firmware that is driven.
@@ -41,8 +41,6 @@ FAST_READ_FIRMWARE = 45
 WARM = 60
 #: Reads before the timed ones: the bus finds out whether its servos know fast reads.
 _UNTIMED_READS = 5
-#: Share of a processor below which the computer is busy with other programs.
-_OWN_SHARE = 0.9
 #: How an emulated robot does without real time.
 STEPPED = "end other programs, or drive it in emulated time, where nothing is late: wlr deploy --emulated --stepped"
 #: s a sensor is looked at; and between two readings of the IMU, and of the flow sensor.
@@ -61,14 +59,6 @@ LARGEST_LENGTH_ERROR = 0.05
 _CAMERA_TIME, _CAMERA_PERIOD = 1.5, 0.005
 #: Part of the frames asked for that must come, and of those with a floor that must show the robot.
 _LEAST_RATE, _LEAST_POSES = 0.8, 0.8
-_CAMERA_REMEDIES = {
-    "rate": "Lower the resolution or the exposure time, or write the rate that comes into the camera's file (rate).",
-    "shutter": "Calibrate from a video of a moving board, or write its readout (s; 0 = global shutter) into that file.",
-    "floor": "Are all floor markers in the picture, flat, lit, and where the floor's file says?",
-    "robot": "Is the robot in the picture, its plate on, and its markers as the body's file says?",
-    "age": "Use USB 3, fewer pixels, a shorter exposure; find out who else uses the computer.",
-    "accuracy": "Bring the camera nearer, use more pixels, focus it, or print larger markers.",
-}
 #: Item of the EEPROM -> what another count does. Only items that some model has are looked at.
 MEANING = {
     "return_delay_time": "each answer waits so long",
@@ -109,26 +99,16 @@ class NotReadyError(RuntimeError):
 
 
 class Check(NamedTuple):
-    """One thing that was looked at.
+    """One thing that was looked at."""
 
-    Attributes:
-        where: joint, bus, or ``robot``.
-        what: name of the check.
-        ok: as it should be.
-        found, expected: in words.
-        remedy: what to do about it.
-        is_fatal: nothing may move while it is not ok; else a warning.
-        fix: item and count to write (torque off) that would mend it; None = by hand.
-    """
-
-    where: str
-    what: str
-    ok: bool
+    where: str  #: joint, bus, or ``robot``
+    what: str  #: name of the check
+    ok: bool  #: as it should be
     found: str
     expected: str
-    remedy: str
-    is_fatal: bool = True
-    fix: tuple[str, int] | None = None
+    remedy: str  #: what to do about it
+    is_fatal: bool = True  #: nothing may move while it is not ok; else a warning
+    fix: tuple[str, int] | None = None  #: item and count to write (torque off) that would mend it; None = by hand
 
     def __str__(self) -> str:
         state = "ok" if self.ok else "FAULT" if self.is_fatal else "warning"
@@ -169,31 +149,19 @@ def require_ports(hardware: Hardware) -> None:
             raise InputError(f"{name} port {path}: not there. {_plug_in(name)}")
 
 
-def _plug_in(name: str) -> str:
-    return f"Plug the adapter in, or name its port with --port {name}=PATH; {_ports_here()}."
-
-
-def _ports_here(devices: Path = Path("/dev")) -> str:
-    """Serial ports of this computer, those with stable names first."""
-    named = sorted((devices / "serial" / "by-id").glob("*")) if (devices / "serial" / "by-id").is_dir() else []
-    found = named or sorted([*devices.glob("ttyUSB*"), *devices.glob("ttyACM*")])
-    return f"here are {', '.join(map(str, found))}" if found else "no USB serial port is here now"
+def _plug_in(name: str, devices: Path = Path("/dev")) -> str:
+    """What to do about a port that is not there, with the serial ports of this computer, those with stable names first."""
+    named = sorted((devices / "serial" / "by-id").glob("*"))
+    found = ", ".join(map(str, named or sorted([*devices.glob("ttyUSB*"), *devices.glob("ttyACM*")])))
+    here = f"here are {found}" if found else "no USB serial port is here now"
+    return f"Plug the adapter in, or name its port with --port {name}=PATH; {here}."
 
 
 # ---- servos ----
 
 
 def check_servos(servos: Servos, robot: Robot, hardware: Hardware, joints: Sequence[str] = JOINTS) -> list[Check]:
-    """Look at every servo and return all checks, good and bad, in joint order.
-
-    Args:
-        servos: with the ports of ``joints`` open.
-        robot, hardware: what they should be.
-        joints: which to look at.
-
-    Raises:
-        BusGoneError: a port is gone.
-    """
+    """Look at the servos of some joints, whose ports are open, and return all checks, good and bad, in joint order."""
     return [check for joint in joints for check in _check_servo(servos, robot, hardware, joint)]
 
 
@@ -310,11 +278,7 @@ def check_answers(servos: Servos, joint: str) -> Check:
 
 
 def check_registers(servos: Servos, bus: Bus, bus_name: str, joint: str) -> Iterator[Check]:
-    """Compare a servo's EEPROM with what it must hold; a check per item, by address.
-
-    Raises:
-        NoAnswerError, RefusedError, BusGoneError: see :class:`wlr_gym.hardware.dynamixel.bus.BusGroup`.
-    """
+    """Compare a servo's EEPROM with what it must hold; a check per item, by address."""
     for item in (name for name in load_table(bus.model).items if name in MEANING):
         expected, found = expected_count(bus, item), servos.get(joint, item)
         if found != expected:
@@ -337,42 +301,24 @@ def mendable(checks: Iterable[Check]) -> list[Check]:
 
 
 def mend(servos: Servos, checks: Sequence[Check]) -> list[Check]:
-    """Write the fixes of the checks that failed, and read them back; return the ones that are not mended.
-
-    Raises:
-        BusGoneError: a port is gone.
-    """
-    mended = [check for check in mendable(checks) if _is_mended(servos, check)]
+    """Write the fixes of the checks that failed, and read them back; return the ones that are not mended."""
+    mended = []
+    for check in mendable(checks):
+        assert check.fix is not None
+        item, count = check.fix
+        with contextlib.suppress(NoAnswerError, RefusedError):
+            with contextlib.suppress(NoAnswerError):  # a servo with a low Status Return Level obeys without a word
+                servos.set(check.where, item, count)
+            if servos.get(check.where, item) == count:
+                mended.append(check)
     return [check for check in checks if not check.ok and check not in mended]
-
-
-def _is_mended(servos: Servos, check: Check) -> bool:
-    """Write a check's fix, and return whether the servo holds it."""
-    assert check.fix is not None, "only what has a fix is mended"
-    item, count = check.fix
-    try:
-        with contextlib.suppress(NoAnswerError):  # a servo with a low Status Return Level obeys without a word
-            servos.set(check.where, item, count)
-        return servos.get(check.where, item) == count
-    except (NoAnswerError, RefusedError):
-        return False
 
 
 # ---- the line ----
 
 
 def check_bus_speed(servos: Servos, reads: int, budget: float, now: Callable[[], float] = time.perf_counter) -> Check:
-    """Time reads of all joints and compare the 99th percentile with the budget.
-
-    Args:
-        servos: with all ports open.
-        reads: how many are timed.
-        budget: s, the hardware file's ``read_time``.
-        now: clock, s.
-
-    Raises:
-        BusGoneError: a port is gone.
-    """
+    """Time reads of all joints by a clock (s) and compare the 99th percentile with the budget (s)."""
     for _ in range(_UNTIMED_READS):
         servos.read()
     times = np.empty(reads)
@@ -384,28 +330,15 @@ def check_bus_speed(servos: Servos, reads: int, budget: float, now: Callable[[],
     median, slow = (1e3 * np.percentile(times, [50, 99])).tolist()
     found = f"median {median:.2f} ms, p99 {slow:.2f} ms, {lost} of {8 * reads} answers lost"
     ok = slow <= budget * 1e3 and lost <= 0.01 * 8 * reads
-    remedy = "" if ok else _speed_remedy(servos, now)
-    return Check("robot", "bus speed", ok, found, f"p99 below {budget * 1e3:g} ms and 1 % lost", remedy)
-
-
-def _speed_remedy(servos: Servos, now: Callable[[], float]) -> str:
-    """Return what to do about a slow bus: it may be the computer that is slow."""
-    share = processor_share(now)
-    busy = f"a program that never waits gets {share:.0%} of a processor"
+    remedy = "Set the adapters' latency timer to 1 ms, raise the baud rate, set return_delay_time = 0, check the cables."
+    remedy += " End other programs: a busy computer is as slow."
     if any(map(is_pseudo_terminal, servos.ports.values())):
-        return f"This computer is too busy, or too slow, for an emulated robot in real time ({busy}): {STEPPED}."
-    if share < _OWN_SHARE:
-        return f"This computer is too busy to drive a robot ({busy}): end other programs, or use another computer."
-    return "Set the adapters' latency timer to 1 ms, raise the baud rate, set return_delay_time = 0, check the cables."
+        remedy = f"This computer is too busy, or too slow, for an emulated robot in real time: {STEPPED}."
+    return Check("robot", "bus speed", ok, found, f"p99 below {budget * 1e3:g} ms and 1 % lost", "" if ok else remedy)
 
 
 def check_latency_timers(hardware: Hardware, system: Path = Path("/sys")) -> list[Check]:
-    """Look at the latency timers of the buses' USB adapters (Linux, FTDI); no check for ports that have none.
-
-    Args:
-        hardware: its ports.
-        system: where sysfs is.
-    """
+    """Look at the latency timers of the buses' USB adapters (Linux, FTDI; sysfs); no check for ports that have none."""
     checks = []
     for name, bus in hardware.buses.items():
         device = Path(bus.port).resolve().name
@@ -421,26 +354,16 @@ def check_latency_timers(hardware: Hardware, system: Path = Path("/sys")) -> lis
 
 
 class ImuSamples(NamedTuple):
-    """Readings of an IMU over a while.
+    """Readings of an IMU over a while."""
 
-    Attributes:
-        gyro, accelerometer: (T, 3) rad/s and m/s2.
-        temperature: degC, mean; NaN without a sample.
-        seconds: how long was listened.
-    """
-
-    gyro: NDArray[np.float64]
-    accelerometer: NDArray[np.float64]
-    temperature: float
-    seconds: float
+    gyro: NDArray[np.float64]  #: (T, 3) rad/s
+    accelerometer: NDArray[np.float64]  #: (T, 3) m/s2
+    temperature: float  #: degC, mean; NaN without a sample
+    seconds: float  #: for which was listened
 
 
 def sample_imu(imu: Imu, clock: Clock, seconds: float = _LOOK_TIME) -> ImuSamples:
-    """Listen to an IMU and return each new reading once.
-
-    Raises:
-        ImuGoneError: its port is gone.
-    """
+    """Listen to an IMU and return each new reading once."""
     imu.read()  # what came before does not count
     seen, start = imu.statistics.readings, clock.now()
     rows: list[NDArray[np.float64]] = []
@@ -455,98 +378,104 @@ def sample_imu(imu: Imu, clock: Clock, seconds: float = _LOOK_TIME) -> ImuSample
     return ImuSamples(table[:, :3], table[:, 3:6], temperature, clock.now() - start)
 
 
-def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
-    """Listen to the IMU of a robot that stands still on a level floor.
+_LIGHT = "Give it light and a floor with texture, 80 mm or more below it; check its supply, port and wiring."
+_CABLE = "Shorten the cable, keep it away from the motors' supply, check ground."
+#: Sensor -> check -> what to do where it fails.
+_REMEDIES = {
+    "imu": {
+        "readings": "Check its supply, its port and baud rate; a microcontroller must run the firmware that sends the frames.",
+        "rate": "Write the rate the microcontroller sends at into the hardware file, or raise its baud rate.",
+        "losses": _CABLE,
+        "rest": "Keep the robot still and look again.",
+        "gyroscope": "Run wlr calibrate imu.",
+        "gravity": "Run wlr calibrate imu --poses 6; is accel_range the sensor's?",
+        "level": "Stand the robot on a level floor; if it does, the sensor is mounted otherwise: wlr calibrate imu --mounting.",
+    },
+    "flow": {
+        "readings": _LIGHT,
+        "quality": _LIGHT,
+        "rest": "Keep the robot still and look again; else something moves in its view.",
+        "losses": _CABLE,
+        "calibration": "Drive or push it straight on while you record, then run wlr calibrate flow.",
+    },
+    "camera": {
+        "frames": "Check its plug.",
+        "rate": "Lower the resolution or the exposure time, or write the rate that comes into the camera's file (rate).",
+        "shutter": "Calibrate from a video of a moving board, or write its readout (s; 0 = global shutter) into that file.",
+        "floor": "Are all floor markers in the picture, flat, lit, and where the floor's file says?",
+        "robot": "Is the robot in the picture, its plate on, and its markers as the body's file says?",
+        "age": "Use USB 3, fewer pixels, a shorter exposure; find out who else uses the computer.",
+        "accuracy": "Bring the camera nearer, use more pixels, focus it, or print larger markers.",
+    },
+}
 
-    Args:
-        imu: open.
-        port: what it should be.
-        clock: what it is timed by.
-    """
+
+def _sensor_check(where: str, what: str, ok: bool, found: str, expected: str, is_fatal: bool = False) -> Check:
+    return Check(where, what, bool(ok), found, expected, _REMEDIES[where.partition(" ")[0]][what], is_fatal)
+
+
+def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
+    """Listen to the IMU, which is open, of a robot that stands still on a level floor."""
     try:
         imu.read()  # what piled up does not count ...
         clock.wait_until(clock.now() + SETTLE_TIME)
         imu.read()  # ... nor what was thrown away behind it
-        before = imu.statistics.readings, imu.statistics.lost, imu.statistics.errors
+        before = replace(imu.statistics)
         samples = sample_imu(imu, clock)
     except ImuGoneError as error:
         return [Check("imu", "readings", False, str(error), "readings", "Plug it in again, check its cable.")]
     if not len(samples.gyro):
-        remedy = "Check its supply, its port and baud rate; a microcontroller must run the firmware that sends the frames."
-        return [Check("imu", "readings", False, "none", f"{port.rate:g} a second", remedy)]
-    count, lost, errors = (
-        now - then
-        for now, then in zip((imu.statistics.readings, imu.statistics.lost, imu.statistics.errors), before, strict=True)
-    )
+        return [_sensor_check("imu", "readings", False, "none", f"{port.rate:g} a second", True)]
+    now = imu.statistics
+    count, lost, errors = now.readings - before.readings, now.lost - before.lost, now.errors - before.errors
     checks = [Check("imu", "readings", True, f"{count}, at {samples.temperature:.0f} degC", "", "")]
     if port.driver == "stream":
         rate = (count + lost) / samples.seconds
-        remedy = "Write the rate the microcontroller sends at into the hardware file, or raise its baud rate."
         near = abs(rate - port.rate) <= 0.1 * port.rate
-        checks.append(Check("imu", "rate", near, f"{rate:.0f} Hz", f"{port.rate:g} Hz within 10 %", remedy, False))
-    remedy = "Shorten the cable, keep it away from the motors' supply, check ground."
-    found = f"{lost} lost, {errors} broken of {count + lost}"
-    checks.append(Check("imu", "losses", lost + errors <= 0.01 * (count + lost), found, "1 % or less", remedy, False))
-    return checks + _check_rest(samples)
+        checks.append(_sensor_check("imu", "rate", near, f"{rate:.0f} Hz", f"{port.rate:g} Hz within 10 %"))
+    found, few = f"{lost} lost, {errors} broken of {count + lost}", lost + errors <= 0.01 * (count + lost)
+    checks.append(_sensor_check("imu", "losses", few, found, "1 % or less"))
+    if len(samples.gyro) < 2 or motion(samples.gyro) > GYRO_REST or motion(samples.accelerometer) > ACCEL_REST:
+        return [*checks, _sensor_check("imu", "rest", False, "it moves", "a robot that stands still")]
+    bias, force = float(np.linalg.norm(samples.gyro.mean(axis=0))), samples.accelerometer.mean(axis=0)
+    length = float(np.linalg.norm(force))
+    tilt = math.acos(min(1.0, max(-1.0, float(force[2]) / length))) if length > 0.0 else math.pi
+    right, gravity = abs(length / STANDARD_GRAVITY - 1.0) < LARGEST_LENGTH_ERROR, f"{STANDARD_GRAVITY:.2f}"
+    level = f"below {math.degrees(LARGEST_TILT):g} deg"
+    return [
+        *checks,
+        Check("imu", "rest", True, "still", "", ""),
+        _sensor_check("imu", "gyroscope", bias < LARGEST_RATE, f"{bias:.3f} rad/s", f"below {LARGEST_RATE:g}"),
+        _sensor_check("imu", "gravity", right, f"{length:.2f} m/s2", f"{gravity} within {LARGEST_LENGTH_ERROR:.0%}"),
+        _sensor_check("imu", "level", tilt < LARGEST_TILT, f"{math.degrees(tilt):.1f} deg", level, True),
+    ]
 
 
 def check_flow(flow: FlowStream, port: FlowPort, clock: Clock) -> list[Check]:
-    """Listen to the optical-flow sensor of a robot that stands still on its floor.
-
-    Args:
-        flow: open.
-        port: what it should be.
-        clock: what it is timed by.
-    """
+    """Listen to the optical-flow sensor, which is open, of a robot that stands still on its floor."""
     flow.read()  # what came before does not count
-    before = flow.statistics.lost, flow.statistics.errors
+    before = replace(flow.statistics)
     start, count = clock.now(), round(_LOOK_TIME / _FLOW_PERIOD)
     readings = []
     for tick in range(1, count + 1):
         clock.wait_until(start + tick * _FLOW_PERIOD)
         readings.append(flow.read())
     good = [reading for reading in readings if reading.is_new]
-    trouble = next((reading.trouble for reading in reversed(readings) if reading.trouble), "")
-    remedy = "Give it light and a floor with texture, 80 mm or more below it; check its supply, port and wiring."
-    found = f"{len(good)} of {count}" + (f", {trouble}" if trouble else "")
-    checks = [Check("flow", "readings", len(good) >= 0.9 * count, found, "a valid one in 9 of 10 control steps", remedy, False)]
+    trouble = next((f", {reading.trouble}" for reading in reversed(readings) if reading.trouble), "")
+    found, often = f"{len(good)} of {count}{trouble}", len(good) >= 0.9 * count
+    checks = [_sensor_check("flow", "readings", often, found, "a valid one in 9 of 10 control steps")]
     if not good:
         return checks
     quality = float(np.mean([reading.quality for reading in good]))
-    checks.append(Check("flow", "quality", quality > 0.15, f"{quality:.2f}", "above 0.15", remedy, False))
     drift = float(np.linalg.norm(np.mean([reading.flow for reading in good], axis=0)))
-    remedy = "Keep the robot still and look again; else something moves in its view."
-    checks.append(Check("flow", "rest", drift < FLOW_REST, f"{drift:.3f} rad/s", f"below {FLOW_REST:g} rad/s", remedy, False))
-    lost, errors = flow.statistics.lost - before[0], flow.statistics.errors - before[1]
-    remedy = "Shorten the cable, keep it away from the motors' supply, check ground."
-    checks.append(
-        Check("flow", "losses", lost + errors <= 0.02 * count, f"{lost} lost, {errors} broken", "2 % or less", remedy, False)
-    )
-    calibrate = "Drive or push it straight on while you record, then run wlr calibrate flow."
-    is_done = port.calibration.date is not None
-    checks.append(Check("flow", "calibration", is_done, port.calibration.date or "never", "a date", calibrate, False))
-    return checks
-
-
-def _check_rest(samples: ImuSamples) -> list[Check]:
-    moved = motion(samples.gyro) / GYRO_REST, motion(samples.accelerometer) / ACCEL_REST
-    if len(samples.gyro) < 2 or max(moved) > 1.0:
-        remedy = "Keep the robot still and look again."
-        return [Check("imu", "rest", False, "it moves", "a robot that stands still", remedy, False)]
-    bias = float(np.linalg.norm(samples.gyro.mean(axis=0)))
-    force = samples.accelerometer.mean(axis=0)
-    length = float(np.linalg.norm(force))
-    tilt = math.acos(min(1.0, max(-1.0, float(force[2]) / length))) if length > 0.0 else math.pi
-    calibrate = "Run wlr calibrate imu"
-    right, level = abs(length / STANDARD_GRAVITY - 1.0) < LARGEST_LENGTH_ERROR, f"{math.degrees(LARGEST_TILT):g} deg"
-    gravity = f"{STANDARD_GRAVITY:.2f} within {LARGEST_LENGTH_ERROR:.0%}"
-    scale = f"{calibrate} --poses 6; is accel_range the sensor's?"
-    stand = "Stand the robot on a level floor; if it does, the sensor is mounted otherwise: wlr calibrate imu --mounting."
+    lost, errors = flow.statistics.lost - before.lost, flow.statistics.errors - before.errors
+    few, date = lost + errors <= 0.02 * count, port.calibration.date
     return [
-        Check("imu", "rest", True, "still", "", ""),
-        Check("imu", "gyroscope", bias < LARGEST_RATE, f"{bias:.3f} rad/s", f"below {LARGEST_RATE:g}", f"{calibrate}.", False),
-        Check("imu", "gravity", right, f"{length:.2f} m/s2", gravity, scale, False),
-        Check("imu", "level", tilt < LARGEST_TILT, f"{math.degrees(tilt):.1f} deg", f"below {level}", stand),
+        *checks,
+        _sensor_check("flow", "quality", quality > 0.15, f"{quality:.2f}", "above 0.15"),
+        _sensor_check("flow", "rest", drift < FLOW_REST, f"{drift:.3f} rad/s", f"below {FLOW_REST:g} rad/s"),
+        _sensor_check("flow", "losses", few, f"{lost} lost, {errors} broken", "2 % or less"),
+        _sensor_check("flow", "calibration", date is not None, date or "never", "a date"),
     ]
 
 
@@ -555,56 +484,42 @@ def check_camera(camera: CameraReader, file: CameraFile, clock: Clock) -> list[C
 
     Only a camera without frames is a fault; a robot drives without poses.
     """
+    from wlr_gym.perception.vision.tracking import MEANINGS, NO_FLOOR  # a robot without a camera does without the finder
+
     where = f"camera {file.name}"
     try:
         camera.open()
     except InputError as error:
-        return [
-            Check(where, "frames", False, str(error), "a camera that gives frames", "Check its plug, number and user group.")
-        ]
-    readings = _listen(camera, clock)
-    checks = [Check(where, "frames", bool(readings), f"{len(readings)} in {_CAMERA_TIME:g} s", "frames", "Check its plug.")]
-    if not readings:
-        return checks
-    rate = len(readings) / _CAMERA_TIME
-    checks.append(_warning(where, "rate", rate >= _LEAST_RATE * file.rate, f"{rate:.1f} per second", f"{file.rate:g}"))
-    age = float(np.median([reading.found - reading.time for reading in readings]))
-    stamps = f" (dated by {dated})" if (dated := getattr(camera, "stamps", "")) else ""
-    checks.append(
-        _warning(where, "age", age < LARGEST_AGE / 2, f"{1e3 * age:.0f} ms{stamps}", f"< {1e3 * LARGEST_AGE / 2:.0f} ms")
-    )
-    found = file.doubt or f"readout {1e3 * (file.calibration.readout or 0.0):g} ms"
-    checks.append(_warning(where, "shutter", not file.doubt, found, "its readout"))
-    return [*checks, *_check_poses(where, readings)]
-
-
-def _listen(camera: CameraReader, clock: Clock) -> list[CameraReading]:
+        remedy = "Check its plug, number and user group."
+        return [Check(where, "frames", False, str(error), "a camera that gives frames", remedy)]
     readings, end = [], clock.now() + _CAMERA_TIME
     while clock.now() < end:
         if (reading := camera.read(clock.now())) is not None:
             readings.append(reading)
         clock.wait_until(clock.now() + _CAMERA_PERIOD)
-    return readings
-
-
-def _check_poses(where: str, readings: list[CameraReading]) -> list[Check]:
-    located = [reading for reading in readings if reading.status != NO_FLOOR]
-    checks = [_warning(where, "floor", bool(located), "found" if located else MEANINGS[NO_FLOOR], "its markers found")]
+    checks = [_sensor_check(where, "frames", bool(readings), f"{len(readings)} in {_CAMERA_TIME:g} s", "frames", True)]
+    if not readings:
+        return checks
+    rate, age = len(readings) / _CAMERA_TIME, float(np.median([reading.found - reading.time for reading in readings]))
+    stamps = f" (dated by {dated})" if (dated := getattr(camera, "stamps", "")) else ""
+    oldest, readout = LARGEST_AGE / 2, file.doubt or f"readout {1e3 * (file.calibration.readout or 0.0):g} ms"
+    located = [reading for reading in readings if reading.reason != MEANINGS[NO_FLOOR]]
+    checks += [
+        _sensor_check(where, "rate", rate >= _LEAST_RATE * file.rate, f"{rate:.1f} per second", f"{file.rate:g}"),
+        _sensor_check(where, "age", age < oldest, f"{1e3 * age:.0f} ms{stamps}", f"< {1e3 * oldest:.0f} ms"),
+        _sensor_check(where, "shutter", not file.doubt, readout, "its readout"),
+        _sensor_check(where, "floor", bool(located), "found" if located else MEANINGS[NO_FLOOR], "its markers found"),
+    ]
     if not located:
         return checks
-    seen = [reading for reading in located if reading.has_pose]
-    lost = Counter(MEANINGS.get(reading.status, reading.status) for reading in located if not reading.has_pose)
+    seen = [reading for reading in located if not reading.reason]
+    lost = Counter(reading.reason for reading in located if reading.reason)
     found = f"in {len(seen)} of {len(located)} frames" + "".join(f"; {why}: {count}" for why, count in lost.most_common())
-    checks.append(_warning(where, "robot", len(seen) >= _LEAST_POSES * len(located), found, "seen in all"))
+    checks.append(_sensor_check(where, "robot", len(seen) >= _LEAST_POSES * len(located), found, "seen in all"))
     if seen:
-        sigma = np.sqrt(np.median([np.diag(reading.covariance) for reading in seen], axis=0))
-        text = f"{1e3 * max(sigma[:2]):.2f} mm, {sigma[3]:.4f} rad (1 sigma)"
-        is_sharp = max(sigma[:2]) < LARGEST_SIGMA[0] / 2 and sigma[3] < LARGEST_SIGMA[1] / 2
-        checks.append(
-            _warning(where, "accuracy", bool(is_sharp), text, f"{500 * LARGEST_SIGMA[0]:g} mm, {LARGEST_SIGMA[1] / 2:g} rad")
-        )
+        x, y, _, yaw, *_ = np.sqrt(np.median([np.diag(reading.covariance) for reading in seen], axis=0)).tolist()
+        is_sharp = max(x, y) < LARGEST_SIGMA[0] / 2 and yaw < LARGEST_SIGMA[1] / 2
+        found = f"{1e3 * max(x, y):.2f} mm, {yaw:.4f} rad (1 sigma)"
+        expected = f"{500 * LARGEST_SIGMA[0]:g} mm, {LARGEST_SIGMA[1] / 2:g} rad"
+        checks.append(_sensor_check(where, "accuracy", is_sharp, found, expected))
     return checks
-
-
-def _warning(where: str, what: str, ok: bool, found: str, expected: str) -> Check:
-    return Check(where, what, ok, found, expected, _CAMERA_REMEDIES[what], False)

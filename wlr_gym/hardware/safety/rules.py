@@ -9,10 +9,10 @@ no motor can have made, readings that stand still where motion is expected, join
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,187 +76,126 @@ FINE = Verdict(Level.DRIVE, "", "")
 REQUESTS = ("stop", "emergency stop")
 
 
+def _each(value: float) -> Callable[[], NDArray[Any]]:
+    """Return what makes an array of a value for each joint (8,)."""
+    return lambda: np.full(_N, value)
+
+
 @dataclass(frozen=True)
 class CameraStatus:
-    """What the camera says.
+    """What the camera says."""
 
-    Attributes:
-        pose: (3,) x, y (m) and yaw (rad, unwrapped) that was believed last, from the start pose; 0 before the first.
-        time: s at which it was exposed; the run's start before the first.
-        is_new: it came in this control step.
-        reason: why no pose comes; empty = nothing is wrong.
-        is_wrong: there are poses, and they contradict the robot's other sensors: they are kept back.
-        doubt: what is not known of the camera that its poses suffer from; empty = nothing.
-    """
-
-    pose: Array = field(default_factory=lambda: np.zeros(3))
-    time: float = 0.0
-    is_new: bool = False
-    reason: str = ""
-    is_wrong: bool = False
-    doubt: str = ""
+    pose: Array = field(default_factory=lambda: np.zeros(3))  #: (3,) believed last: m, rad (unwrapped), from the start
+    time: float = 0.0  #: s at which it was exposed; the run's start before the first
+    is_new: bool = False  #: it came in this control step
+    reason: str = ""  #: why no pose comes; empty = nothing is wrong
+    is_wrong: bool = False  #: there are poses, and they contradict the robot's other sensors: they are kept back
+    doubt: str = ""  #: what is not known of the camera that its poses suffer from; empty = nothing
 
 
 @dataclass(frozen=True)
 class RobotStatus:
-    """What is known of the robot at a control step. Arrays are in joint order.
+    """What is known of the robot at a control step. Arrays are in joint order."""
 
-    Attributes:
-        time: s.
-        position, velocity, effort: (8,) last good readings, rad, rad/s, N m.
-        silence: (8,) s since the joint's last good reading; 0 = it answered in this step.
-        alert, restarted: (8,) hardware error; rebooted since the last reading.
-        voltage, temperature: (8,) V, degC, as last read.
-        gyro, accelerometer: (3,) rad/s, m/s2, body frame.
-        imu_silence: s since the IMU's last reading.
-        up: (3,) the vertical in the body frame.
-        late_ticks: control steps in a row that started a period late or more. late_share: of the last second's.
-        operator_silence: s since the operator's last sign. idle: s for which nothing was sent to the servos.
-        lost: ports that are gone, in words..
-        trouble: why log or terminal failed.
-        broken: packets with a wrong checksum since all joints answered last.
-        registers: of the servos, as last read.
-        suspect: (8,) the joint's last reading was impossible, and has not been confirmed.
-        unseen: (8,) s that the joint was not seen before its last answer, or before the first impossible one.
-        jump: (8,) rad by which a joint's readings jumped for good, further than a motor can turn; 0 = not.
-        flow: of the optical-flow sensor in this step; None = the robot has none.
-        camera: what the camera says; None = there is none.
-        asked_to_stop: why a stop was asked for. asked_off: why torque is to go off at once.
-    """
-
-    time: float
-    position: Array
-    velocity: Array
-    effort: Array
-    silence: Array
-    alert: Mask
-    restarted: Mask
-    voltage: Array
-    temperature: Array
-    gyro: Array
-    accelerometer: Array
-    imu_silence: float
-    up: Array
-    late_ticks: int = 0
-    late_share: float = 0.0
-    operator_silence: float = 0.0
-    idle: float = 0.0
-    lost: str = ""
-    trouble: str = ""
-    asked_to_stop: str = ""
-    asked_off: str = ""
-    broken: int = 0
-    flow: FlowReading | None = None
-    registers: ServoRegisters = UNREAD
-    suspect: Mask = field(default_factory=lambda: np.zeros(len(JOINTS), bool))
-    unseen: Array = field(default_factory=lambda: np.zeros(len(JOINTS)))
-    jump: Array = field(default_factory=lambda: np.zeros(len(JOINTS)))
-    camera: CameraStatus | None = None
+    time: float  #: s
+    position: Array  #: (8,) rad, last good readings
+    velocity: Array  #: (8,) rad/s
+    effort: Array  #: (8,) N m
+    silence: Array  #: (8,) s since the joint's last good reading; 0 = it answered in this step
+    alert: Mask  #: (8,) hardware error
+    restarted: Mask  #: (8,) rebooted since the last reading
+    voltage: Array  #: (8,) V, as last read
+    temperature: Array  #: (8,) degC, as last read
+    gyro: Array  #: (3,) rad/s, body frame
+    accelerometer: Array  #: (3,) m/s2, body frame
+    imu_silence: float  #: s since the IMU's last reading
+    up: Array  #: (3,) the vertical in the body frame
+    late_ticks: int = 0  #: control steps in a row that started a period late or more
+    late_share: float = 0.0  #: of the last second's
+    operator_silence: float = 0.0  #: s since the operator's last sign
+    idle: float = 0.0  #: s for which nothing was sent to the servos
+    lost: str = ""  #: ports that are gone, in words
+    trouble: str = ""  #: why log or terminal failed
+    asked_to_stop: str = ""  #: why a stop was asked for
+    asked_off: str = ""  #: why torque is to go off at once
+    broken: int = 0  #: packets with a wrong checksum since all joints answered last
+    flow: FlowReading | None = None  #: of the optical-flow sensor in this step; None = the robot has none
+    registers: ServoRegisters = UNREAD  #: of the servos, as last read
+    suspect: Mask = field(default_factory=_each(False))  #: (8,) the last reading was impossible, and is not confirmed
+    unseen: Array = field(default_factory=_each(0.0))  #: (8,) s not seen before the last answer, or the first impossible
+    jump: Array = field(default_factory=_each(0.0))  #: (8,) rad that readings jumped for good, beyond a motor; 0 = not
+    camera: CameraStatus | None = None  #: what the camera says; None = there is none
 
 
 @dataclass(frozen=True)
 class Ratings:
-    """Ratings of the robot's motors, and what its servos' registers allow.
+    """Ratings of the robot's motors, and what its servos' registers allow."""
 
-    Attributes:
-        low, high: (8,) setpoints the servos take, rad and rad/s.
-        leg_limits: rad, of the robot file.
-        stall_torque: (8,) N m. no_load_speed: (8,) rad/s.
-        currents: of torques and rates.
-        period: s of a control step.
-        supply: V that these hold at.
-        watchdog: count that Bus Watchdog is armed with. goal_pwm: (8,) counts that Goal PWM is set to.
-        pwm_share: (8,) part of the supply that this is.
-        profile: of the servos.
-    """
-
-    low: Array
-    high: Array
-    leg_limits: tuple[float, float]
-    stall_torque: Array
-    currents: CurrentLaw
-    no_load_speed: Array
-    period: float
-    supply: float
-    watchdog: float = np.nan
-    goal_pwm: Array = field(default_factory=lambda: np.full(len(JOINTS), np.nan))
-    pwm_share: Array = field(default_factory=lambda: np.ones(len(JOINTS)))
-    profile: Profile = field(default_factory=Profile)
+    leg_limits: tuple[float, float]  #: rad, of the robot file
+    stall_torque: Array  #: (8,) N m
+    no_load_speed: Array  #: (8,) rad/s
+    currents: CurrentLaw  #: of torques and rates
+    period: float  #: s of a control step
+    supply: float  #: V that these hold at
+    low: Array = field(default_factory=_each(-np.inf))  #: (8,) rad and rad/s, lowest setpoints that the servos' registers take
+    high: Array = field(default_factory=_each(np.inf))  #: (8,) and highest
+    watchdog: float = np.nan  #: count that Bus Watchdog is armed with
+    goal_pwm: Array = field(default_factory=_each(np.nan))  #: (8,) counts that Goal PWM is set to
+    pwm_share: Array = field(default_factory=_each(1.0))  #: (8,) part of the supply that this is
+    profile: Profile = field(default_factory=Profile)  #: of the servos
 
 
-def ratings_of(robot: Robot, period: float, low: Array | None = None, high: Array | None = None) -> Ratings:
-    """Return the ratings of a robot; without register limits (``low``, ``high``) all setpoints are possible."""
-    motors = (robot.servo.leg, robot.servo.wheel)
-    stall = np.repeat([motor.stall_torque for motor in motors], 4)
-    speed = np.repeat([motor.no_load_speed for motor in motors], 4)
+def ratings_of(robot: Robot, period: float, **registers: Any) -> Ratings:
+    """Return the ratings of a robot; ``registers``: what its servos' registers allow (:class:`Ratings`)."""
+    leg, wheel = robot.servo.leg, robot.servo.wheel
     return Ratings(
-        np.full(_N, -np.inf) if low is None else low,
-        np.full(_N, np.inf) if high is None else high,
-        robot.leg_limits,
-        stall,
-        current_law(robot),
-        speed,
-        period,
-        robot.servo.supply_voltage,
+        leg_limits=robot.leg_limits,
+        stall_torque=np.repeat([leg.stall_torque, wheel.stall_torque], 4),
+        no_load_speed=np.repeat([leg.no_load_speed, wheel.no_load_speed], 4),
+        currents=current_law(robot),
+        period=period,
+        supply=robot.servo.supply_voltage,
+        **registers,
     )
 
 
 @dataclass(frozen=True)
 class JointMemory:
-    """What lasts from step to step of joints and IMU.
+    """What lasts from step to step of joints and IMU."""
 
-    Attributes:
-        still_at: (8,) rad, reading from which on a joint has stayed the same but for the encoder's last bits.
-        position, velocity: (8,) rad, rad/s, last read. A leg that turns back may by chance repeat one of them, not both.
-        ramp: (8,) rad/s, speed that the wheels' profile asks for by now; legs 0.
-        reference: (8,) rad/s, speed that the wheels should have by now; legs 0.
-        unmoved: (8,) rad a joint should have moved since then.
-        away: (8,) s for which a joint has stayed away from its setpoint.
-        imu: (6,) last rates and specific forces. imu_same: s for which they have not changed at all.
-    """
-
-    still_at: Array = field(default_factory=lambda: np.full(_N, np.nan))
-    position: Array = field(default_factory=lambda: np.full(_N, np.nan))
-    velocity: Array = field(default_factory=lambda: np.full(_N, np.nan))
-    ramp: Array = field(default_factory=lambda: np.zeros(_N))
-    reference: Array = field(default_factory=lambda: np.zeros(_N))
-    unmoved: Array = field(default_factory=lambda: np.zeros(_N))
-    away: Array = field(default_factory=lambda: np.zeros(_N))
-    imu: Array = field(default_factory=lambda: np.full(6, np.nan))
-    imu_same: float = 0.0
+    still_at: Array = field(default_factory=_each(np.nan))  #: (8,) rad, since when only the encoder's last bits differ
+    position: Array = field(default_factory=_each(np.nan))  #: (8,) rad, last read
+    velocity: Array = field(default_factory=_each(np.nan))  #: (8,) rad/s; a leg that turns back may repeat one, not both
+    ramp: Array = field(default_factory=_each(0.0))  #: (8,) rad/s, speed that the wheels' profile asks for by now; legs 0
+    reference: Array = field(default_factory=_each(0.0))  #: (8,) rad/s, speed that the wheels should have by now; legs 0
+    unmoved: Array = field(default_factory=_each(0.0))  #: (8,) rad a joint should have moved since then
+    away: Array = field(default_factory=_each(0.0))  #: (8,) s for which a joint has stayed away from its setpoint
+    imu: Array = field(default_factory=lambda: np.full(6, np.nan))  #: (6,) last rates and specific forces
+    imu_same: float = 0.0  #: s for which they have not changed at all
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What lasts from step to step: how long things have been beyond their limits, s; motors (8,) that are on; joints."""
+    """What lasts from step to step: how long (s) things have been beyond their limits, and more."""
 
-    loaded: Array = field(default_factory=lambda: np.zeros(_N))
+    loaded: Array = field(default_factory=_each(0.0))
     current: float = 0.0
     sagged: float = 0.0
     tilted: float = 0.0
     tilting: float = 0.0
-    torque_on: Mask = field(default_factory=lambda: np.ones(_N, bool))
+    torque_on: Mask = field(default_factory=_each(True))  #: (8,) motors that are on
     joints: JointMemory = field(default_factory=JointMemory)
 
 
 class Decision(NamedTuple):
-    """What to send.
+    """What to send."""
 
-    Attributes:
-        level: what the robot may do.
-        setpoints: (8,) rad and rad/s, finite.
-        torque_on: (8,) motors that are on.
-        verdicts: findings; those at DRIVE change nothing about the setpoints.
-        limited: rule -> joints whose setpoints it changed.
-        memory: for the next step.
-    """
-
-    level: Level
-    setpoints: Array
-    torque_on: Mask
-    verdicts: tuple[Verdict, ...]
-    limited: dict[str, Mask]
-    memory: Memory
+    level: Level  #: what the robot may do
+    setpoints: Array  #: (8,) rad and rad/s, finite
+    torque_on: Mask  #: (8,) motors that are on
+    verdicts: tuple[Verdict, ...]  #: findings; those at DRIVE change nothing about the setpoints
+    limited: dict[str, Mask]  #: rule -> joints whose setpoints it changed
+    memory: Memory  #: for the next step
 
     @property
     def worst(self) -> Verdict:
@@ -276,8 +215,7 @@ def decide(
     """Decide on one control step.
 
     Args:
-        limits: the robot's.
-        ratings: the robot's.
+        limits, ratings: the robot's.
         status: what was last seen.
         memory: of the step before.
         previous: (8,) setpoints of the step before, finite.
@@ -295,7 +233,9 @@ def decide(
     elif level >= Level.HOLD:
         setpoints = np.where(_IS_LEG, previous, 0.0)
     start = np.where(on, previous, resting(status.position))
-    setpoints, limited = limit_setpoints(limits, ratings, setpoints, start, status.position, slow_down(limits, status))
+    hottest = np.nanmax(status.temperature, initial=-np.inf)
+    wheel_share = float(np.clip((limits.hot - hottest) / (limits.hot - limits.warm), 0.0, 1.0))
+    setpoints, limited = limit_setpoints(limits, ratings, setpoints, start, status.position, wheel_share)
     return Decision(level, setpoints, on, verdicts, limited if level == Level.DRIVE else {}, replace(memory, torque_on=on))
 
 
@@ -327,17 +267,14 @@ def limit_setpoints(
 ) -> tuple[Array, dict[str, Mask]]:
     """Return setpoints within all limits, and rule -> joints that it changed.
 
-    The slew limit comes last, so no setpoint ever jumps: not even back into range from outside.
-
-    Args:
-        limits, ratings: the robot's.
-        setpoints, previous: (8,) finite.
-        position: (8,) rad, as last read.
-        wheel_share: of the wheel speed limit that is left.
+    The slew limit comes last, so no setpoint ever jumps: not even back into range from outside. ``position`` is (8,) rad, as
+    last read; ``wheel_share`` is what a hot servo leaves of the wheel speed limit, 1 to 0.
     """
     low = np.where(_IS_LEG, ratings.leg_limits[0] + limits.leg_margin, -limits.wheel_speed * wheel_share)
     high = np.where(_IS_LEG, ratings.leg_limits[1] - limits.leg_margin, limits.wheel_speed * wheel_share)
-    low, high = _in_order(np.maximum(low, ratings.low), np.minimum(high, ratings.high))
+    low, high = np.maximum(low, ratings.low), np.minimum(high, ratings.high)
+    middle = (low + high) / 2.0  # both ends of a range that is inverted: clipping to it would pass a leg's end
+    low, high = np.minimum(low, middle), np.maximum(high, middle)
     inside = np.clip(setpoints, low, high)
     near = np.clip(inside, position - limits.leg_lead, position + limits.leg_lead)
     near = np.where(_IS_LEG, np.clip(near, low, high), inside)
@@ -353,18 +290,6 @@ def limit_setpoints(
     final = np.where(_IS_LEG & (previous >= low) & (previous <= high), tapered, slewed)
     changes = {"limit": setpoints != inside, "lead": inside != near, "slew": near != slewed, "taper": final != slewed}
     return final, {rule: mask for rule, mask in changes.items() if mask.any()}
-
-
-def _in_order(low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the ends of ranges, both at the middle of one that is inverted: clipping to it would pass a leg's end."""
-    middle = (low + high) / 2.0
-    return np.minimum(low, middle), np.maximum(high, middle)
-
-
-def slow_down(limits: SafetyLimits, status: RobotStatus) -> float:
-    """Return the share of the wheel speed limit that the hottest servo leaves, 1 to 0."""
-    hottest = np.nanmax(status.temperature, initial=-np.inf)
-    return float(np.clip((limits.hot - hottest) / (limits.hot - limits.warm), 0.0, 1.0))
 
 
 # ---- how long it has been so ----
@@ -393,19 +318,16 @@ def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory
 def remember_joints(
     limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: JointMemory, previous: Array, torque_on: Mask
 ) -> JointMemory:
-    """Return the memory after a step.
+    """Return the memory after a step with the setpoints (8,) and motors (8,) of the step before.
 
-    Args:
-        limits, ratings: the robot's.
-        status: what was last seen; arrays of joints may be those of several robots, (N, 8).
-        memory: of the step before.
-        previous: (8,) setpoints sent in the step before.
-        torque_on: (8,) motors that were on.
+    Arrays of joints in ``status`` may be those of several robots, (N, 8).
     """
     # driven, heard in this step, and telling their registers
     seen = torque_on & (status.silence == 0.0) & np.isfinite(status.registers.torque)
     largest = ratings.no_load_speed * ratings.pwm_share * status.voltage / ratings.supply  # no setpoint makes a wheel faster
-    ramp = np.where(torque_on, next_ramp(ratings, memory.ramp, np.clip(previous, -largest, largest)), 0.0)
+    change = ratings.profile.wheel_acceleration * ratings.period or np.inf
+    asked = np.clip(previous, -largest, largest)
+    ramp = np.where(torque_on & ~_IS_LEG, memory.ramp + np.clip(asked - memory.ramp, -change, change), 0.0)
     reference = np.where(torque_on, memory.reference + (ramp - memory.reference) * ratings.period / WHEEL_LAG, 0.0)
     expected = np.where(_IS_LEG, line_speed(ratings, status), np.where(np.abs(reference) > CREEP, reference, 0.0))
     same = (status.position == memory.position) & (status.velocity == memory.velocity)
@@ -428,12 +350,6 @@ def remember_joints(
         imu,
         imu_same,
     )
-
-
-def next_ramp(ratings: Ratings, ramp: Array, setpoints: Array) -> Array:
-    """Return the speeds (8,) that the wheels' profile asks for a step later; legs 0. Their velocity loop lags behind that."""
-    largest = ratings.profile.wheel_acceleration * ratings.period or np.inf
-    return np.where(_IS_LEG, 0.0, ramp + np.clip(setpoints - ramp, -largest, largest))
 
 
 def line_speed(ratings: Ratings, status: RobotStatus) -> Array:
@@ -544,41 +460,42 @@ def judge_joints(
     """
     yield from _judge_registers(ratings, status, on)
     for k in np.flatnonzero(status.jump):
-        yield Verdict(Level.OFF, "jump", _jump_text(limits, ratings, status, int(k)))
+        reading, possible = status.position[k] + status.jump[k], reach(limits, ratings, status.unseen)[k]
+        text = f"{JOINTS[k]} reads {reading:.2f} rad, {abs(status.jump[k]):.2f} rad from its reading {status.unseen[k]:.3f} s "
+        text += f"before: no motor turns that far (limit {possible:.2f} rad); check horn and encoder, exchange the servo"
+        yield Verdict(Level.OFF, "jump", text)
     frozen = frozen_limit(limits)
     for k in np.flatnonzero(is_frozen(limits, memory)):
-        yield Verdict(
-            Level.OFF,
-            "frozen",
-            f"{JOINTS[k]} reads {status.position[k]:.3f} rad again and again while it should have turned by "
-            f"{abs(memory.unmoved[k]):.2f} rad (limit {frozen[k]:g} rad): is it blocked? If not, its encoder has failed: "
-            f"exchange the servo",
-        )
+        text = f"{JOINTS[k]} reads {status.position[k]:.3f} rad again and again while it should have turned by "
+        text += f"{abs(memory.unmoved[k]):.2f} rad (limit {frozen[k]:g} rad): is it blocked? If not, its encoder has failed: "
+        yield Verdict(Level.OFF, "frozen", text + "exchange the servo")
     for k in np.flatnonzero(is_lost(limits, ratings, memory)):
-        yield Verdict(Level.OFF, "tracking", _tracking_text(limits, ratings, status, memory, int(k)))
+        seconds = f"for {memory.away[k]:.2f} s (limit {error_time(limits, ratings)[k]:.2f} s)"
+        found = f"is at {status.position[k]:.2f} rad, more than {limits.leg_error:g} rad from its setpoint {seconds}"
+        if not _IS_LEG[k]:
+            expected = f"expected {memory.reference[k]:.2f} within {limits.wheel_error:g}"
+            found = f"turns at {status.velocity[k]:.2f} rad/s, {expected} {seconds}"
+        remedy = "is it blocked, or its motor weak? Turn it by hand with torque off, check supply and gears"
+        yield Verdict(Level.OFF, "tracking", f"{JOINTS[k]} {found}: {remedy}")
     if memory.imu_same > limits.imu_frozen:
         text = f"imu repeats the same six values for {memory.imu_same:.2f} s (limit {limits.imu_frozen:g} s): "
         yield Verdict(Level.STOP, "imu frozen", text + "restart its microcontroller, check the wires to the chip")
 
 
 def _judge_registers(ratings: Ratings, status: RobotStatus, on: Mask) -> Iterator[Verdict]:
-    registers = status.registers
+    registers, end_others = status.registers, "end other programs on its bus"
     explained = status.restarted | status.alert  # these have rules of their own
     for k in np.flatnonzero(np.isfinite(registers.torque) & ~explained & (status.silence == 0.0)):
         joint, torque, watchdog, pwm = JOINTS[k], registers.torque[k], registers.watchdog[k], registers.goal_pwm[k]
         if torque != on[k]:
-            text = (
-                f"{joint}: Torque Enable is {torque:.0f}, expected {on[k]:d}: it was switched or rebooted by something else; "
-            )
-            yield Verdict(Level.OFF, "torque", text + "check its supply and cable, end other programs on its bus")
+            text = f"{joint}: Torque Enable is {torque:.0f}, expected {on[k]:d}: it was switched or rebooted by something else"
+            yield Verdict(Level.OFF, "torque", f"{text}; check its supply and cable, {end_others}")
         elif watchdog >= 0.0 and watchdog != ratings.watchdog:
-            text = (
-                f"{joint}: Bus Watchdog is {watchdog:.0f}, expected {ratings.watchdog:.0f}: it would not stop if this program "
-            )
-            yield Verdict(Level.STOP, "register", text + "died; end other programs on its bus")
+            text = f"{joint}: Bus Watchdog is {watchdog:.0f}, expected {ratings.watchdog:.0f}"
+            yield Verdict(Level.STOP, "register", f"{text}: it would not stop if this program died; {end_others}")
         if torque and pwm != ratings.goal_pwm[k]:
-            text = f"{joint}: Goal PWM is {pwm:.0f}, expected {ratings.goal_pwm[k]:.0f}: something else changed its limit; "
-            yield Verdict(Level.STOP, "register", text + "end other programs on its bus")
+            text = f"{joint}: Goal PWM is {pwm:.0f}, expected {ratings.goal_pwm[k]:.0f}: something else changed its limit"
+            yield Verdict(Level.STOP, "register", f"{text}; {end_others}")
 
 
 def error_time(limits: SafetyLimits, ratings: Ratings) -> Array:
@@ -602,24 +519,6 @@ def is_frozen(limits: SafetyLimits, memory: JointMemory) -> Mask:
 def is_lost(limits: SafetyLimits, ratings: Ratings, memory: JointMemory) -> Mask:
     """Return which joints (..., 8) have stayed away from their setpoints for too long."""
     return memory.away > error_time(limits, ratings)
-
-
-def _jump_text(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, k: int) -> str:
-    reading, possible = status.position[k] + status.jump[k], reach(limits, ratings, status.unseen)[k]
-    return (
-        f"{JOINTS[k]} reads {reading:.2f} rad, {abs(status.jump[k]):.2f} rad from its reading {status.unseen[k]:.3f} s before: "
-        f"no motor turns that far (limit {possible:.2f} rad); check horn and encoder, exchange the servo"
-    )
-
-
-def _tracking_text(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: JointMemory, k: int) -> str:
-    seconds = f"for {memory.away[k]:.2f} s (limit {error_time(limits, ratings)[k]:.2f} s)"
-    if _IS_LEG[k]:
-        found = f"is at {status.position[k]:.2f} rad, more than {limits.leg_error:g} rad from its setpoint {seconds}"
-    else:
-        expected = f"expected {memory.reference[k]:.2f} within {limits.wheel_error:g}"
-        found = f"turns at {status.velocity[k]:.2f} rad/s, {expected} {seconds}"
-    return f"{JOINTS[k]} {found}: is it blocked, or its motor weak? Turn it by hand with torque off, check supply and gears"
 
 
 # ---- readings that no motor can have made ----

@@ -56,34 +56,22 @@ class Guard:
         self._robot, self._hardware, self._is_wanted = robot, hardware, is_wanted
 
     def start(self, log: Path | None = None) -> None:
-        """Start the process, if it does not run.
-
-        Args:
-            log: folder in which the process notes what it did (``guard.jsonl``); None = nowhere.
+        """Start the process, if it does not run; it notes what it did in ``guard.jsonl`` in the folder ``log``.
 
         Raises:
             InputError: the process does not start.
         """
         if not self._is_wanted or self.process is not None:
             return
+        ids = self._robot.dynamixel_ids
         buses = [
-            {
-                "name": name,
-                "port": bus.port,
-                "baud_rate": bus.baud_rate,
-                "model": bus.model,
-                "ids": [self._robot.dynamixel_ids[joint] for joint in bus.joints],
-            }
+            [name, bus.port, bus.baud_rate, bus.model, [ids[joint] for joint in bus.joints]]
             for name, bus in self._hardware.buses.items()
         ]
-        process = subprocess.Popen(
-            [sys.executable, "-m", "wlr_gym.hardware.safety.watchdog"],
-            stdin=subprocess.PIPE,
-            bufsize=0,
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # a Ctrl-C at the terminal is for the driving process
-        )
         spec = {"buses": buses, "log": None if log is None else str((log / "guard.jsonl").resolve())}
+        command, pipe = [sys.executable, "-m", "wlr_gym.hardware.safety.watchdog"], subprocess.PIPE
+        # in a session of its own: a Ctrl-C at the terminal is for the driving process
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, bufsize=0, start_new_session=True)
         assert process.stdin is not None
         assert process.stdout is not None
         with contextlib.suppress(OSError):
@@ -155,15 +143,6 @@ def _wait_for_the_end(parent: int) -> str:
     return "gone"
 
 
-def _kill(parent: int) -> None:
-    """Kill the process that hangs, and wait until it is gone, and its ports free."""
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(parent, signal.SIGKILL)
-    end = time.monotonic() + KILL_TIME
-    while os.getppid() == parent and time.monotonic() < end:
-        time.sleep(0.001)
-
-
 def main() -> int:
     """Watch the driving process; 1 = servos were left that did not confirm."""
     parent = os.getppid()
@@ -177,23 +156,23 @@ def main() -> int:
         text += data
     spec = json.loads(text)
     groups = [
-        BusGroup(bus["name"], bus["port"], bus["baud_rate"], dict.fromkeys(bus["ids"], load_table(bus["model"])))
-        for bus in spec["buses"]
+        BusGroup(name, port, baud_rate, dict.fromkeys(ids, load_table(model)))
+        for name, port, baud_rate, model, ids in spec["buses"]
     ]
     os.write(1, b"ready\n")
     why = _wait_for_the_end(parent)
     if not why:
         return 0
     if why == "hangs":
-        _kill(parent)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(parent, signal.SIGKILL)
+        end = time.monotonic() + KILL_TIME
+        while os.getppid() == parent and time.monotonic() < end:  # until then its ports are not free
+            time.sleep(0.001)
     left = switch_off(groups, TRY_TIME)
     if spec["log"] is not None:
-        event = {
-            "t": round(time.monotonic(), 6),
-            "event": "torque off",
-            "driver": why,
-            "unconfirmed": {name: sorted(ids) for name, ids in left.items()},
-        }
+        unconfirmed = {name: sorted(ids) for name, ids in left.items()}
+        event = {"t": round(time.monotonic(), 6), "event": "torque off", "driver": why, "unconfirmed": unconfirmed}
         with contextlib.suppress(OSError), open(spec["log"], "ab") as file:
             file.write((json.dumps(event) + "\n").encode())
     return 1 if left else 0
