@@ -107,7 +107,7 @@ class BusLine:
         held: list[tuple[float, bytes]] = []  # (delay by a fault, bytes) of the USB packet being filled
         for k, (servo, raw) in enumerate(answers):
             waits = self.timing.wire and (k == 0 or raw.startswith(protocol.HEADER))
-            pause = servo.return_delay if waits else 0.0
+            pause = servo["return_delay_time"] * 2e-6 if waits else 0.0
             start += pause + self.timing.turnaround + self._wire_time(len(raw), baud_rate)
             arrived, delay = self._faults.mangle(now, raw, [servo.name, self.name])
             held.append((delay, arrived))
@@ -164,8 +164,8 @@ class BusLine:
     def _answer_one(self, packet: Packet, heard: list[EmulatedServo]) -> list[tuple[EmulatedServo, bytes]]:
         """Instructions to one servo, or to all of them at once (only a ping is then answered)."""
         answers = []
-        for servo in sorted(heard, key=lambda servo: servo.id):
-            own = servo.id
+        for servo in sorted(heard, key=lambda servo: servo["id"]):
+            own = servo["id"]
             if packet.id not in (own, BROADCAST):
                 if packet.id == servo["secondary_id"] and packet.instruction == Instruction.WRITE:
                     _carry_out(servo, packet)
@@ -201,7 +201,7 @@ def _read_several(
     asked: Sequence[tuple[int, int, int]], heard: list[EmulatedServo], fast: bool
 ) -> list[tuple[EmulatedServo, bytes]]:
     """Read (id, address, length) each. A servo waits for the one named before it, so a missing one silences all behind it."""
-    by_id = {servo.id: servo for servo in heard}
+    by_id = {servo["id"]: servo for servo in heard}
     chain: list[tuple[EmulatedServo, Status]] = []
     for id, address, length in asked:
         servo = by_id.get(id)
@@ -221,7 +221,7 @@ def _read_several(
 
 def _write_several(parts: list[tuple[int, int, bytes]], heard: list[EmulatedServo]) -> None:
     """Write (id, address, data) each. Nobody answers: what a servo refuses is lost without a word."""
-    by_id = {servo.id: servo for servo in heard}
+    by_id = {servo["id"]: servo for servo in heard}
     for id, address, data in parts:
         if id in by_id:
             by_id[id].write(address, data)

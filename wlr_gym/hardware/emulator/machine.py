@@ -275,9 +275,9 @@ class Machine:
 
     # ---- faults ----
 
-    def inject(self, fault: Fault | str) -> Fault:
-        """Make something go wrong: a fault, or a line of text that :func:`parse_fault` understands."""
-        fault = parse_fault(fault, self.places) if isinstance(fault, str) else fault
+    def inject(self, text: str) -> Fault:
+        """Make something go wrong: a line of text that :func:`parse_fault` understands."""
+        fault = parse_fault(text, self.places)
         self.faults.add(fault, self.time)
         return fault
 

@@ -268,7 +268,11 @@ class Server:
         try:
             while not self._is_over:
                 ready = self._wait()
-                self._catch_up()
+                if self._real_time:
+                    self._slip(LARGEST_LAG)
+                    now = self._now()  # not asked again: who is slower than time would never listen
+                    while self.machine.time + self.machine.options.tick <= now:
+                        self._step()
                 self._listen(ready)
                 self._emit()
         except Exception as error:
@@ -297,14 +301,6 @@ class Server:
             if peer in ready:
                 self._serve_socket(peer)
         return [name for name, master in masters.items() if master in ready]
-
-    def _catch_up(self) -> None:
-        if not self._real_time:
-            return
-        self._slip(LARGEST_LAG)
-        now = self._now()  # not asked again: who is slower than time would never listen
-        while self.machine.time + self.machine.options.tick <= now:
-            self._step()
 
     def _slip(self, largest: float) -> None:
         """Give up the time (s) by which emulated time is further behind."""

@@ -344,19 +344,9 @@ class EmulatedServo(Registers):
         return not self.dead and self._silence <= 0.0 and self.get("protocol_type") == 2
 
     @property
-    def id(self) -> int:
-        """Its id on the line."""
-        return self.get("id")
-
-    @property
     def baud_rate(self) -> int:
         """Bits per second."""
         return BAUD_RATES[self.get("baud_rate")]
-
-    @property
-    def return_delay(self) -> float:
-        """s from an instruction's end to the answer's start."""
-        return self.get("return_delay_time") * 2e-6
 
     @property
     def alert(self) -> int:
