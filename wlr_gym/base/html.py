@@ -112,12 +112,14 @@ def commands(lines: Sequence[str]) -> str:
     return f"<pre>{escape(chr(10).join(lines))}</pre>"
 
 
+def picture(name: str, data: bytes, caption: str = "", media: str = "image/png") -> str:
+    """Return a picture or film inside the page, with its caption."""
+    source = f"data:{media};base64,{base64.b64encode(data).decode('ascii')}"
+    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f'<figure><img alt="{escape(name)}" src="{source}">{below}</figure>'
+
+
 def pictures_of(kind: str, pictures: Mapping[str, bytes], caption: str) -> str:
     """Return the pictures named ``kind`` or ``kind_1``, ``kind_2``, ... inside the page, the caption under the last."""
     chosen = [name for name in pictures if name == kind or name.startswith(f"{kind}_")]
-    shown = []
-    for name in chosen:
-        data = base64.b64encode(pictures[name]).decode("ascii")
-        below = f"<figcaption>{escape(caption)}</figcaption>" if name == chosen[-1] else ""
-        shown.append(f'<figure><img alt="{escape(name)}" src="data:image/png;base64,{data}">{below}</figure>')
-    return "\n".join(shown)
+    return "\n".join(picture(name, pictures[name], caption if name == chosen[-1] else "") for name in chosen)

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.html import heading, table
+from wlr_gym.base.html import heading, picture, table
 from wlr_gym.base.plots import COLOURS, new_figure, tidy
 from wlr_gym.base.text import counted, number
-from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, link, paragraph, picture
+from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, link, paragraph
 from wlr_gym.gap.report.text import error, listed, percent, places, plain, unit_of
 from wlr_gym.robot import JOINTS, LEGS, WHEELS
 
@@ -166,7 +166,7 @@ def name(demo: Demo, tell: Tell) -> Section:
          "found; below each the error that is left. Green: two standard deviations of sensor noise."),
     ):  # fmt: skip
         if (plots / f"{kind}.png").is_file():
-            html += picture(plots / f"{kind}.png", caption)
+            html += picture(kind, (plots / f"{kind}.png").read_bytes(), caption)
     files = ((REPORT_FILE, "the whole report"), ("patch.yaml", "the patch"))
     links = [link(demo, demo.gap / name, text) for name, text in files if (demo.gap / name).is_file()]
     html += f"<p>Files: {', '.join(links)}.</p>"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_text
-from wlr_gym.base.html import anchor, document, section
+from wlr_gym.base.html import anchor, document, picture, section
 from wlr_gym.base.plots import save
 
 if TYPE_CHECKING:
@@ -92,7 +91,6 @@ _VERDICTS = {
     NOT_SHOWN: ("✗", "#8a6d00", "Not shown."),
     FAILED: ("✗", "#b03030", "Failed."),
 }
-_MEDIA = {".png": "image/png", ".webp": "image/webp"}
 
 
 @dataclass(frozen=True)
@@ -142,13 +140,6 @@ def link(demo: Demo, path: Path, text: str) -> str:
     return f'<a href="{escape(target)}{"/" if path.is_dir() else ""}">{escape(text)}</a>'
 
 
-def picture(path: Path, caption: str) -> str:
-    """Return a picture or film inside the page, with its caption."""
-    data = base64.b64encode(path.read_bytes()).decode("ascii")
-    source = f"data:{_MEDIA[path.suffix]};base64,{data}"
-    return f'<figure><img alt="{escape(path.stem)}" src="{source}"><figcaption>{escape(caption)}</figcaption></figure>'
-
-
 def filmed(
     path: Path,
     demo: Demo,
@@ -172,12 +163,12 @@ def filmed(
         film_beside(path, ENVIRONMENT, subjects, FIRST_SEED + demo.seed, seconds, keywords, view=view, fps=10.0, **options)
     except InputError as error:
         return paragraph(f"No film: {error}.")
-    return picture(path, caption)
+    return picture(path.stem, path.read_bytes(), caption, "image/webp")
 
 
 def drawn(figure: Figure, path: Path, caption: str) -> str:
     """Save a figure as PNG, and return it for the page."""
-    return picture(save(figure, path), caption)
+    return picture(path.stem, save(figure, path).read_bytes(), caption)
 
 
 # ---- the page --------------------------------------------------------------------------------------------------------
