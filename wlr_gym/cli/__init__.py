@@ -24,7 +24,6 @@ from typing import Any
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError, MissingPackageError, nearest, unknown_name
-from wlr_gym.base.jobs import import_modules
 
 #: Exit codes; an interrupted command ends as a shell reports SIGINT (128 + 2).
 OK = 0
@@ -131,6 +130,8 @@ def _import_modules(words: list[str]) -> list[str]:
     IMPORTED.clear()
     while words and words[0].partition("=")[0] == "--import":
         module, words = (words[0].partition("=")[2], words[1:]) if "=" in words[0] else ("".join(words[1:2]), words[2:])
+        from wlr_gym.base.jobs import import_modules
+
         try:
             import_modules([module])
         except (ModuleNotFoundError, TypeError, ValueError) as error:
