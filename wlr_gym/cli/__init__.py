@@ -130,10 +130,10 @@ def _import_modules(words: list[str]) -> list[str]:
     IMPORTED.clear()
     while words and words[0].partition("=")[0] == "--import":
         module, words = (words[0].partition("=")[2], words[1:]) if "=" in words[0] else ("".join(words[1:2]), words[2:])
-        from wlr_gym.base.jobs import import_modules
-
+        if os.getcwd() not in sys.path:
+            sys.path.insert(0, os.getcwd())  # as for python -m: modules lie where one works
         try:
-            import_modules([module])
+            importlib.import_module(module)
         except (ModuleNotFoundError, TypeError, ValueError) as error:
             raise InputError(f"--import {module}: expected a module of Python: {error}") from None
         IMPORTED.append(module)
