@@ -29,10 +29,10 @@ Series = tuple[Times, Array]
 ANGLES = ("yaw", "pitch", "roll", "tilt")
 
 
-def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> Series:
+def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> tuple[Times, Array, Times]:
     """Return times (ns) and an angle (rad) of a quaternion: ``yaw``, ``pitch``, ``roll``, or ``tilt`` off upright.
 
-    Lost frames, whose quaternion is no rotation, are left out.
+    Frames whose quaternion is no rotation (not known, or of length 0) are lost: their times (ns) come last.
 
     Args:
         topic: that has it.
@@ -45,39 +45,26 @@ def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, w
         InputError: no such quaternion.
     """
     stem, _, angle = field.rpartition(".")
-    at, quaternion, lost = _rotations(topic, stem, use, where)
-    at, quaternion = at[~lost], quaternion[~lost]
-    w, *vector = (quaternion / np.linalg.norm(quaternion, axis=1)[:, None]).T
+    names = next((names for names in _quaternions(stem) if names[0] in topic.fields), _quaternions(stem)[0])
+    parts = [topic.series(name, use, where) for name in names]
+    at = np.unique(np.concatenate([times for times, _ in parts]))
+    quaternion = np.full((len(at), len(parts)), np.nan)  # of a table's row some parts may be missing
+    for part, (times, values) in enumerate(parts):
+        quaternion[np.searchsorted(at, times), part] = values
+    seen = np.linalg.norm(quaternion, axis=1) >= 0.5
+    w, *vector = (quaternion[seen] / np.linalg.norm(quaternion[seen], axis=1)[:, None]).T
     if axes is not None:  # a proper turn of both frames: the quaternion's vector turns with them
         vector = [vector[XYZ.index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0) for axis in axes]
     yaw, pitch, roll = euler_angles(np.stack([w, *vector], axis=1))
     x, y, _ = vector
-    angles = {"yaw": yaw, "pitch": pitch, "roll": roll, "tilt": np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))}
-    values = angles[angle]
-    return at, np.unwrap(values) if angle == "yaw" else values
+    tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
+    values = {"yaw": np.unwrap(yaw), "pitch": pitch, "roll": roll, "tilt": tilt}[angle]
+    return at[seen], values, at[~seen]
 
 
-def lost_frames(topic: Topic, field: str, use: str, where: str) -> Times:
-    """Return the times (ns) at which the quaternion of an angle is no rotation: not known, or of length 0.
-
-    Its message's position is not one, either. Of a field that is no angle of a quaternion there are none.
-    """
-    stem, _, angle = field.rpartition(".")
-    if field in topic.fields or angle not in ANGLES:
-        return np.zeros(0, np.int64)
-    at, _, lost = _rotations(topic, stem, use, where)
-    return at[lost]
-
-
-def _rotations(topic: Topic, stem: str, use: str, where: str) -> tuple[Times, Array, NDArray[np.bool_]]:
-    """Return times, quaternions (n, 4), and which of them are no rotations: of a table's row some parts may be missing."""
-    names = next((names for names in _quaternions(stem) if names[0] in topic.fields), _quaternions(stem)[0])
-    parts = [topic.series(name, use, where) for name in names]
-    every = np.unique(np.concatenate([at for at, _ in parts]))
-    quaternion = np.full((len(every), len(parts)), np.nan)
-    for part, (at, values) in enumerate(parts):
-        quaternion[np.searchsorted(every, at), part] = values
-    return every, quaternion, ~(np.linalg.norm(quaternion, axis=1) >= 0.5)
+def has_angle(topic: Topic, field: str) -> bool:
+    """Whether a field that a topic does not have is to be taken of a quaternion."""
+    return field not in topic.fields and field.rpartition(".")[2] in ANGLES
 
 
 def quaternion_names(stem: str) -> set[str]:
@@ -92,8 +79,8 @@ def _quaternions(stem: str) -> list[list[str]]:
     ``q[3]``.
     """
     ordered = re.fullmatch(r"(.*)\[([wxyz]{4})\]", stem)
-    if ordered and sorted(ordered.group(2)) == list("wxyz"):
-        return [[f"{ordered.group(1)}[{ordered.group(2).index(part)}]" for part in "wxyz"]]
+    if ordered and sorted(ordered[2]) == list("wxyz"):
+        return [[f"{ordered[1]}[{ordered[2].index(part)}]" for part in "wxyz"]]
     return [[f"{stem}{joint}{part}" for part in "wxyz"] for joint in (".", "_", "")]
 
 
@@ -369,10 +356,9 @@ def _read_series(log: Log, found: LogMap, resolved: Mapping[str, Resolved], note
     """Return each channel's samples in SI units on the common clock, in the order of time; times once only."""
     lost: Times = np.zeros(0, np.int64)
     yaw = resolved.get("cam_yaw")
-    if yaw is not None:
-        where = f"{log.name}: channel 'cam_yaw'"
-        lost = lost_frames(log.topic(yaw.topic), yaw.field, found.use(yaw.topic).use, where)
-        if len(lost):
+    if yaw is not None and has_angle(topic := log.topic(yaw.topic), yaw.field):
+        _, _, lost = pose_angle(topic, yaw.field, found.use(yaw.topic).use, None, f"{log.name}: channel 'cam_yaw'")
+        if len(lost):  # their positions are none, either
             notes.append(f"topic '{yaw.topic}': {len(lost)} lost frame{'s are' if len(lost) > 1 else ' is'} left out")
     series = {}
     for column, source in resolved.items():
@@ -380,10 +366,10 @@ def _read_series(log: Log, found: LogMap, resolved: Mapping[str, Resolved], note
         where = f"{log.name}: channel '{column}'"
         if column in COMMANDS and (angle := resolved[column.replace("cmd", "pos")]).topic == source.topic:
             topic = with_torque_off(topic, source.field, angle.field)
-        if source.field in topic.fields or source.field.rpartition(".")[2] not in ANGLES:
-            at, raw = topic.series(source.field, clock.use, where)
+        if has_angle(topic, source.field):
+            at, raw, _ = pose_angle(topic, source.field, clock.use, found.frames.get("cam"), where)
         else:
-            at, raw = pose_angle(topic, source.field, clock.use, found.frames.get("cam"), where)
+            at, raw = topic.series(source.field, clock.use, where)
         keep = np.concatenate([np.diff(at) > 0, [True]])  # of two at one time, the later message
         if column not in COMMANDS:
             keep &= np.isfinite(raw)

@@ -34,7 +34,7 @@ from wlr_gym.data.logs.map import (
     units_of,
     words,
 )
-from wlr_gym.data.logs.rows import lost_frames, pose_angle
+from wlr_gym.data.logs.rows import has_angle, pose_angle
 from wlr_gym.data.logs.tables import TABLE
 from wlr_gym.data.logs.topics import Log, Topic
 from wlr_gym.robot import JOINTS, LEGS, Robot
@@ -511,11 +511,11 @@ class _Proposer:
         if chosen.field in topic.fields:
             at, values = topic.series(chosen.field, clock.use, self.log.name)
         else:
-            at, values = pose_angle(topic, chosen.field, clock.use, None, self.log.name)
+            at, values, _ = pose_angle(topic, chosen.field, clock.use, None, self.log.name)
         keep = np.isfinite(values)
         yaw = self.chosen.get("cam_yaw")
-        if column.startswith("cam") and yaw is not None and yaw.topic == chosen.topic:
-            keep &= ~np.isin(at, lost_frames(topic, yaw.field, clock.use, self.log.name))
+        if column.startswith("cam") and yaw is not None and yaw.topic == chosen.topic and has_angle(topic, yaw.field):
+            keep &= ~np.isin(at, pose_angle(topic, yaw.field, clock.use, None, self.log.name)[2])
         at, values = at[keep], values[keep]
         once = np.concatenate([[True], np.diff(at) > 0]) if len(at) else np.zeros(0, bool)
         origin = min(int(one.received[0]) for one in self.log.topics.values() if len(one.received))
@@ -636,7 +636,7 @@ class _Proposer:
             shown += ": the one that hardly changes points up"
             chosen = self.chosen["cam_yaw"]
             topic, stem = self.log.topics[chosen.topic], chosen.field.rpartition(".")[0]
-            _, tilts = pose_angle(topic, f"{stem}.tilt", self.clocks[chosen.topic].use, None, self.log.name)
+            _, tilts, _ = pose_angle(topic, f"{stem}.tilt", self.clocks[chosen.topic].use, None, self.log.name)
             is_tilted = (tilt := float(np.median(tilts))) > _TILTED  # off upright: no run begins on its side
             if is_tilted:
                 shown += f"; its quaternion tilts the robot by {np.degrees(tilt):.0f} deg: are its parts in another order?"
