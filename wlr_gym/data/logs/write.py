@@ -53,6 +53,9 @@ class McapSink:
 
     Args:
         file: open for writing, binary.
+
+    Attributes:
+        writer: of the package ``mcap``: ``flush`` it, and what has come so far can be read; ``finish`` it at the end.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -60,8 +63,8 @@ class McapSink:
         require_package("rosbags", "logs")
         from mcap.writer import Writer
 
-        self._writer = Writer(file)
-        self._writer.start(profile="ros2", library="wlr_gym")
+        self.writer = Writer(file)
+        self.writer.start(profile="ros2", library="wlr_gym")
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
 
@@ -69,19 +72,11 @@ class McapSink:
         """Write a message; a topic's first one writes its definition, too."""
         topic, kind, time, data = message
         if kind not in self._schemas:
-            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition(kind).encode())
+            self._schemas[kind] = self.writer.register_schema(kind, "ros2msg", definition(kind).encode())
         if topic not in self._channels:
             qos = {"offered_qos_profiles": ""}
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
-        self._writer.add_message(self._channels[topic], time, data, time)
-
-    def flush(self) -> None:
-        """Write out what has come so far: a reader finds it even if nothing comes after it."""
-        self._writer.flush()
-
-    def finish(self) -> None:
-        """Write the index; the file stays open."""
-        self._writer.finish()
+            self._channels[topic] = self.writer.register_channel(topic, "cdr", self._schemas[kind], qos)
+        self.writer.add_message(self._channels[topic], time, data, time)
 
 
 def export_run(run: Run, path: Path, form: str = "mcap") -> Path:
@@ -106,7 +101,7 @@ def export_run(run: Run, path: Path, form: str = "mcap") -> Path:
             sink = McapSink(file)
             for message in messages_of(run):
                 sink.add(message)
-            sink.finish()
+            sink.writer.finish()
 
     replace_file(path, write)
     return path
@@ -236,7 +231,7 @@ class McapStream:
                 except queue.Empty:
                     if over:
                         break
-            self._sink.finish()
+            self._sink.writer.finish()
         except Exception as error:  # whatever it is, it stops no robot
             self.trouble = f"{self.path}: {error or type(error).__name__}"
         finally:
@@ -252,7 +247,7 @@ class McapStream:
         for message in row_messages(dict(zip(self.columns, values, strict=True)), nanoseconds(t, self._offset)):
             self._sink.add(message)
         if time.monotonic() - self._flushed > FLUSH:
-            self._sink.flush()
+            self._sink.writer.flush()
             self._flushed = time.monotonic()
 
 
