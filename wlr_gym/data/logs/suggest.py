@@ -114,11 +114,11 @@ class _NameFacts(NamedTuple):
 
 
 def read_name(name: str) -> _NameFacts:
-    """Return what a name of a field, joint or column says; its part is by the last word: ``leg_wheel_fl`` is a wheel."""
+    """Return what a name of a field, joint or column says; ``leg_wheel_fl`` is a wheel on a leg."""
     found = words(name)
-    parts = [part for word in found for part, known in (("wheel", _WHEEL), ("leg", _LEG)) if word.startswith(known) or
-             word.endswith(known)]  # fmt: skip
-    part = "wheel" if "wheel" in parts or "w" in found else parts[0] if parts else None
+    is_wheel = any(word == "w" or word.startswith(_WHEEL) or word.endswith(_WHEEL) for word in found)
+    is_leg = any(word.startswith(_LEG) or word.endswith(_LEG) for word in found)
+    part = "wheel" if is_wheel else "leg" if is_leg else None
     quantity = next((kind for word in found for kind, known in _QUANTITIES.items() if word in known), None)
     return _NameFacts(_corner(found), part, quantity, any(word in _COMMAND for word in found))
 
