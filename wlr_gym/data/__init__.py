@@ -4,10 +4,14 @@
 :mod:`wlr_gym.data.replay`. ``simulate_again`` repeats a simulated run that has its record beside it.
 """
 
+from typing import TYPE_CHECKING
+
 from wlr_gym.data.check import Finding, check_table
 from wlr_gym.data.format import COLUMNS, Column, Profile, RunMeta
-from wlr_gym.data.replay import simulate_again, simulated_parameters
 from wlr_gym.data.runs import DataSet, Run, Simulation, convert, read_dataset, read_meta, read_run, write_meta, write_run
+
+if TYPE_CHECKING:
+    from wlr_gym.data.replay import simulate_again, simulated_parameters
 
 __all__ = [
     "COLUMNS",
@@ -28,3 +32,12 @@ __all__ = [
     "write_meta",
     "write_run",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Load a replay's simulators and effects when they are asked for: a robot that logs its runs needs none."""
+    if name not in ("simulate_again", "simulated_parameters"):
+        raise AttributeError(f"module 'wlr_gym.data' has no attribute '{name}'")
+    from wlr_gym.data import replay
+
+    return getattr(replay, name)
