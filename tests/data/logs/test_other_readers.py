@@ -51,7 +51,15 @@ def test_profile_encodings_index_and_counts(path, messages):
         summary = reader.get_summary()
         assert summary is not None
         assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
-        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        assert all(schema.encoding == "ros2msg" and schema.data for schema in summary.schemas.values())
+        kinds = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
+        assert kinds == {
+            "/wlr/run": "std_msgs/msg/String", "/joint_states": "sensor_msgs/msg/JointState",
+            "/joint_commands": "sensor_msgs/msg/JointState", "/imu": "sensor_msgs/msg/Imu",
+            "/supply": "wlr_gym_msgs/msg/Supply", "/camera": "wlr_gym_msgs/msg/Camera",
+            "/robot_description": "std_msgs/msg/String", "/pose": "geometry_msgs/msg/PoseStamped",
+            "/tf": "tf2_msgs/msg/TFMessage", "/slip": "visualization_msgs/msg/MarkerArray",
+        }  # fmt: skip
         statistics = summary.statistics
         assert statistics is not None
         assert statistics.message_count == sum(map(len, messages.values()))
@@ -76,6 +84,9 @@ def test_what_a_plot_shows_is_the_run(messages, run):
     for k, joint in enumerate(JOINTS):
         assert np.array_equal([message.position[k] for _, message in messages["/joint_states"]], run[f"pos_{joint}"])
     assert np.array_equal([message.angular_velocity.z for _, message in messages["/imu"]], run["gyro_z"])
+    poses = [message.pose.position.x for _, message in messages["/pose"]]
+    assert np.array_equal(poses, run["cam_x"][np.isfinite(run["cam_x"])])
+    assert 2 * len(messages["/slip"]) == len(messages["/tf"]) > 60
 
 
 def test_frames_make_one_tree_that_the_robots_links_are_in(messages):

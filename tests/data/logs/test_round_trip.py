@@ -16,7 +16,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.data import Run, convert, read_run, write_run
 from wlr_gym.data.format import COLUMNS, COMMANDS, REQUIRED, Profile, RunMeta
-from wlr_gym.data.logs import export_run, import_log, read_exported, read_logs
+from wlr_gym.data.logs import export_run, import_log, read_exported
 from wlr_gym.data.logs.messages import nanoseconds, seconds
 from wlr_gym.data.logs.write import McapStream
 from wlr_gym.data.runs import robot_of
@@ -95,36 +95,6 @@ def test_a_run_that_cannot_be_read_costs_no_older_export(form, name, tmp_path):
     run.write_text("broken")
     assert main(["export", str(run), "--to", form, "--force"]) == 2
     assert (tmp_path / name).exists()
-
-
-def test_what_tools_show(tmp_path):
-    """Joints, IMU, poses, transforms and arrows of slip, in types that Foxglove and PlotJuggler know, definitions inside."""
-    from mcap.reader import make_reader
-
-    run = read_run(write_run(tmp_path / "run_01.csv", rows_of(made_up(6.0))))
-    with export_run(run, tmp_path / "a.mcap").open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    kinds = {channel.topic: summary.schemas[channel.schema_id] for channel in summary.channels.values()}
-    assert {topic: schema.name for topic, schema in kinds.items()} == {
-        "/wlr/run": "std_msgs/msg/String",
-        "/joint_states": "sensor_msgs/msg/JointState",
-        "/joint_commands": "sensor_msgs/msg/JointState",
-        "/imu": "sensor_msgs/msg/Imu",
-        "/supply": "wlr_gym_msgs/msg/Supply",
-        "/camera": "wlr_gym_msgs/msg/Camera",
-        "/robot_description": "std_msgs/msg/String",
-        "/pose": "geometry_msgs/msg/PoseStamped",
-        "/tf": "tf2_msgs/msg/TFMessage",
-        "/slip": "visualization_msgs/msg/MarkerArray",
-    }
-    assert all(schema.encoding == "ros2msg" and schema.data for schema in kinds.values())
-    (log,) = read_logs(tmp_path / "a.mcap")
-    pose, moved = log.topics["/pose"], log.topics["/tf"]
-    seen = np.isfinite(run["cam_x"])
-    assert np.array_equal(pose.fields["pose.position.x"][1], run["cam_x"][seen])
-    assert np.abs(moved.fields["transforms[body].transform.translation.y"][1]).max() < 1.0
-    assert 2 * len(log.topics["/slip"].received) == len(moved.received) > 120
 
 
 # ---- while it goes on ------------------------------------------------------------------------------------------------
