@@ -12,7 +12,8 @@ from wlr_gym.base.settings import overlay
 from wlr_gym.physics.model import dynamics
 from wlr_gym.physics.plants.mujoco.mjcf import mjcf_text, read_mjcf
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, load_robot
-from wlr_gym.robot.interchange import parse_urdf, recognise, urdf_text
+from wlr_gym.robot.interchange.recognition import recognise
+from wlr_gym.robot.interchange.urdf import parse_urdf, urdf_text
 from wlr_gym.robot.parameters import Parameters
 
 mujoco: Any = pytest.importorskip("mujoco")

@@ -8,8 +8,8 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot import load_robot
-from wlr_gym.robot.interchange import parse_urdf, recognise, urdf_text
-from wlr_gym.robot.interchange.recognition import robot_over, robot_text
+from wlr_gym.robot.interchange.recognition import recognise, robot_over, robot_text
+from wlr_gym.robot.interchange.urdf import parse_urdf, urdf_text
 
 LINK = """
 <link name="{name}">

@@ -21,9 +21,16 @@ from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.terminal import ask_terminal, print_json, print_table
 from wlr_gym.physics.feasibility import ENTRIES, RobotFinding, capability_of, examine_robot, unusual
 from wlr_gym.robot import Robot, load_robot, robot_hash
-from wlr_gym.robot.interchange import ImportedRobot, LinkTree, parse_urdf, recognise, urdf_text
-from wlr_gym.robot.interchange.recognition import base_beside, of_all, robot_over, robot_text
-from wlr_gym.robot.interchange.urdf import NOT_IN_URDF
+from wlr_gym.robot.interchange.recognition import (
+    ImportedRobot,
+    LinkTree,
+    base_beside,
+    of_all,
+    recognise,
+    robot_over,
+    robot_text,
+)
+from wlr_gym.robot.interchange.urdf import NOT_IN_URDF, parse_urdf, urdf_text
 from wlr_gym.robot.outline import QUESTIONS, Question, derived_numbers, question_of
 
 Format = Literal["mjcf", "urdf"]

@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot import CORNER_SIGNS, FIRST_WHEEL, JOINTS, LEGS, WHEELS, Robot, standing_height
-from wlr_gym.robot.interchange import LinkJoint, LinkShape, LinkTree, Placement, RigidLink
+from wlr_gym.robot.interchange.recognition import LinkJoint, LinkShape, LinkTree, Placement, RigidLink
 from wlr_gym.robot.parameters import Parameters
 
 # pyright: reportAttributeAccessIssue=false
