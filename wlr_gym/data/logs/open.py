@@ -36,6 +36,7 @@ def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None =
     path = Path(path)
     read = _reader(path)
     columns = None if wanted is None else wanted.get(TABLE, ())
+    tell(0.0)
     if read is not None:
         yield _gathered(path, read, wanted, most, tell)
     elif path.is_dir():
