@@ -6,8 +6,7 @@
 
 from typing import TYPE_CHECKING
 
-from wlr_gym.data.check import Finding, check_table
-from wlr_gym.data.format import COLUMNS, Column, Profile, RunMeta
+from wlr_gym.data.format import COLUMNS, Column, Finding, Profile, RunMeta, check_table
 from wlr_gym.data.runs import DataSet, Run, Simulation, convert, read_dataset, read_meta, read_run, write_meta, write_run
 
 if TYPE_CHECKING:

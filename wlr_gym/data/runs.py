@@ -25,8 +25,7 @@ from wlr_gym.base.files import make_output_folder, replace_file, write_text
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.base.text import row_words
-from wlr_gym.data.check import Finding, check_names, check_table
-from wlr_gym.data.format import COLUMNS, META_FILE, ROBOT_FILE, SUFFIXES, RunMeta
+from wlr_gym.data.format import COLUMNS, META_FILE, ROBOT_FILE, SUFFIXES, Finding, RunMeta, check_names, check_table
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash
 from wlr_gym.robot.parameter_table import ELEMENTS
@@ -84,7 +83,7 @@ def read_run(path: str | Path) -> Run:
     """Read one run from CSV or Parquet, with the ``meta.yaml`` beside it.
 
     Raises:
-        InputError: not a run in the format (see :func:`wlr_gym.data.check.check_table`).
+        InputError: not a run in the format (see :func:`wlr_gym.data.format.check_table`).
     """
     import pandas
 

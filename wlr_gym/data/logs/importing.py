@@ -18,8 +18,7 @@ import yaml
 from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
-from wlr_gym.data.check import Finding, check_table
-from wlr_gym.data.format import COLUMNS, REQUIRED, RunMeta
+from wlr_gym.data.format import COLUMNS, REQUIRED, Finding, RunMeta, check_table
 from wlr_gym.data.logs.map import (
     CURRENTS,
     NO_PROFILE,
@@ -35,10 +34,9 @@ from wlr_gym.data.logs.map import (
     resolve,
 )
 from wlr_gym.data.logs.messages import RUN
-from wlr_gym.data.logs.open import first_messages, quiet, read_logs
+from wlr_gym.data.logs.readers import TABLE, first_messages, quiet, read_logs
 from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields, write_samples
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
-from wlr_gym.data.logs.tables import TABLE
 from wlr_gym.data.logs.topics import Share
 from wlr_gym.data.logs.write import read_exported
 from wlr_gym.data.runs import check_meta, next_run, note_robot, noted, own_robot, robot_of_meta, write_meta, write_run

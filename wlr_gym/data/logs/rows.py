@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, REQUIRED
 from wlr_gym.data.logs.map import LogMap, Resolved
-from wlr_gym.data.logs.tables import TABLE
+from wlr_gym.data.logs.readers import TABLE
 from wlr_gym.data.logs.topics import LOG, Log, Topic
 from wlr_gym.data.run_states import euler_angles
 from wlr_gym.robot import JOINTS, WHEELS

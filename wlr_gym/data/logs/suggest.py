@@ -34,8 +34,8 @@ from wlr_gym.data.logs.map import (
     units_of,
     words,
 )
+from wlr_gym.data.logs.readers import TABLE
 from wlr_gym.data.logs.rows import has_angle, pose_angle
-from wlr_gym.data.logs.tables import TABLE
 from wlr_gym.data.logs.topics import Log, Topic
 from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameter_table import XYZ

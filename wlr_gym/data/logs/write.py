@@ -37,7 +37,7 @@ from wlr_gym.data.logs.messages import (
     seconds,
     typestore,
 )
-from wlr_gym.data.logs.open import quiet, read_logs
+from wlr_gym.data.logs.readers import quiet, read_logs
 from wlr_gym.data.logs.topics import LOG, Share
 from wlr_gym.data.runs import Run, Simulation, is_shipped, own_robot
 from wlr_gym.robot import Robot, load_robot

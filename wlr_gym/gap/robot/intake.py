@@ -1,7 +1,7 @@
 """Whether measured runs can be used, before anything is fitted: :data:`CHECKS`, one after the other, in seconds.
 
 Thresholds come from the robot file, the resolution of its sensors and its kinematics; each stands with its reason before the
-checks that use it. What is no run at all is refused when it is read (:mod:`wlr_gym.data.check`).
+checks that use it. What is no run at all is refused when it is read (:mod:`wlr_gym.data.format`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.check import increments
-from wlr_gym.data.format import COMMANDS
+from wlr_gym.data.format import COMMANDS, increments
 from wlr_gym.data.runs import Run
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.physics import servo
