@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data import COLUMNS, Profile, RunMeta, check_table, convert, read_dataset, read_meta, read_run, write_run
 from wlr_gym.data.format import CAMERA, FLOW, REQUIRED
 from wlr_gym.data.logs import export_run
-from wlr_gym.data.logs.write import read_exported
+from wlr_gym.data.logs.messages import read_exported
 from wlr_gym.data.sensors import SENSED, channels
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 from wlr_gym.robot import JOINTS, LEGS, WHEELS

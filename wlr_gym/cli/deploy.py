@@ -50,7 +50,7 @@ from wlr_gym.policy import (
 from wlr_gym.robot import JOINTS, load_robot, robot_hash
 
 if TYPE_CHECKING:
-    from wlr_gym.data.logs.write import McapStream
+    from wlr_gym.data.logs.messages import McapStream
     from wlr_gym.envs.core import Core
     from wlr_gym.hardware.deployment import Deployment
     from wlr_gym.hardware.loop import ControlLoop
@@ -139,7 +139,7 @@ def run(options: DeployOptions) -> int:
                 loop.clock.machine.inject(fault)
         recorder = loop.recorder
         if options.mcap is not None:
-            from wlr_gym.data.logs.write import McapStream
+            from wlr_gym.data.logs.messages import McapStream
 
             recorder.stream = last.enter_context(McapStream(options.mcap, recorder.columns[1:], recorder.meta, loop.robot))
         keys = stack.enter_context(Keys())

@@ -110,7 +110,7 @@ def _target(options: ExportOptions) -> Path:
 
 def _export_runs(options: ExportOptions, form: str) -> list[Path]:
     from wlr_gym.data.logs import export_run
-    from wlr_gym.data.logs.write import FORMATS
+    from wlr_gym.data.logs.messages import FORMATS
     from wlr_gym.data.runs import read_run, some_runs
 
     refuse_given(

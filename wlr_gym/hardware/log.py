@@ -28,7 +28,7 @@ from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 from wlr_gym.robot import JOINTS, WHEEL_SLICE, Robot
 
 if TYPE_CHECKING:
-    from wlr_gym.data.logs.write import McapStream
+    from wlr_gym.data.logs.messages import McapStream
 
 PARTIAL = "partial_"
 #: Of a log, finished or not, with its number.

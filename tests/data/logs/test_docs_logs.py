@@ -9,9 +9,9 @@ from wlr_gym.base.settings import parse_config
 from wlr_gym.data.logs.map import CURRENTS, FACTORS, LogMap, resolve
 from wlr_gym.data.logs.messages import (
     CAMERA_TOPIC,
-    COMMANDS,
     DESCRIPTION,
     IMU,
+    JOINT_COMMANDS,
     JOINT_STATES,
     POSE,
     RUN,
@@ -45,4 +45,4 @@ def test_its_units_are_those_of_the_code():
 def test_its_topics_are_those_of_the_code():
     table = PAGE[PAGE.index("| topic | type |") : PAGE.index("### While the robot runs")]
     named = set(re.findall(r"`(/[\w/]+)`", table))
-    assert named == {RUN, JOINT_STATES, COMMANDS, IMU, SUPPLY, CAMERA_TOPIC, POSE, TRANSFORMS, SLIP, DESCRIPTION}
+    assert named == {RUN, JOINT_STATES, JOINT_COMMANDS, IMU, SUPPLY, CAMERA_TOPIC, POSE, TRANSFORMS, SLIP, DESCRIPTION}

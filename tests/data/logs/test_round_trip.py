@@ -17,8 +17,7 @@ from wlr_gym.cli import main
 from wlr_gym.data import Run, convert, read_run, write_run
 from wlr_gym.data.format import COLUMNS, COMMANDS, REQUIRED, Profile, RunMeta
 from wlr_gym.data.logs import export_run, import_log, read_exported
-from wlr_gym.data.logs.messages import nanoseconds, seconds
-from wlr_gym.data.logs.write import McapStream
+from wlr_gym.data.logs.messages import McapStream, nanoseconds, seconds
 from wlr_gym.data.runs import robot_of
 from wlr_gym.robot import load_robot, robot_content, robot_hash
 
@@ -121,7 +120,7 @@ def test_a_stream_is_the_run(tmp_path):
 
 
 def test_a_stream_that_was_killed_can_be_read_up_to_its_last_flush(tmp_path, monkeypatch):
-    monkeypatch.setattr("wlr_gym.data.logs.write.FLUSH", 0.0)
+    monkeypatch.setattr("wlr_gym.data.logs.messages.FLUSH", 0.0)
     rows = rows_of(made_up(4.0))
     writing = stream(tmp_path / "live.mcap", rows, close=False)
     while not writing._rows.empty():
@@ -143,7 +142,7 @@ def test_a_stream_without_a_row_leaves_no_file(tmp_path):
 
 
 def test_a_stream_never_waits_and_never_overwrites(tmp_path, monkeypatch):
-    monkeypatch.setattr("wlr_gym.data.logs.write.WAITING", 5)
+    monkeypatch.setattr("wlr_gym.data.logs.messages.WAITING", 5)
     writing = McapStream(tmp_path / "live.mcap", COMMANDS, RunMeta())  # its thread has not begun
     for k in range(8):
         writing.add(0.02 * k, [0.0] * len(COMMANDS))
@@ -154,7 +153,7 @@ def test_a_stream_never_waits_and_never_overwrites(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("broken")])
 def test_a_stream_that_failed_ends_at_once_though_its_queue_is_full(tmp_path, monkeypatch, error):
-    monkeypatch.setattr("wlr_gym.data.logs.write.WAITING", 5)
+    monkeypatch.setattr("wlr_gym.data.logs.messages.WAITING", 5)
 
     def fail(message):
         raise error

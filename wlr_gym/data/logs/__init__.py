@@ -7,10 +7,10 @@ reads any log as numbers and times.
 
 from wlr_gym.data.logs.importing import ImportedRun, import_log, suggest_map
 from wlr_gym.data.logs.map import LogMap, read_map
+from wlr_gym.data.logs.messages import ExportedRun, export_run, read_exported
 from wlr_gym.data.logs.readers import read_logs
 from wlr_gym.data.logs.suggest import Proposal
 from wlr_gym.data.logs.topics import Log, Topic
-from wlr_gym.data.logs.write import ExportedRun, export_run, read_exported
 
 __all__ = [
     "ExportedRun",

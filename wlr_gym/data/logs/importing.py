@@ -33,12 +33,11 @@ from wlr_gym.data.logs.map import (
     read_map,
     resolve,
 )
-from wlr_gym.data.logs.messages import RUN
+from wlr_gym.data.logs.messages import RUN, read_exported
 from wlr_gym.data.logs.readers import TABLE, first_messages, quiet, read_logs
 from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields, write_samples
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
 from wlr_gym.data.logs.topics import Share
-from wlr_gym.data.logs.write import read_exported
 from wlr_gym.data.runs import check_meta, next_run, note_robot, noted, own_robot, robot_of_meta, write_meta, write_run
 from wlr_gym.robot import Robot, load_robot, robot_hash
 
