@@ -98,14 +98,6 @@ def hole(at: Times) -> float:
     return max(_BRIDGED * float(np.median(np.diff(at))), _SHORT * 1e9)
 
 
-def interpolated(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
-    width = (at[after] - at[after - 1]).astype(np.float64)
-    share = (times - at[after - 1]) / width
-    result = values[after - 1] + share * (values[after] - values[after - 1])
-    return np.where(bridged(times, at), result, np.nan), _rms(np.minimum(np.abs(share), np.abs(1.0 - share)) * width)
-
-
 def bridged(times: Times, at: Times) -> NDArray[np.bool_]:
     """Whether the samples before and after each time say what was between them; a sample at the time itself does."""
     after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
@@ -117,45 +109,52 @@ def bridged(times: Times, at: Times) -> NDArray[np.bool_]:
     return inside | (at[after] == times) | (at[after - 1] == times)
 
 
-def held(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    middle = times + round(0.5e9 * period)
-    place = np.clip(np.searchsorted(at, middle, side="right") - 1, 0, len(at) - 1)
-    return values[place], _rms((at[place] - times)[np.abs(at[place] - times) < 1e9 * period])
-
-
-def nearest(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    place = _next_to(times, at)
-    distance = np.abs(at[place] - times)
-    return np.where(distance <= hole(at), values[place], np.nan), _rms(distance)
-
-
-def framed(times: Times, at: Times, values: Array, period: float) -> tuple[Array, float]:
-    """Each frame goes to the row next to it, moved along the line to the next frame; the other rows get none."""
-    inside = (at >= times[0] - 0.5e9 * period) & (at <= times[-1] + 0.5e9 * period)
-    rows = np.unique(_next_to(at[inside], times))
-    result = np.full(len(times), np.nan)
-    result[rows] = interpolated(times[rows], at, values, period)[0]
-    distance = np.abs(times[rows] - at[_next_to(times[rows], at)])
-    return result, _rms(distance)
-
-
 def _next_to(times: Times, at: Times) -> NDArray[np.intp]:
     after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
     return after - ((times - at[after - 1]) < (at[after] - times))
 
 
-def _rms(nanoseconds: NDArray[np.generic]) -> float:
-    return float(np.sqrt(np.mean(np.square(nanoseconds.astype(np.float64))))) * 1e-9 if len(nanoseconds) else 0.0
-
-
-#: Way -> function of rows' times, samples' times (ns), their values, and s between rows, which returns values at the rows and
-#: how far they were moved (s, rms); and what is said of it.
-TAKES = {
-    "interpolate": (interpolated, "interpolated"),
-    "hold": (held, "held at mid-step"),
-    "nearest": (nearest, "nearest sample"),
-    "frames": (framed, "next to frames"),
+#: Way that rows get a value -> what is said of it.
+HOW = {
+    "interpolate": "interpolated",
+    "hold": "held at mid-step",
+    "nearest": "nearest sample",
+    "frames": "next to frames",
 }
+
+
+def at_rows(times: Times, at: Times, values: Array, take: str, period: float) -> tuple[Array, str, float]:
+    """Return a channel's values at the rows, how they came about, and how far they were moved, s rms.
+
+    Args:
+        times: of the rows, ns.
+        at, values: of the channel's samples.
+        take: one of :data:`HOW`; a sample at a row's own time is taken as it is.
+        period: s between rows.
+    """
+    place = np.minimum(np.searchsorted(at, times), len(at) - 1)
+    exact = at[place] == times
+    if exact.all():
+        return values[place], "as recorded", 0.0
+    if take == "hold":
+        last = np.clip(np.searchsorted(at, times + round(0.5e9 * period), side="right") - 1, 0, len(at) - 1)
+        result, moved = values[last], at[last] - times
+        moved = moved[np.abs(moved) < 1e9 * period]
+    else:
+        moved = at[_next_to(times, at)] - times
+        if take == "nearest":
+            result = np.where(np.abs(moved) <= hole(at), values[_next_to(times, at)], np.nan)
+        else:
+            after = np.clip(np.searchsorted(at, times), 1, len(at) - 1)
+            share = (times - at[after - 1]) / (at[after] - at[after - 1]).astype(np.float64)
+            result = values[after - 1] + share * (values[after] - values[after - 1])
+            result = np.where(bridged(times, at), result, np.nan)
+        if take == "frames":  # each goes to the row next to it, moved along the line to the next; the other rows get none
+            inside = (at >= times[0] - 0.5e9 * period) & (at <= times[-1] + 0.5e9 * period)
+            rows = np.isin(np.arange(len(times)), _next_to(at[inside], times))
+            result, moved = np.where(rows, result, np.nan), moved[rows]
+    rms = float(np.sqrt(np.mean(np.square(moved.astype(np.float64))))) * 1e-9 if len(moved) else 0.0
+    return np.where(exact, values[place], result), HOW[take], rms
 
 
 # ---- what a log leaves open about joints -----------------------------------------------------------------------------
@@ -300,7 +299,7 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     for column, source in resolved.items():
         at, values = series[column]
         values = np.unwrap(values) if column == "cam_yaw" else values
-        table[column], how, moved = _at_rows(times, at, values, source.take, period)
+        table[column], how, moved = at_rows(times, at, values, source.take, period)
         samples[column] = ((at - origin) * 1e-9, values)
         rate, known = 1e9 / float(np.median(np.diff(at))), float(np.isfinite(table[column]).mean())
         facts.append(ChannelFact(column, source.topic, source.field, source.unit, rate, how, moved, known))
@@ -320,17 +319,6 @@ def _from_start(made: MadeRun) -> MadeRun:
         start, (t, values) = table[wheel][0], samples[wheel]
         table[wheel], samples[wheel] = table[wheel] - start, (t, values - start)
     return replace(made, table=table, samples=samples)
-
-
-def _at_rows(times: Times, at: Times, values: Array, take: str, period: float) -> tuple[Array, str, float]:
-    """Return a channel's values at the rows, how they came about, and how far they were moved (s, rms)."""
-    place = np.minimum(np.searchsorted(at, times), len(at) - 1)
-    exact = at[place] == times
-    if exact.all():
-        return values[place], "as recorded", 0.0
-    function, how = TAKES[take]
-    result, moved = function(times, at, values, period)
-    return np.where(exact, values[place], result), how, moved
 
 
 # ---- samples of a channel --------------------------------------------------------------------------------------------
