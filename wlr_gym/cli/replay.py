@@ -76,15 +76,16 @@ def run(options: ReplayOptions) -> int:
     on_robot = options.backend in REAL
     if not on_robot:
         options.refuse_robot_options("add --backend dynamixel")
-    if on_robot and options.video is not None:
-        raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
-    if options.video is not None:
-        check_video(options.video)
     check_number("--segment", options.segment, "s", above=LEAD)
-    runs = read_runs(options.runs)
+    runs, films = read_runs(options.runs), []
+    if (path := options.video) is not None:
+        if on_robot:
+            raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
+        check_video(path)
+        films = [path.with_name(f"{path.stem}_{one.name}{path.suffix}") for one in runs] if len(runs) > 1 else [path]
     patch = options.patch()
     options.refuse_results(options.out, ERRORS_FILE)
-    for film in _films(options, [one.name for one in runs]):
+    for film in films:
         refuse_existing(film, options.force, "--video")
     for measured in runs:  # a refusal leaves no folder behind
         prepare(measured, options.robot, effects=patch, segment=options.segment)
@@ -106,29 +107,20 @@ def run(options: ReplayOptions) -> int:
     found = {"robot": first.robot.name, "clock": first.clock, "physics_step": first.physics_step, "runs": driven}
     record_provenance(options.out, settings_of(options) | found | {"effects": patch.content()["effects"]})
     console.print(f"errors, plots and provenance: {options.out}")
-    if options.video is not None:
-        _film(options, results, patch, console)
+    for result, film in zip(results, films, strict=False):
+        _draw_film(options, result, patch, film, console)
     return OK if len(results) == len(runs) else FAILED
 
 
-def _films(options: ReplayOptions, names: Sequence[str]) -> list[Path]:
-    """Return a film for each run that is named; none without --video."""
-    if (path := options.video) is None:
-        return []
-    return [path] if len(names) == 1 else [path.with_name(f"{path.stem}_{name}{path.suffix}") for name in names]
-
-
-def _film(options: ReplayOptions, results: Sequence[ReplayResult], patch: Patch, console: Console) -> None:
+def _draw_film(options: ReplayOptions, result: ReplayResult, patch: Patch, target: Path, console: Console) -> None:
     from wlr_gym.data.replay import prepare
     from wlr_gym.data.watch import FPS, film_length, replay_film
     from wlr_gym.render import write_video
 
-    for result, target in zip(results, _films(options, [result.run.name for result in results]), strict=True):
-        _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment)
-        count = film_length(result.run)
-        pictures = replay_film(result, parameters, options.backend)
-        write_video(target, tracked(pictures, count, f"drawing {result.run.name}", console), FPS, count)
-        console.print(f"video: {target}")
+    _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment)
+    count, pictures = film_length(result.run), replay_film(result, parameters, options.backend)
+    write_video(target, tracked(pictures, count, f"drawing {result.run.name}", console), FPS, count)
+    console.print(f"video: {target}")
 
 
 def _replay_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
