@@ -61,11 +61,7 @@ class CompareOptions(JsonOption, OutOption, RunsRobotOption, PatchOption):
 
 
 def run(options: CompareOptions) -> int:
-    """Compare, print the tables, write the files; 0 when done, with ``--strict`` 1 when a bound is broken.
-
-    Raises:
-        InputError: unknown plant, excitation, effect or robot, unreadable runs, numbers out of range.
-    """
+    """Compare, print the tables, write the files; 0 when done, with ``--strict`` 1 when a bound is broken."""
     from wlr_gym.data.comparison import compare, markdown, parse_plant, save_map, save_motion_plot, summary_table, tables
 
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)

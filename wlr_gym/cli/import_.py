@@ -48,11 +48,7 @@ class ImportOptions(JsonOption):
 
 
 def run(options: ImportOptions) -> int:
-    """Import, and say how each channel came about and what is missing.
-
-    Raises:
-        InputError: unreadable logs, a map that does not fit, runs that a reader would refuse.
-    """
+    """Import, and say how each channel came about and what is missing."""
     from wlr_gym.data.logs import import_log, read_map
     from wlr_gym.data.logs.importing import MAP_FILE, require_own
 

@@ -59,11 +59,7 @@ class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
 
 
 def run(options: RecordOptions) -> int:
-    """Record; 0 when every motion was driven to its end, 1 when something stopped the robot, 130 when it was interrupted.
-
-    Raises:
-        InputError: unknown motion, backend, robot or patch, options that make no sense, ports that cannot be opened.
-    """
+    """Record; 0 when every motion was driven to its end, 1 when something stopped the robot, 130 when it was interrupted."""
     from wlr_gym.data.excitations import excite
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, read_commands, same_profile, write_commands

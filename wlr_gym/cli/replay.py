@@ -62,11 +62,7 @@ class ReplayOptions(JsonOption, ForceOption, RobotOption, PatchOption):
 
 
 def run(options: ReplayOptions) -> int:
-    """Replay, print the tables, write the files; 0 when done, 1 when something stopped the robot.
-
-    Raises:
-        InputError: unreadable runs, patch, robot or backend.
-    """
+    """Replay, print the tables, write the files; 0 when done, 1 when something stopped the robot."""
     from wlr_gym.data.replay import LEAD, prepare, save_plots
     from wlr_gym.data.runs import read_runs
     from wlr_gym.physics.plants import REAL, check_backend

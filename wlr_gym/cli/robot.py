@@ -214,11 +214,7 @@ def show_robot(options: ShowOptions) -> int:
 
 
 def import_robot(options: RobotImportOptions) -> int:
-    """Read, write, and say what was averaged or left out; 1 when the robot cannot stand, drive or turn.
-
-    Raises:
-        InputError: no such file, another kind of robot, or numbers that no robot file can hold; nothing is written.
-    """
+    """Read, write, and say what was averaged or left out; 1 when the robot cannot stand, drive or turn."""
     check_new_file(options.out, options.force, endings=ENDINGS)
     found = recognise(_read(options.file), idealise=options.idealise)
     name = options.name or found.name or options.out.stem
@@ -254,11 +250,7 @@ def _read(path: Path) -> LinkTree:
 
 
 def export_robot(options: RobotExportOptions) -> int:
-    """Write the file, and say what it cannot hold.
-
-    Raises:
-        InputError: no such robot, or a file that is there or of no known format.
-    """
+    """Write the file, and say what it cannot hold."""
     from wlr_gym.physics.plants.mujoco.mjcf import NOT_IN_MJCF, mjcf_text
 
     by_name = SUFFIXES.get(options.out.suffix.lower())

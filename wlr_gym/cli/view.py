@@ -43,11 +43,7 @@ class ViewOptions(RunsRobotOption, PatchOption):
 
 
 def run(options: ViewOptions) -> int:
-    """Serve the page until Ctrl-C.
-
-    Raises:
-        InputError: unreadable runs, patch, robot or backend, no such address.
-    """
+    """Serve the page until Ctrl-C."""
     import time
 
     from wlr_gym.data.watch import open_recordings

@@ -35,11 +35,7 @@ _LARGEST = np.repeat([2.0 * np.pi, 30.0], 4)
 
 
 def write_commands(folder: Path, motion: Motion) -> Path:
-    """Write a motion's setpoints as ``folder/<name>.csv`` (``t``, ``cmd_*``; empty = torque off), profile in ``meta.yaml``.
-
-    Raises:
-        InputError: the folder cannot be written to, or its ``meta.yaml`` says something else.
-    """
+    """Write a motion's setpoints as ``folder/<name>.csv`` (``t``, ``cmd_*``; empty = torque off), profile in ``meta.yaml``."""
     make_output_folder(folder)
     write_meta(folder, RunMeta(profile=motion.profile))
     t = np.array([round(tick * motion.period, 9) for tick in range(len(motion.setpoints))])
@@ -164,11 +160,7 @@ def meta_of(motion: Motion, robot: Robot, meta: RunMeta | None = None) -> RunMet
 
 
 def same_profile(motions: Sequence[Motion]) -> Profile:
-    """Return the servo profile of all motions.
-
-    Raises:
-        InputError: they have different ones; runs of one folder share ``meta.yaml``, and so the profile.
-    """
+    """Return the servo profile of all motions; different ones are refused: runs of one folder share ``meta.yaml``."""
     for motion in motions:
         if motion.profile != motions[0].profile:
             names = f"{motions[0].name} and {motion.name}"

@@ -80,11 +80,7 @@ class DataSet:
 
 
 def read_run(path: str | Path) -> Run:
-    """Read one run from CSV or Parquet, with the ``meta.yaml`` beside it.
-
-    Raises:
-        InputError: not a run in the format (see :func:`wlr_gym.data.format.check_table`).
-    """
+    """Read one run from CSV or Parquet, with the ``meta.yaml`` beside it."""
     import pandas
 
     path = Path(path)
@@ -113,11 +109,7 @@ def read_dataset(folder: str | Path) -> DataSet:
 
 
 def some_runs(folder: Path) -> list[Path]:
-    """Return the runs of a folder.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Return the runs of a folder; one without any is refused."""
     check_folder(folder, of="runs")
     paths = run_files(folder)
     if not paths:
@@ -238,11 +230,7 @@ def write_run(
 
 
 def write_meta(folder: str | Path, meta: RunMeta) -> Path:
-    """Write ``meta.yaml``, a servo profile only where it was stated; one that is there and says the same is left alone.
-
-    Raises:
-        InputError: the one that is there says something else (it holds for all runs of the folder).
-    """
+    """Write ``meta.yaml``, a servo profile only where it was stated; one that is there must say the same."""
     path = Path(folder) / META_FILE
     check_meta(folder, meta)
     if not path.is_file():
@@ -251,11 +239,7 @@ def write_meta(folder: str | Path, meta: RunMeta) -> Path:
 
 
 def check_meta(folder: str | Path, meta: RunMeta) -> None:
-    """Refuse to write meta data where there are others.
-
-    Raises:
-        InputError: the ``meta.yaml`` that is there says something else (it holds for all runs of the folder).
-    """
+    """Refuse to write meta data where there are others: a ``meta.yaml`` holds for all runs of its folder."""
     path = Path(folder) / META_FILE
     there = read_meta(folder) if path.is_file() else meta
     told = []
@@ -327,11 +311,7 @@ def is_shipped(robot: Robot) -> bool:
 
 
 def write_robot(path: Path, robot: Robot) -> None:
-    """Write a robot as a file that :func:`wlr_gym.robot.load_robot` reads, every number in it; the same content stays as it is.
-
-    Raises:
-        InputError: the file is there and holds another robot.
-    """
+    """Write a robot as a file that :func:`wlr_gym.robot.load_robot` reads, every number in it; another one is not replaced."""
     if path.is_file():
         if load_robot(path, check=False) != robot:
             raise InputError(f"{path}: holds another robot than '{robot.name}'; write to another folder")
@@ -351,9 +331,6 @@ def note_robot(folder: Path, robot: Robot, meta: RunMeta) -> RunMeta:
     """Return the meta data of runs in ``folder`` so that they find their robot wherever the folder goes.
 
     A robot that ships is named. Another one is written beside the runs, as ``robot.yaml``, and its fingerprint noted.
-
-    Raises:
-        InputError: the folder holds another robot.
     """
     found = noted(robot, meta)
     if found.robot == ROBOT_FILE:
@@ -446,11 +423,7 @@ def simulation_path(run: Path) -> Path:
 
 
 def read_simulation(run: Path) -> Simulation | None:
-    """Read the record beside a run; None where there is none.
-
-    Raises:
-        InputError: broken YAML, unknown key, or a value of the wrong kind.
-    """
+    """Read the record beside a run; None where there is none."""
     path = simulation_path(run)
     return parse_config(Simulation, read_yaml(path), str(path)) if path.is_file() else None
 

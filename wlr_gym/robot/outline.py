@@ -129,11 +129,7 @@ _BY_KEY = {question.key: question for question in QUESTIONS}
 
 
 def question_of(key: str) -> Question:
-    """Return the question about a key.
-
-    Raises:
-        InputError: none is; names the nearest.
-    """
+    """Return the question about a key; another key is refused with the nearest."""
     check_name("number of a new robot", key, _BY_KEY, "--set")
     return _BY_KEY[key]
 

@@ -68,11 +68,7 @@ class ImportedRun:
 def suggest_map(
     log: str | Path, given: Mapping[str, Any] | None = None, robot: str | None = None, tell: Share = quiet
 ) -> Proposal:
-    """Return a proposed map for a log; what ``given`` (a map's content) says is taken as it is.
-
-    Raises:
-        InputError: a log that cannot be read, or that holds nothing known; see :func:`wlr_gym.data.logs.suggest.propose`.
-    """
+    """Return a proposed map for a log; what ``given`` (a map's content) says is taken as it is."""
     meta = parse_config(LogMap, decided(given or {}), "map").meta
     return propose(next(read_logs(log, most=MOST, tell=tell)), _robot_of(meta, robot), given)
 
@@ -162,11 +158,7 @@ def _map_of(map: LogMap | Mapping[str, Any] | str | Path | None, log: Path, out:
 
 
 def check_map_file(path: Path, data: Mapping[str, Any]) -> None:
-    """Refuse to write a map's content where there is another one.
-
-    Raises:
-        InputError: the file is there, and says something else.
-    """
+    """Refuse to write a map's content where there is another one."""
 
     def meant(data: Mapping[str, Any]) -> object:
         """What a map says, to be compared: a robot file that it names stands beside it."""
@@ -181,11 +173,7 @@ def check_map_file(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def write_map(path: Path, map: LogMap | Proposal) -> None:
-    """Write a map, and a robot file that it names beside it; one that is there and says the same is left alone.
-
-    Raises:
-        InputError: the one that is there says something else.
-    """
+    """Write a map, and a robot file that it names beside it; one that is there must say the same."""
     proposal = map if isinstance(map, Proposal) else Proposal(content(map), (), ())
     check_map_file(path, proposal.content)
     if path.exists():

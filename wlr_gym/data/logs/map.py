@@ -97,11 +97,7 @@ def check_effort(column: str, table: Mapping[str, NDArray[np.float64]], unit: st
 
 
 def factor(column: str, unit: str | None, robot: Robot, where: str) -> float:
-    """Return what one ``unit`` of a column is in SI units, a count as the robot's encoders count; None = it is in SI units.
-
-    Raises:
-        InputError: no unit of this column.
-    """
+    """Return what one ``unit`` of a column is in SI units, a count as the robot's encoders count; None = it is in SI units."""
     si = COLUMNS[column].unit
     if unit is None:
         return 1.0
@@ -343,11 +339,7 @@ class Resolved:
 
 
 def resolve(found: LogMap, robot: Robot, where: str) -> dict[str, Resolved]:
-    """Return column -> where it comes from, for every channel of the map.
-
-    Raises:
-        InputError: a joint without a name, or a unit that is none of the channel's.
-    """
+    """Return column -> where it comes from, for every channel of the map."""
     resolved = {}
     for column in COLUMNS:
         keys = [column, *sorted((name for name, members in GROUPS.items() if column in members), key=len, reverse=True)]

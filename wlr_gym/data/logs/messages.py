@@ -402,11 +402,7 @@ def export_run(run: Run, path: Path, form: str = "mcap") -> Path:
 
 
 def messages_of(run: Run) -> Iterator[Sent]:
-    """Yield a run's messages in the order of time.
-
-    Raises:
-        InputError: rows less than 1 ns apart.
-    """
+    """Yield a run's messages in the order of time; rows less than 1 ns apart are refused."""
     offset = clock_offset(float(run["t"][0]))
     times = [nanoseconds(t, offset) for t in run["t"].tolist()]
     close = np.flatnonzero(np.diff(np.array(times, np.int64)) <= 0)

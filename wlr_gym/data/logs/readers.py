@@ -64,11 +64,7 @@ def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None =
 
 
 def first_messages(path: Path) -> Iterator[Message]:
-    """Yield the messages of a log from its beginning; none of a table.
-
-    Raises:
-        InputError: no such file, or one that cannot be read.
-    """
+    """Yield the messages of a log from its beginning; none of a table."""
     read = _reader(path)
     return iter(()) if read is None else read(path, lambda topic: True, [], quiet)
 
@@ -239,9 +235,6 @@ def mcap_messages(path: Path, wants: Callable[[str], bool], notes: list[str], te
         wants: whether a topic is decoded.
         notes: gets what is odd: a cut end, a broken chunk, types that cannot be decoded.
         tell: called with the share of the file that was read.
-
-    Raises:
-        InputError: no MCAP file at all.
     """
     require_package("mcap", "logs")
     require_package("rosbags", "logs")
@@ -338,11 +331,7 @@ ROSBAG1 = b"#ROSBAG V"
 
 
 def bag_messages(path: Path, wants: Callable[[str], bool], notes: list[str], tell: Share) -> Iterator[Message]:
-    """Yield the messages of the topics that ``wants`` asks for; see :func:`mcap_messages`.
-
-    Raises:
-        InputError: no bag, or one that cannot be opened.
-    """
+    """Yield the messages of the topics that ``wants`` asks for; see :func:`mcap_messages`."""
     require_package("rosbags", "logs")
     files = _mcap_files(path) if path.is_dir() else []
     if not files:

@@ -479,9 +479,6 @@ def runs_of(log: Log, found: LogMap, resolved: Mapping[str, Resolved], split: fl
     """Yield the runs that a map makes of a recording, cut where the robot is quietest.
 
     One, or several of about :data:`LONGEST`; with ``split``, runs of about so many seconds. Cut ones go across no hole.
-
-    Raises:
-        InputError: what :func:`wlr_gym.data.logs.rows.make_run` raises.
     """
     made = make_run(log, found, resolved)
     t = made.table["t"]

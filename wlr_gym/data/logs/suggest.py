@@ -414,11 +414,7 @@ class Proposal:
 
     @property
     def map(self) -> LogMap:
-        """The map.
-
-        Raises:
-            InputError: some of it is open.
-        """
+        """The map; one that is open in part is refused."""
         return parse_map(self.content, "map")
 
     @property

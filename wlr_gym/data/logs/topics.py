@@ -61,11 +61,7 @@ class Topic:
         return self.stamped
 
     def series(self, name: str, use: str, where: str) -> tuple[NDArray[np.int64], Array]:
-        """Return times (ns) and values of one field, in the order of time.
-
-        Raises:
-            InputError: no such field.
-        """
+        """Return times (ns) and values of one field, in the order of time; another name is refused."""
         if name not in self.fields:
             raise unknown_name("field", name, self.known | set(self.fields), f"{where}: topic '{self.name}'")
         rows, values = self.fields[name]
@@ -101,11 +97,7 @@ class Log:
         return f"{self.path}{self.part and ', '}{self.part}"
 
     def topic(self, name: str) -> Topic:
-        """Return a topic.
-
-        Raises:
-            InputError: there is none of that name.
-        """
+        """Return a topic; another name is refused with the nearest."""
         if name not in self.topics:
             raise unknown_name("topic", name, self.known | set(self.topics), self.name)
         return self.topics[name]
