@@ -75,15 +75,7 @@ def effort_range(column: str, robot: Robot) -> tuple[float, float]:
 def check_effort(column: str, table: Mapping[str, NDArray[np.float64]], unit: str, robot: Robot, where: str) -> None:
     """Refuse efforts that the robot's motor cannot have, and those in small units that its register would not show.
 
-    Args:
-        column: of the efforts.
-        table: of the run, in SI units.
-        unit: that the log is said to have them in.
-        robot: that the run is of.
-        where: for messages.
-
-    Raises:
-        InputError: naming file, column and value, and what was expected.
+    The table is in SI units; ``unit`` is the one that the log is said to have them in.
     """
     stall, count = effort_range(column, robot)
     sizes, moved = np.nan_to_num(np.abs(table[column])), np.ptp(table[column.replace("eff", "pos")])

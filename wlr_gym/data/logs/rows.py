@@ -182,12 +182,7 @@ def with_torque_off(topic: Topic, setpoint: str, angle: str) -> Topic:
 
 
 def without_wraps(series: Mapping[str, Series], joint: str) -> tuple[Array, str]:
-    """Return a joint's angles, jumps undone where they start anew after a turn or half of one; and what is to be said of it.
-
-    Args:
-        series: channel -> times (ns) and values, SI units.
-        joint: name.
-    """
+    """Return a joint's angles, jumps undone where they start anew after a turn or half of one; and what is to be said of it."""
     at, values = series[f"pos_{joint}"]
     steps, gaps = np.abs(np.diff(values)), np.diff(at)
     if np.ptp(values) >= _TURN or not (steps > np.pi).any():
@@ -275,12 +270,7 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     """Return the run that a map makes of a log.
 
     Every message of one topic makes a row, at its true time; a channel with a sample at that time has it as it is. Of the
-    others the map says how rows get a value. Nothing is brought to a raster.
-
-    Args:
-        log: what was recorded.
-        found: the map.
-        resolved: what it means for each channel.
+    others the map, which ``resolved`` has for each channel, says how rows get a value. Nothing is brought to a raster.
 
     Raises:
         InputError: a required channel, a topic or a field is missing, or no two rows have all that a row needs.
