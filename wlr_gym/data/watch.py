@@ -146,6 +146,11 @@ class RunRecording:
         patch: what is added to the ghost's nominal model.
         segment: s between the points at which the ghost starts anew from the measured robot; inf = never.
 
+    Attributes:
+        name: of the run.
+        length: s.
+        ghost, true: the replayed robot, and the run's own simulation.
+
     Raises:
         InputError: no such robot, a patch that does not fit it, or a run that is too short to be replayed.
     """
@@ -162,22 +167,13 @@ class RunRecording:
         self.robot: Robot
         self.robot, self._model = prepare(run, robot, effects=patch)
         self._t = run["t"] - run["t"][0]
+        self.name, self.length = run.name, float(self._t[-1])
         self._rolled = rolled_poses(run, self.robot)
         rows = len(self._t)
         self.ghost, self.true = Track(rows, len(CHANNELS)), Track(rows, 0)
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, name="ghost", daemon=True)
         self._thread.start()
-
-    @property
-    def name(self) -> str:
-        """Of the run."""
-        return self.run.name
-
-    @property
-    def length(self) -> float:
-        """s."""
-        return float(self._t[-1])
 
     @property
     def titles(self) -> Mapping[str, str]:
