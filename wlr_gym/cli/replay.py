@@ -30,8 +30,6 @@ from wlr_gym.render.video import check_video
 from wlr_gym.robot import CORNERS, JOINTS
 
 if TYPE_CHECKING:
-    import pandas
-
     from wlr_gym.data import Run
     from wlr_gym.data.replay import ReplayResult
     from wlr_gym.physics.effects import Patch
@@ -173,13 +171,13 @@ def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, othe
         for result in results:
             if (error := result.errors.get(name)) is not None:
                 rows.append((result.run.name, channel, corner, kind, *vars(error).values(), error.segment_rms / error.noise))
-    columns = ("run", "channel", "corner", "kind", "segment", "full", "unit", "noise", "ratio")
-    errors = pandas.DataFrame(rows, columns=columns)
+    columns: Any = ["run", "channel", "corner", "kind", "segment", "full", "unit", "noise", "ratio"]
+    errors: Any = pandas.DataFrame(rows, columns=columns)
 
     def rms(values: Any) -> float:
         return float(np.sqrt(np.mean(np.square(values))))
 
-    def table(of: pandas.DataFrame, first: str, second: str) -> list[tuple[str, ...]]:
+    def table(of: Any, first: str, second: str) -> list[tuple[str, ...]]:
         """Return the rms error in noise units, a row for each value of the first column, a cell for each of the second."""
         columns = CORNERS if second == "corner" else of[second].unique()
         values = of.groupby([first, second], sort=False)["ratio"].agg(rms).unstack()

@@ -91,7 +91,7 @@ class ParameterSpec:
     def nominal(self, robot: Any) -> list[float | None]:
         """Return the values (size) for a :class:`wlr_gym.robot.Robot`; None where its file has none."""
         found = (attrgetter(source)(robot) if isinstance(source, str) else source for source in self.sources)
-        values = [value for one in found for value in (one if isinstance(one, tuple) else (one,))]
+        values: list[Any] = [value for one in found for value in (one if isinstance(one, tuple) else (one,))]
         whole = values * (self.size // len(values))
         if not robot.individual:
             return whole

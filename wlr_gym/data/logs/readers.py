@@ -441,6 +441,7 @@ def read_table(path: Path, wanted: Collection[str] | None = None, most: int | No
         InputError: not such a file, no column of times, or times that go back.
     """
     notes: list[str] = []
+    times = np.zeros(0, np.int64)
     frame, decimal = _csv(path, most, notes) if path.suffix.lower() == ".csv" else (_parquet(path, most), ".")
     name = _time_column([str(column) for column in frame.columns], path)
     if len(frame):
@@ -458,7 +459,7 @@ def _parquet(path: Path, most: int | None) -> pandas.DataFrame:
     import pyarrow
 
     try:
-        frame = pandas.read_parquet(path)
+        frame: Any = pandas.read_parquet(path)
     except (OSError, ValueError, pyarrow.ArrowException) as error:
         raise cannot_read(path, "parquet", error) from None
     if frame.index.name is not None:
@@ -530,7 +531,7 @@ def _time_column(columns: list[str], path: Path) -> str:
 
 
 def _with_times(
-    frame: pandas.DataFrame, name: str, decimal: str, path: Path, notes: list[str]
+    frame: Any, name: str, decimal: str, path: Path, notes: list[str]
 ) -> tuple[pandas.DataFrame, NDArray[np.int64]]:
     """Return the rows that have a time, and their times in ns: comments and repeated names of columns have none."""
     import pandas
@@ -615,7 +616,7 @@ def _csv(path: Path, most: int | None, notes: list[str]) -> tuple[pandas.DataFra
     try:
         dialect = _dialect(path)
         separator = r"\s+" if dialect.separator == " " else dialect.separator
-        frame = pandas.read_csv(
+        frame: Any = pandas.read_csv(
             path, nrows=most, skipinitialspace=True, encoding=dialect.encoding, sep=separator, decimal=dialect.decimal,
             header=None, names=dialect.names, skiprows=dialect.skipped, index_col=False, low_memory=False,
         )  # fmt: skip

@@ -285,7 +285,8 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     times = _complete(log, resolved, series, times, notes)
     times = _without_holes(log, resolved, series, times, notes)
     origin, period = int(times[0]), float(np.median(np.diff(times))) * 1e-9
-    table, samples, facts = {"t": (times - origin) * 1e-9}, {}, []
+    table: dict[str, Array] = {"t": np.asarray((times - origin) * 1e-9, np.float64)}
+    samples, facts = {}, []
     for column, source in resolved.items():
         at, values = series[column]
         values = np.unwrap(values) if column == "cam_yaw" else values
