@@ -80,7 +80,11 @@ class DataSet:
 
 
 def read_run(path: str | Path) -> Run:
-    """Read one run from CSV or Parquet, with the ``meta.yaml`` beside it."""
+    """Read one run from CSV or Parquet, with the ``meta.yaml`` beside it.
+
+    Raises:
+        InputError: not a run in the format (see :func:`wlr_gym.data.format.check_table`).
+    """
     import pandas
 
     path = Path(path)
