@@ -107,11 +107,11 @@ def test_start_again_after_an_end(rig):
 
 def test_a_dry_run_writes_nothing(tmp_path):
     rig = Rig(tmp_path, dry_run=True)
-    before = {joint: bytes(servo.registers.memory) for joint, servo in rig.machine.servos.items()}
+    before = {joint: bytes(servo.memory) for joint, servo in rig.machine.servos.items()}
     rig.start(0.3)
     rig.loop.close()
     for joint, servo in rig.machine.servos.items():
-        assert servo.registers.memory[64:120] == before[joint][64:120], joint  # all setpoints, gains, torque and the watchdog
+        assert servo.memory[64:120] == before[joint][64:120], joint  # all setpoints, gains, torque and the watchdog
     assert rig.loop.reason == "end"
     assert read_run(tmp_path / "run_01.csv")["cmd_wheel_lf"][-1] == 0.0
 
@@ -185,10 +185,10 @@ def test_a_watchdog_that_cannot_be_armed_stops_the_start(rig):
 def test_checks_that_fail_write_nothing(rig):
     rig.machine.servos["leg_lf"].set("bus_watchdog", -1)
     rig.machine.servos["wheel_rr"].set("drive_mode", 1)
-    before = {joint: bytes(servo.registers.memory)[:120] for joint, servo in rig.machine.servos.items()}
+    before = {joint: bytes(servo.memory)[:120] for joint, servo in rig.machine.servos.items()}
     with pytest.raises(StoppedError, match="drive_mode"):
         rig.loop.start()
-    assert {joint: bytes(servo.registers.memory)[:120] for joint, servo in rig.machine.servos.items()} == before
+    assert {joint: bytes(servo.memory)[:120] for joint, servo in rig.machine.servos.items()} == before
 
 
 def test_the_watchdog_of_a_servo_that_does_not_confirm_torque_off_stays_armed(tmp_path):
