@@ -38,9 +38,7 @@ from wlr_gym.cli.terminal import print_json
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
 from wlr_gym.gap.decision import Decided
-from wlr_gym.gap.estimation.fit import fit, widened
-from wlr_gym.gap.estimation.model import nominal_model
-from wlr_gym.gap.estimation.uncertainty import half_widths
+from wlr_gym.gap.estimation import fit, half_widths, nominal_model, widened
 from wlr_gym.gap.report.result import Result
 from wlr_gym.gap.robot.problem import open_robot
 from wlr_gym.gap.workflow import SCATTER
@@ -434,9 +432,9 @@ def calibration_alone(decided: Decided, data: Path) -> Result:
     runs = decided.result.runs
     fitted = [k for k, name in enumerate(problem.runs) if name in runs.fit]
     scatter = SCATTER * problem.tempering
-    found = widened(problem, fitted, fit(problem, fitted, nominal_model(problem), scatter=scatter, steps=problem.steps))
+    found = widened(fit(nominal_model(problem), fitted, scatter=scatter))
     calibration = {}
-    for quantity, value, half in zip(problem.quantities, found.model.quantities, half_widths(problem, found), strict=False):
+    for quantity, value, half in zip(problem.quantities, found.model.quantities, half_widths(found), strict=False):
         interval = [value - half, value + half] if math.isfinite(half) else None
         known = {"nominal": quantity.nominal, "fitted": float(value), "unit": quantity.unit, "sigma": quantity.sigma}
         calibration[quantity.name] = known | {"ci95": interval}

@@ -13,8 +13,8 @@ import numpy as np
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import git_commit
-from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.model import FittedModel, nominal_model
+from wlr_gym.gap.estimation import fit
+from wlr_gym.gap.estimation import FittedModel, nominal_model
 from wlr_gym.gap.rig.pendulum import ENCODER_NOISE, JOINT, RIG_EFFECTS, PendulumProblem
 from wlr_gym.gap.rig.pendulum_recordings import read_recordings
 from wlr_gym.gap.rig.problem import law_candidates
@@ -40,10 +40,10 @@ def best_fit(problem, runs, effects, autocorrelation_time=None):
         stronger[names.index(name)] = value
     fits = []
     for quantities in (nominal(problem), stronger):
-        model = FittedModel(quantities)
+        model = FittedModel(problem, quantities)
         for name, values in effects.items():
             model = model.with_effect(candidates[name], values)
-        fits.append(fit(problem, runs, model, autocorrelation_time=autocorrelation_time, steps=25))
+        fits.append(fit(model, runs, autocorrelation_time=autocorrelation_time, steps=25))
     return min(fits, key=lambda found: found.cost)
 
 

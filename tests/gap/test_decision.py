@@ -4,6 +4,7 @@ import importlib
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -160,16 +161,16 @@ def test_a_motion_that_loads_what_is_in_question_promises_more(data):
 def test_motions_that_cannot_promise_more_are_not_worked_out(data, monkeypatch, bounds, whole, worked_out, best):
     monkeypatch.setattr(decision, "record_simulation", lambda path, motion, *_: data / "run_01.parquet")
     monkeypatch.setattr(decision, "RobotProblem", lambda *_, **__: None)
-    monkeypatch.setattr(decision, "_own_uncertainty", lambda *_: [])
     done = []
 
-    def promise(problem, found, left, motion, free=None):
+    def promise(motion, free=None):
         if free is not None:
             done.append(motion.name)
         per_second, most = (bounds if free is None else whole)[motion.name]
         return decision.Promise(motion, per_second * motion.duration, most, ("x", "y"))
 
-    monkeypatch.setattr(decision, "_promise", promise)
+    seen = SimpleNamespace(promise=promise, own_uncertainty=list)
+    monkeypatch.setattr(decision, "_Foresight", lambda *_: seen)
     drive = excite("straight", robot=ROBOT, seconds=1.0)
     motions = [decision.Motion(name, drive.setpoints, drive.period) for name in bounds]
     found = decision.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, ROBOT, [])

@@ -11,7 +11,7 @@ from engine_runs import META, ROBOT, abrupt, free_rear_wheels, nominal, posture_
 from wlr_gym.data import RunMeta
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.sensors import channel_noise
-from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation import nominal_model
 from wlr_gym.gap.robot import replay_loop as loop
 from wlr_gym.gap.robot import simulate
 from wlr_gym.gap.robot.problem import RobotProblem

@@ -19,7 +19,7 @@ from wlr_gym.data.record import record_simulation
 from wlr_gym.data.replay import replay
 from wlr_gym.data.runs import write_run
 from wlr_gym.gap.analysis import ParameterEstimate
-from wlr_gym.gap.estimation.model import FittedModel, level, mean_squares, nominal_model
+from wlr_gym.gap.estimation import FittedModel, level, mean_squares, nominal_model
 from wlr_gym.gap.problem import Setting, Unknown
 from wlr_gym.gap.report.recommendation import relation_of
 from wlr_gym.gap.report.result import write_result
@@ -208,7 +208,7 @@ def test_effects_that_meet_a_known_number_know_its_tolerance(tried, good):
         quantities = nominal.quantities.copy()
         for k, quantity in enumerate(problem.quantities):
             quantities[k] += tolerances * quantity.sigma * (quantity.name in moved)
-        return within_tolerance(problem, FittedModel(quantities).with_effect(chosen, values))
+        return within_tolerance(FittedModel(problem, quantities).with_effect(chosen, values))
 
     sigma = {name: problem.quantities[names.index(name)].sigma for name in names}
     radius = sigma["wheel.radius[wheel_lf]"] / ROBOT.wheel.radius
@@ -711,7 +711,7 @@ def test_time_of_a_formula_is_that_of_the_run_however_it_is_replayed(tmp_path):
 def test_floor_is_what_a_perfect_model_reaches(good):
     problem = RobotProblem([good])
     setting = nominal_model(problem).setting
-    floor = noise_floor(problem, setting, [0])
+    floor = noise_floor(nominal_model(problem), [0])
     assert 0.9 < floor < 1.25
     first, second = problem.remade(setting, [0], 2)
     assert level(mean_squares(first, problem.cap)) == floor  # however many are made

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from toy_problem import Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation import Replayed, fit, nominal_model
 from wlr_gym.gap.problem import Start
 from wlr_gym.gap.selection.hypothesis import Hypothesis, credible_names, occam, probabilities
 from wlr_gym.gap.selection.screening import Score
@@ -24,7 +23,7 @@ def score(problem, name, information):
 def hypothesis(problem, name, gain, cost=0.0):
     own, nominal = candidate(problem, name), nominal_model(problem)
     model = nominal.with_effect(own, (1.0,) * len(own.unknowns))
-    return Hypothesis(own, model, gain, np.full(5, gain / 5), 1.0, [], nominal, [], occam=cost)
+    return Hypothesis(model, RUNS, [], Replayed(nominal, RUNS, []), gain, np.full(5, gain / 5), 1.0, occam=cost)
 
 
 def test_an_unknown_costs_what_it_is_known_better_than_beforehand():
@@ -72,11 +71,11 @@ def test_the_set_holds_the_fewest_names_and_places_of_a_name_count_together():
 
 def test_a_search_keeps_the_names_that_respond_alike_and_those_alone():
     problem = Toy({}, [sized("drag", 3.0, "left")])
-    first = search_effects(problem, RUNS, fit(problem, RUNS, nominal_model(problem))).rounds[0]
+    first = search_effects(fit(nominal_model(problem), RUNS)).rounds[0]
     assert first.selected is not None
     assert {first.selected.candidate.name, *(h.candidate.name for h in first.equivalents)} == {"drag", "twin"}
     assert first.probabilities[1] < 1e-6
-    last = search_effects(Toy(), RUNS, fit(Toy(), RUNS, nominal_model(Toy()))).rounds[-1]
+    last = search_effects(fit(nominal_model(Toy()), RUNS)).rounds[-1]
     assert last.selected is None
     assert last.probabilities[1] > 0.5
     assert last.equivalents == []

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, Toy
 
-from wlr_gym.gap.estimation.model import estimate_noise
+from wlr_gym.gap.estimation import estimate_noise
 from wlr_gym.gap.validation.localisation import BINS, localise
 
 RUNS = 4

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.gap.estimation.model import level, mean_squares
+from wlr_gym.gap.estimation import level, mean_squares
 from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting
 from wlr_gym.gap.rig.own import CompiledRig, OwnRigProblem, check_rig, load_rig, open_own_rig, read_rig_runs
 from wlr_gym.gap.workflow import analyse, known_patch

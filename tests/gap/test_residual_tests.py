@@ -12,8 +12,7 @@ from gap_examples import EFFECT_FOUND
 from toy_problem import CHANNELS, NOISE, Toy
 
 from wlr_gym.gap.analysis import UNKNOWN, Turning
-from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation import fit, nominal_model
 from wlr_gym.gap.report.page import save_analysis
 from wlr_gym.gap.report.result import read_result
 from wlr_gym.gap.report.text import adequacy, sentence
@@ -25,7 +24,7 @@ RUNS = [0, 1, 2, 3, 4]
 
 
 def judged(problem, runs=RUNS):
-    found = adequacy_of(problem, runs, fit(problem, runs, nominal_model(problem)))
+    found = adequacy_of(fit(nominal_model(problem), runs))
     assert found is not None
     return found
 
@@ -150,8 +149,8 @@ def test_the_same_data_give_the_same_numbers():
 def test_a_model_that_cannot_make_its_runs_is_not_judged():
     problem = Toy()
     problem.remade = lambda setting, runs, count: iter(())
-    assert adequacy_of(problem, RUNS, fit(problem, RUNS, nominal_model(problem))) is None
-    assert np.isnan(noise_floor(problem, nominal_model(problem).setting, RUNS))
+    assert adequacy_of(fit(nominal_model(problem), RUNS)) is None
+    assert np.isnan(noise_floor(nominal_model(problem), RUNS))
     done = analyse_problem(problem, "toy")
     assert done.adequacy is None
     assert done.gap is not None

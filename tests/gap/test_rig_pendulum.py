@@ -15,8 +15,7 @@ from rig_fits import best_fit, nominal, position_errors
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.gap.analysis import Analysis, FoundEffect, ParameterEstimate
-from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.model import nominal_model
+from wlr_gym.gap.estimation import fit, nominal_model
 from wlr_gym.gap.problem import Setting
 from wlr_gym.gap.report.result import patch_of
 from wlr_gym.gap.rig import pendulum
@@ -668,7 +667,7 @@ def test_a_simulation_that_breaks_down_is_as_far_off_as_can_be(loaded):
 def named(problem, runs):
     """Name effects by the quick way: these benches answer smoothly."""
     problem.thorough = False
-    return search_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=12))
+    return search_effects(fit(nominal_model(problem), runs, steps=12))
 
 
 def test_hidden_load_dependent_friction_is_named_and_measured(loaded):
@@ -676,7 +675,7 @@ def test_hidden_load_dependent_friction_is_named_and_measured(loaded):
     found = named(loaded, fitted).fit.model
     assert [candidate.name for candidate, _ in found.effects] == ["load_dependent_friction"]
     assert found.effects[0][1][0] == pytest.approx(LOADED.load_ratio, rel=0.1)
-    without = fit(loaded, fitted, nominal_model(loaded), steps=12).model
+    without = fit(nominal_model(loaded), fitted, steps=12).model
     after, before = (position_errors(loaded, m.setting, held).mean() for m in (found, without))
     assert after < 0.3 * before
 

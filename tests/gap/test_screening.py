@@ -7,16 +7,14 @@ import pytest
 from toy_problem import CHANNELS, DECOYS, NOISE, NOMINAL, QUANTITIES, REACH, SIGMA, STRENGTH, Toy, candidate, coloured, sized
 
 from wlr_gym.gap.analysis import NOTHING_MISSING, UNKNOWN
-from wlr_gym.gap.estimation.fit import fit
-from wlr_gym.gap.estimation.model import autocorrelation_times, estimate_noise, nominal_model
+from wlr_gym.gap.estimation import autocorrelation_times, estimate_noise, fit, nominal_model
 from wlr_gym.gap.problem import Candidate, Start, Unknown
 from wlr_gym.gap.report.text import sentence
-from wlr_gym.gap.selection import cross_validation
+from wlr_gym.gap.selection import finalists
 from wlr_gym.gap.selection.screening import (
     LEAST_GAIN,
     LEAST_SHARE,
     PER_UNKNOWN,
-    Products,
     acceptance_threshold,
     largest_by_chance,
     rescored,
@@ -30,9 +28,9 @@ RUNS = range(5)
 
 
 def screened(problem, quantities=None):
-    found = fit(problem, RUNS, nominal_model(problem))
+    found = fit(nominal_model(problem), RUNS)
     probes, candidates = problem.candidates(found.model.setting, found.residuals, RUNS)
-    responded = responses(problem, found, RUNS, probes)
+    responded = responses(found, probes)
     return found, responded, screen(candidates, responded)
 
 
@@ -159,10 +157,10 @@ def test_effect_that_only_an_implausible_size_would_show_is_not_visible():
 
 def test_all_probes_are_one_batch():
     problem = Toy()
-    found = fit(problem, RUNS, nominal_model(problem))
+    found = fit(nominal_model(problem), RUNS)
     probes, _ = problem.candidates(found.model.setting, found.residuals, RUNS)
     before = problem.calls
-    responses(problem, found, RUNS, probes)
+    responses(found, probes)
     assert problem.calls - before == len(probes)
 
 
@@ -197,11 +195,11 @@ class Kinked(Toy):
 
 
 def scored(problem):
-    found = fit(problem, RUNS, nominal_model(problem), scatter=SCATTER)
+    found = fit(nominal_model(problem), RUNS, scatter=SCATTER)
     probes, candidates = problem.candidates(found.model.setting, found.residuals, RUNS)
-    responded = responses(problem, found, RUNS, probes)
+    responded = responses(found, probes)
     first = screen(candidates, responded)
-    return found, first, *rescored(problem, found, responded, Products.of(found, responded), first)
+    return found, first, *rescored(responded, first)
 
 
 def of(scores, name):
@@ -218,7 +216,7 @@ def test_an_error_that_lasts_counts_as_many_readings_once_it_is_explained():
     most = 3 * 5 * 200 * np.log(1.0 + 3.0**2)
     assert most / SCATTER < again[0].gain < most
     assert max(score.gain for score in again[1:]) < 0.2 * again[0].gain
-    search = search_effects(problem, RUNS, found)
+    search = search_effects(found)
     assert [one.label for one, _ in search.fit.model.effects] == ["decoy_0 body"]
     assert search.fit.model.effects[0][1] == pytest.approx((3.0,), abs=0.1)
 
@@ -235,7 +233,7 @@ def test_a_kink_does_not_hide_an_effect():
     assert of(again, "decoy_1").gain < LEAST_GAIN
     assert alone[0].candidate.name == "decoy_1"
     assert alone[0].values == pytest.approx((1.0,), abs=0.1)
-    search = search_effects(problem, RUNS, found)
+    search = search_effects(found)
     assert [one.label for one, _ in search.fit.model.effects] == ["decoy_1 body"]
     assert search.fit.model.effects[0][1] == pytest.approx((1.0,), abs=0.05)
 
@@ -271,10 +269,10 @@ def test_one_number_in_place_of_many_tolerances_is_no_effect(monkeypatch):
     """Tolerances that count many times make it cheap; counted once they explain as much."""
     problem = Together(dict.fromkeys(QUANTITIES, 1.5))
     problem.tempering = 10.0
-    found = fit(problem, RUNS, nominal_model(problem), scatter=6.0, steps=problem.steps)
-    assert search_effects(problem, RUNS, found).fit.model.effects == ()
-    monkeypatch.setattr(cross_validation, "_tolerances_do", lambda *_: False)
-    assert [one.name for one, _ in search_effects(problem, RUNS, found).fit.model.effects] == ["together"]
+    found = fit(nominal_model(problem), RUNS, scatter=6.0)
+    assert search_effects(found).fit.model.effects == ()
+    monkeypatch.setattr(finalists, "_tolerances_do", lambda *_: False)
+    assert [one.name for one, _ in search_effects(found).fit.model.effects] == ["together"]
 
 
 @pytest.mark.parametrize(("misfit", "verdict"), [(3.5, UNKNOWN), (np.inf, NOTHING_MISSING)])
@@ -308,14 +306,14 @@ ROWS = 1000
 
 def by_chance(problem, scatter=1.0):
     """Largest improvements of the draws, and that of the data themselves, to first order."""
-    found = fit(problem, RUNS, nominal_model(problem))
+    found = fit(nominal_model(problem), RUNS)
     found = replace(found, noise=estimate_noise(found.residuals, scatter=scatter))
     probes, candidates = problem.candidates(found.model.setting, found.residuals, RUNS)
-    responded = responses(problem, found, RUNS, probes)
-    products, first = Products.of(found, responded), screen(candidates, responded)
-    scores, _ = rescored(problem, found, responded, products, first)
+    responded = responses(found, probes)
+    first = screen(candidates, responded)
+    scores, _ = rescored(responded, first)
     actual = max(score.gain - PER_UNKNOWN * (len(score.values) - 1) for score in first)
-    return largest_by_chance(problem, RUNS, found, responded, products, scores), actual
+    return largest_by_chance(responded, scores), actual
 
 
 def test_the_draws_are_as_large_as_what_data_without_an_effect_give():

@@ -8,12 +8,11 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from toy_problem import DECOYS, NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
 from wlr_gym.gap.analysis import EFFECT_FOUND, NOT_EXCITED, NOTHING_MISSING
-from wlr_gym.gap.estimation.fit import Fit, fit, linearise
-from wlr_gym.gap.estimation.model import estimate_noise, nominal_model, total_cost, untouched
+from wlr_gym.gap.estimation import Fit, Replayed, estimate_noise, fit, linearise, nominal_model, replay
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.report.text import NOTHING_CLEAR, sentence, title
-from wlr_gym.gap.selection import cross_validation, search
-from wlr_gym.gap.selection.cross_validation import (
+from wlr_gym.gap.selection import finalists, search
+from wlr_gym.gap.selection.finalists import (
     MOST_LEFT,
     Finalist,
     accept,
@@ -47,7 +46,7 @@ RUNS = range(5)
 
 
 def named(problem, runs=RUNS):
-    return search_effects(problem, runs, fit(problem, runs, nominal_model(problem), steps=problem.steps))
+    return search_effects(fit(nominal_model(problem), runs))
 
 
 def level():
@@ -56,6 +55,11 @@ def level():
     start = Start((("gain",),), lambda a: (float(a[0]),))
     tolerance = Tolerance(("gain",), SIGMA[0], REACH, replaces=True)
     return Candidate("level", ("body",), (unknown,), (start,), tolerances=(tolerance,))
+
+
+def hypothesis(one, base, gain=1.0, predicted=1.0):
+    """What was fitted as a hypothesis beside a model without it, of so much gain."""
+    return Hypothesis(one.model, RUNS, one.residuals, base, gain, np.ones(5), predicted)
 
 
 def labels(found):
@@ -127,9 +131,9 @@ def test_scores_of_pure_noise_are_those_of_chance():
     gains = []
     for seed in range(20):
         problem = Toy(seed=seed, white=1.5, error=1.0, ar1=0.8)
-        current = fit(problem, RUNS, nominal_model(problem))
+        current = fit(nominal_model(problem), RUNS)
         probes, candidates = problem.candidates(None, [], [])
-        found = screen(candidates, responses(problem, current, RUNS, probes))
+        found = screen(candidates, responses(current, probes))
         gains += [score.gain for score in found if score.candidate.name.startswith("decoy")]
     # chi-square of one degree of freedom; the autocorrelation time is estimated, so the scale may be a little off
     assert 0.6 < np.mean(gains) < 1.7
@@ -172,12 +176,12 @@ def test_looking_for_a_second_effect_starts_from_how_numbers_act_beside_the_firs
     """Also where the calibrated parameters are as the file says."""
     problem = Toy({}, [sized("play", 1.3), sized("decoy_4", -0.7)], error=0.5)
     seen, refitting = [], search.refit
-    monkeypatch.setattr(search, "refit", lambda *args: seen.append((args[2], args[4])) or refitting(*args))
+    monkeypatch.setattr(search, "refit", lambda *args: seen.append((args[0], args[2])) or refitting(*args))
     named(problem)
     assert len(seen[-1][0].model.effects) == 2
     for current, given in seen:
-        as_given = untouched(problem, current.model)
-        assert np.array_equal(given, linearise(problem, as_given, RUNS)[1])
+        as_given = current.model.untouched()
+        assert np.array_equal(given, linearise(as_given, RUNS)[1])
 
 
 def test_sums_are_those_of_one_thread(monkeypatch):
@@ -249,25 +253,25 @@ def test_effect_that_replaces_a_parameter_is_refitted_without_it():
     """Calibration went as far as it may; beside the effect the number does nothing, and only its tolerance pulls it home."""
     problem = Toy({"gain": 6.0}, rows=400)
     problem.tempering = 3.0
-    current = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    given = linearise(problem, nominal_model(problem), RUNS)[1]
+    current = fit(nominal_model(problem), RUNS)
+    given = linearise(nominal_model(problem), RUNS)[1]
     probes, _ = problem.candidates(None, [], [])
-    score = screen([level()], responses(problem, current, RUNS, probes))[0]
-    refitted = refit(problem, RUNS, current, [score], given)[0]
-    whole = fit(problem, RUNS, nominal_model(problem).with_effect(level(), (5.0,)), scatter=current.noise.scatter)
+    score = screen([level()], responses(current, probes))[0]
+    refitted = refit(current, [score], given)[0]
+    whole = fit(nominal_model(problem).with_effect(level(), (5.0,)), RUNS, scatter=current.noise.scatter)
     assert refitted.values == pytest.approx((6.0,), abs=0.2)
     assert refitted.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
 
 
 def stuck_and_free(problem):
     """A calibrated model that cannot move, the one it should be, and the columns of the model as given."""
-    given = linearise(problem, nominal_model(problem), RUNS)[1]
-    residuals = [r[0] for r in problem.residuals([nominal_model(problem).setting], RUNS)]
-    free = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    noise = estimate_noise(residuals)
-    cost = total_cost(problem, nominal_model(problem), residuals, noise.autocorrelation_time)
+    given = linearise(nominal_model(problem), RUNS)[1]
+    (now,) = replay([nominal_model(problem)], RUNS)
+    free = fit(nominal_model(problem), RUNS)
+    noise = estimate_noise(now.residuals)
+    cost = now.cost_under(noise.autocorrelation_time)
     silent = [np.zeros_like(columns) for columns in given]
-    stuck = replace(free, model=nominal_model(problem), residuals=residuals, columns=silent, noise=noise, cost=cost)
+    stuck = replace(free, model=now.model, residuals=now.residuals, columns=silent, noise=noise, cost=cost)
     return stuck, free, given
 
 
@@ -276,8 +280,8 @@ def test_what_a_hypothesis_finds_by_starting_elsewhere_is_no_evidence_for_it():
     problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
     stuck, good, given = stuck_and_free(problem)
     probes, candidates = problem.candidates(None, [], [])
-    score = next(s for s in screen(candidates, responses(problem, good, RUNS, probes)) if s.candidate.name == "decoy_1")
-    refitted = refit(problem, RUNS, stuck, [score], given)[0]
+    score = next(s for s in screen(candidates, responses(good, probes)) if s.candidate.name == "decoy_1")
+    refitted = refit(stuck, [score], given)[0]
     assert refitted.model.quantities == pytest.approx(good.model.quantities, abs=0.2 * SIGMA.min())
     assert abs(refitted.gain) < 0.5 * LEAST_GAIN
 
@@ -286,10 +290,10 @@ def test_parameter_that_an_effect_replaces_is_a_rival_of_it():
     problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
     stuck, good, given = stuck_and_free(problem)
     probes, _ = problem.candidates(None, [], [])
-    score = screen([level()], responses(problem, good, RUNS, probes))[0]
-    refitted = refit(problem, RUNS, stuck, [score], given)[0]
+    score = screen([level()], responses(good, probes))[0]
+    refitted = refit(stuck, [score], given)[0]
     assert abs(refitted.gain) < 0.5 * LEAST_GAIN
-    assert refitted.base.quantities == pytest.approx(good.model.quantities, abs=0.2 * SIGMA.min())
+    assert refitted.base.model.quantities == pytest.approx(good.model.quantities, abs=0.2 * SIGMA.min())
 
 
 @pytest.mark.parametrize(("effects", "names"), [([], []), ([sized("drag", 0.8, "right")], ["drag right"])])
@@ -299,7 +303,7 @@ def test_stuck_calibration_is_done_anew_from_where_refits_have_been(monkeypatch,
     )  # also where none is predicted to improve the fit
     problem = Toy({"gain": 2.0, "offset": -2.0}, effects, rows=400)
     stuck, free, given = stuck_and_free(problem)
-    found = search_effects(problem, RUNS, stuck, given=given)
+    found = search_effects(stuck, given=given)
     assert labels(found) == names
     assert found.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
 
@@ -318,10 +322,9 @@ def test_selected_effect_converges_also_from_the_model_as_given():
     problem = Trap({}, [sized("drag", 0.8, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
     far = nominal_model(problem).with_effect(own, (0.5,))
-    trapped = fit(problem, RUNS, replace(far, quantities=far.quantities + np.array([2.4 * SIGMA[0], 0.0, 0.0])), steps=1)
-    base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    found = Hypothesis(own, trapped.model, 1.0, np.ones(5), 1.0, trapped.residuals, base.model, base.residuals)
-    final, _ = converge(problem, RUNS, Finalist(found, trapped), base, lambda text: None)
+    trapped = fit(replace(far, quantities=far.quantities + np.array([2.4 * SIGMA[0], 0.0, 0.0])), RUNS, steps=1)
+    base = fit(nominal_model(problem), RUNS)
+    final, _ = converge(Finalist(hypothesis(trapped, base), trapped), base)
     assert trapped.model.quantities[0] > NOMINAL[0] + 1.5 * SIGMA[0]
     assert final.fit.model.quantities[0] == pytest.approx(NOMINAL[0], abs=0.3 * SIGMA[0])
     assert final.hypothesis.values == final.fit.model.effects[0][1]
@@ -343,24 +346,24 @@ def test_converging_effect_searches_a_grid_of_places(monkeypatch):
     unknowns = (Unknown("size", "1", 0.0, -10.0, 10.0, 0.5), Unknown("place", "row", 0.0, 0.0, 200.0, 8.0, is_size=False))
     bump = Candidate("bump", ("body",), unknowns, ())
     problem = Bump({}, [bump.effect((3.0, 100.0))], rows=200)
-    lost = fit(problem, RUNS, nominal_model(problem).with_effect(bump, (3.0, 132.0)), steps=0)
+    lost = fit(nominal_model(problem).with_effect(bump, (3.0, 132.0)), RUNS, steps=0)
     assert lost.model.effects[0][1][1] > 120.0
-    assert best_on_grid(problem, RUNS, lost).effects[0][1][1] == pytest.approx(100.0, abs=2.0)
-    base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    found = Hypothesis(bump, lost.model, 1.0, np.ones(5), 1.0, lost.residuals, base.model, base.residuals)
+    assert best_on_grid(lost).effects[0][1][1] == pytest.approx(100.0, abs=2.0)
+    base = fit(nominal_model(problem), RUNS)
+    found = hypothesis(lost, base)
     # with fits that hardly move
-    monkeypatch.setattr(cross_validation, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
+    monkeypatch.setattr(finalists, "fit", lambda *arguments, **options: fit(*arguments, **options | {"steps": 0}))
     searched = []
 
-    def halfway(problem, runs, found):
+    def halfway(found):
         place = found.model.effects[-1][1][1]
         searched.append(place)
-        return nominal_model(problem).with_effect(bump, (3.0, 116.0)) if place > 120.0 else best_on_grid(problem, runs, found)
+        return nominal_model(problem).with_effect(bump, (3.0, 116.0)) if place > 120.0 else best_on_grid(found)
 
-    final, _ = converge(problem, RUNS, Finalist(found, lost), base, lambda text: None)
+    final, _ = converge(Finalist(found, lost), base)
     assert final.hypothesis.values[1] == pytest.approx(100.0, abs=2.0)
-    monkeypatch.setattr(cross_validation, "best_on_grid", halfway)
-    converge(problem, RUNS, Finalist(found, lost), base, lambda text: None)
+    monkeypatch.setattr(finalists, "best_on_grid", halfway)
+    converge(Finalist(found, lost), base)
     assert len(searched) == 2
 
 
@@ -368,26 +371,24 @@ def test_converging_effect_searches_a_grid_of_places(monkeypatch):
 def test_what_has_converged_is_not_fitted_from_there_again(monkeypatch, converged, fits):
     problem = Toy({}, [sized("drag", 0.8, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
-    base = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=problem.steps)
-    found = Hypothesis(own, whole.model, 1.0, np.ones(5), 1.0, whole.residuals, base.model, base.residuals)
+    base = fit(nominal_model(problem), RUNS)
+    whole = fit(nominal_model(problem).with_effect(own, (0.5,)), RUNS)
+    found = hypothesis(whole, base)
     starts = []
-    monkeypatch.setattr(
-        cross_validation, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options)
-    )
-    converge(problem, RUNS, Finalist(found, replace(whole, converged=converged)), base, lambda text: None)
-    assert starts.count(cross_validation.CONVERGENCE_STEPS) == fits
+    monkeypatch.setattr(finalists, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options))
+    converge(Finalist(found, replace(whole, converged=converged)), base)
+    assert starts.count(finalists.CONVERGENCE_STEPS) == fits
 
 
 def test_improvement_by_calibrated_parameters_alone_counts_for_nothing():
     """The model without the effect was left at nominal; the whole fit has found the numbers, and there is no effect."""
     problem = Toy({"gain": 2.0, "offset": -2.0}, rows=400)
     nominal, own = nominal_model(problem), candidate(problem, "drag", ["right"])
-    whole = fit(problem, RUNS, nominal.with_effect(own, (0.1,)), steps=problem.steps)
-    residuals = [r[0] for r in problem.residuals([nominal.setting], RUNS)]
-    left = Hypothesis(own, nominal.with_effect(own, (0.1,)), 1e3, np.ones(5), 1.0, residuals, nominal, residuals)
-    stuck = replace(whole, model=nominal, residuals=residuals)
-    (final,), _ = fit_finalists(problem, RUNS, stuck, [left], stuck)
+    whole = fit(nominal.with_effect(own, (0.1,)), RUNS)
+    (plain,) = replay([nominal], RUNS)
+    left = hypothesis(replace(plain, model=nominal.with_effect(own, (0.1,))), plain, 1e3)
+    stuck = replace(whole, model=nominal, residuals=plain.residuals)
+    (final,), _ = fit_finalists(stuck, [left], stuck)
     assert final.fit.model.quantities == pytest.approx(whole.model.quantities, abs=0.2 * SIGMA.min())
     assert abs(final.hypothesis.gain) < 0.5 * LEAST_GAIN
 
@@ -395,16 +396,14 @@ def test_improvement_by_calibrated_parameters_alone_counts_for_nothing():
 @pytest.mark.parametrize(("predicted", "is_fitted"), [(300.0, True), (90.0, False)])
 def test_hypothesis_that_falls_short_of_its_prediction_is_fitted_in_full(predicted, is_fitted):
     problem = Toy({}, [sized("drag", 0.8, "right")], rows=400)
-    current = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
+    current = fit(nominal_model(problem), RUNS)
 
     def refitted(name, gain, screened, *where):
         model = current.model.with_effect(candidate(problem, name, list(where) or None), (0.1,))
-        return Hypothesis(
-            model.effects[0][0], model, gain, np.ones(5), screened, current.residuals, current.model, current.residuals
-        )
+        return hypothesis(replace(current, model=model), current, gain, screened)
 
     hypotheses = [refitted("decoy_1", 60.0, 100.0), refitted("drag", -5.0, predicted, "right")]
-    finals, _ = fit_finalists(problem, RUNS, current, worth_a_fit(hypotheses), current)
+    finals, _ = fit_finalists(current, worth_a_fit(hypotheses), current)
     assert len(finals) == 1 + is_fitted
     assert (finals[0].hypothesis.candidate.label == "drag right") is is_fitted
     assert (finals[0].hypothesis.gain > 100.0) is is_fitted
@@ -420,26 +419,24 @@ def test_finalists_are_compared_with_the_same_model(monkeypatch):
         residuals = [ones * level] * 5
         noise = estimate_noise(residuals, np.full(3, 100.0))
         columns = [np.zeros((model.size, 600), np.float32)] * 5
-        cost = total_cost(problem, model, residuals, noise.autocorrelation_time)
-        return Fit(model, residuals, noise, cost, columns, np.eye(1), np.eye(1))
+        cost = Replayed(model, RUNS, residuals).cost_under(noise.autocorrelation_time)
+        return Fit(model, RUNS, residuals, noise, cost, columns, np.eye(1), np.eye(1))
 
-    def fitted(problem, runs, model, **_):
+    def fitted(model, runs, **_):
         return levelled(model, levels[model.effects[-1][0].name][0])
 
-    monkeypatch.setattr(cross_validation, "fit", fitted)
-    monkeypatch.setattr(cross_validation, "_afresh", lambda *_: [])
+    monkeypatch.setattr(finalists, "fit", fitted)
+    monkeypatch.setattr(finalists, "_afresh", lambda *_: [])
 
-    def left(problem, runs, whole, found, autocorrelation_time):
+    def left(whole, found, autocorrelation_time):
         return levelled(nominal, levels[found.name][1])
 
-    monkeypatch.setattr(cross_validation, "_left", left)
+    monkeypatch.setattr(finalists, "_left", left)
     current = levelled(nominal, 20.0)
     effects = [candidate(problem, name) for name in levels]
-    hypotheses = [
-        Hypothesis(c, nominal.with_effect(c, (0.1,)), 50.0, np.ones(5), 1.0, current.residuals, nominal, current.residuals)
-        for c in effects
-    ]
-    finals, bare = fit_finalists(problem, RUNS, current, hypotheses, current)
+    tried = [replace(current, model=nominal.with_effect(effect, (0.1,))) for effect in effects]
+    hypotheses = [hypothesis(one, current, 50.0) for one in tried]
+    finals, bare = fit_finalists(current, hypotheses, current)
     assert [final.hypothesis.candidate.name for final in finals] == ["decoy_0", "decoy_1"]
     assert finals[1].hypothesis.gain < 0.0 < finals[0].hypothesis.gain < LEAST_GAIN
     assert bare.residuals[0][0, 0] == pytest.approx(3.2 * ones[0, 0])
@@ -448,10 +445,10 @@ def test_finalists_are_compared_with_the_same_model(monkeypatch):
 def test_model_without_each_run_is_the_fit_without_it():
     problem = Toy({"gain": 1.0}, [sized("drag", 0.8, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
-    whole = fit(problem, RUNS, nominal_model(problem).with_effect(own, (0.5,)), steps=12)
-    for run, model in zip(RUNS, without_each_run(problem, whole), strict=True):
+    whole = fit(nominal_model(problem).with_effect(own, (0.5,)), RUNS, steps=12)
+    for run, model in zip(RUNS, without_each_run(whole), strict=True):
         rest = [other for other in RUNS if other != run]
-        anew = fit(problem, rest, whole.model, autocorrelation_time=whole.noise.autocorrelation_time, steps=12)
+        anew = fit(whole.model, rest, autocorrelation_time=whole.noise.autocorrelation_time, steps=12)
         assert model.effects[0][1] == pytest.approx(anew.model.effects[0][1], abs=0.01)
         assert model.quantities == pytest.approx(anew.model.quantities, abs=0.2 * SIGMA.min())
 
@@ -462,12 +459,12 @@ def test_effect_of_one_run_fails_cross_validation(seen_in, passes):
     for run in seen_in:
         problem._measured[run] = problem._measured[run] + 1.5 * problem.shape("drag right")[run] * NOISE
     own = candidate(problem, "drag", ["right"])
-    bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)), steps=problem.steps)
+    bare = fit(nominal_model(problem), RUNS)
+    whole = fit(bare.model.with_effect(own, (0.5,)), RUNS)
     autocorrelation_time = whole.noise.autocorrelation_time
-    gain = total_cost(problem, bare.model, bare.residuals, autocorrelation_time) - whole.cost
+    gain = bare.cost_under(autocorrelation_time) - whole.cost
     assert gain > LEAST_GAIN
-    assert cross_validated(problem, RUNS, bare, whole, autocorrelation_time) is passes
+    assert cross_validated(bare, whole, autocorrelation_time) is passes
 
 
 @pytest.mark.parametrize(
@@ -479,14 +476,13 @@ def test_what_tolerances_nearly_do_is_no_effect(monkeypatch, quantities, falls_s
     problem.tempering = 3.0
     meets = (Tolerance(quantities, 1.0, REACH),) if quantities else ()
     own = replace(candidate(problem, "drag", ["right"]), tolerances=meets)
-    bare = fit(problem, RUNS, nominal_model(problem))
-    whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)))
-    hypothesis = Hypothesis(own, whole.model, 30.0, np.ones(5), 30.0, whole.residuals, bare.model, bare.residuals)
-    said = set()
+    bare = fit(nominal_model(problem), RUNS)
+    whole = fit(bare.model.with_effect(own, (0.5,)), RUNS)
+    final, said = Finalist(hypothesis(whole, bare, 30.0, 30.0), whole), set()
     for short in (0.9, 1.2, 1.6):
         costs = iter([short * LEAST_GAIN, 0.0])
-        monkeypatch.setattr(cross_validation, "fit", lambda *_, costs=costs, **__: replace(bare, cost=next(costs)))
-        if cross_validation._tolerances_do(problem, RUNS, LEAST_GAIN, Finalist(hypothesis, whole), bare):
+        monkeypatch.setattr(finalists, "fit", lambda *_, costs=costs, **__: replace(bare, cost=next(costs)))
+        if finalists._tolerances_do(LEAST_GAIN, final, bare):
             said.add(short)
     assert said == falls_short
 
@@ -495,13 +491,13 @@ def test_one_run_may_hold_most_of_what_an_effect_explains(monkeypatch):
     """Each run alone shows the effect: a share of what the fit improves by is not asked then."""
     problem = Toy({}, [sized("drag", 1.0, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
-    bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)), steps=problem.steps)
+    bare = fit(nominal_model(problem), RUNS)
+    whole = fit(bare.model.with_effect(own, (0.5,)), RUNS)
     tau = whole.noise.autocorrelation_time
-    monkeypatch.setattr(cross_validation, "LEAST_VALIDATED", 1e3)  # no share is enough
-    assert cross_validated(problem, RUNS, bare, whole, tau)
-    monkeypatch.setattr(cross_validation, "LEAST_GAIN", 1e6)
-    assert not cross_validated(problem, RUNS, bare, whole, tau)
+    monkeypatch.setattr(finalists, "LEAST_VALIDATED", 1e3)  # no share is enough
+    assert cross_validated(bare, whole, tau)
+    monkeypatch.setattr(finalists, "LEAST_GAIN", 1e6)
+    assert not cross_validated(bare, whole, tau)
 
 
 def test_what_refits_miss_is_fitted_in_full_where_much_is_left(monkeypatch):
@@ -509,8 +505,8 @@ def test_what_refits_miss_is_fitted_in_full_where_much_is_left(monkeypatch):
     problem = Toy({}, [sized("drag", 0.8, "right")], rows=400)
     refits = search.refit
 
-    def stuck(problem, runs, current, scores, given):
-        found = refits(problem, runs, current, scores, given)
+    def stuck(current, scores, given):
+        found = refits(current, scores, given)
         return [replace(h, gain=min(h.gain, 1.0), predicted_gain=0.0) for h in found]
 
     monkeypatch.setattr(search, "refit", stuck)
@@ -521,19 +517,20 @@ def test_what_refits_miss_is_fitted_in_full_where_much_is_left(monkeypatch):
 
 def test_the_second_look_takes_the_most_promising_of_other_names():
     problem = Toy()
-    current = fit(problem, RUNS, nominal_model(problem))
+    current = fit(nominal_model(problem), RUNS)
 
     def refitted(name, gain, predicted):
         model = current.model.with_effect(candidate(problem, name), (0.1,))
-        same = current.residuals
-        return Hypothesis(model.effects[0][0], model, gain, np.ones(5), predicted, same, current.model, same)
+        return hypothesis(replace(current, model=model), current, gain, predicted)
 
     had = refitted("decoy_0", 9.0, 9.0)
     others = [refitted(f"decoy_{k}", 8.0 - k, 1.0) for k in range(1, 3)]
     late = refitted("twin", -5.0, 30.0)
     chosen = left_to_fit([had, *others, replace(others[0], gain=0.5), late], [Finalist(had, current)])
     assert chosen == [late, *others]
-    many = [replace(late, candidate=replace(late.candidate, name=f"name_{k}")) for k in range(2 * MOST_LEFT)]
+    own = late.candidate
+    effects = [replace(own, name=f"name_{k}") for k in range(2 * MOST_LEFT)]
+    many = [replace(late, model=current.model.with_effect(effect, (0.1,))) for effect in effects]
     assert len(left_to_fit(many, [])) == MOST_LEFT
 
 
@@ -541,17 +538,14 @@ def test_the_second_look_takes_the_most_promising_of_other_names():
 def test_of_nearly_equal_effects_that_with_fewer_unknowns_is_accepted(monkeypatch, more, first):
     problem = Toy()
     monkeypatch.setattr(problem, "thorough", True)  # all have converged
-    current = fit(problem, RUNS, nominal_model(problem))
+    current = fit(nominal_model(problem), RUNS)
 
     def final(name, gain, *values):
         model = current.model.with_effect(candidate(problem, name), values)
-        own = Hypothesis(
-            model.effects[0][0], model, gain, np.ones(5), gain, current.residuals, current.model, current.residuals
-        )
-        return Finalist(own, current)
+        return Finalist(hypothesis(replace(current, model=model), current, gain, gain), current)
 
     finals = [final("ripple", 50.0 + more, 1.0, 0.5), final("twin", 50.0, 1.0)]
-    accepted, _, _ = accept(problem, RUNS, LEAST_GAIN, finals, current, lambda text: None)
+    accepted, _, _ = accept(LEAST_GAIN, finals, current)
     assert accepted is not None
     assert accepted.hypothesis.candidate.name == first
 
@@ -561,8 +555,8 @@ def test_one_run_of_five_may_be_thrown_off(monkeypatch, thrown_off, passes):
     """A rough cost, as of play: next to the fit, one run is far from the data."""
     problem = Toy({}, [sized("drag", 1.0, "right")], rows=400)
     own = candidate(problem, "drag", ["right"])
-    bare = fit(problem, RUNS, nominal_model(problem), steps=problem.steps)
-    whole = fit(problem, RUNS, bare.model.with_effect(own, (0.5,)), steps=problem.steps)
+    bare = fit(nominal_model(problem), RUNS)
+    whole = fit(bare.model.with_effect(own, (0.5,)), RUNS)
     true = problem.residuals
 
     def rough(settings, runs):
@@ -570,7 +564,7 @@ def test_one_run_of_five_may_be_thrown_off(monkeypatch, thrown_off, passes):
         return [r + far for r in true(settings, runs)]
 
     monkeypatch.setattr(problem, "residuals", rough)
-    assert cross_validated(problem, RUNS, bare, whole, whole.noise.autocorrelation_time) is passes
+    assert cross_validated(bare, whole, whole.noise.autocorrelation_time) is passes
 
 
 class Once(Toy):
@@ -645,9 +639,9 @@ def test_an_effect_that_is_refuted_after_it_made_an_earlier_one_redundant_leaves
     problem = Toy({}, [sized("decoy_1", 1.5), sized("drag", 0.8, "right")], rows=400, runs=6)
     problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
 
-    def only_the_last(problem, runs, current, tell):
+    def only_the_last(current, tell):
         while len(current.model.effects) > 1:
-            current = fit(problem, runs, current.model.without_effect(0), scatter=current.noise.scatter)
+            current = fit(current.model.without_effect(0), current.runs, scatter=current.noise.scatter)
         return current
 
     monkeypatch.setattr(search, "remove_redundant", only_the_last)
@@ -677,10 +671,10 @@ def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):
         asked.append(1)
         return accepted, finals, free if len(asked) == 1 else bare
 
-    monkeypatch.setattr(search, "_without_more", lambda problem, current, hypotheses: current)
+    monkeypatch.setattr(search, "_without_more", lambda current, hypotheses: current)
     monkeypatch.setattr(search, "fit_finalists", keep_bare(search.fit_finalists))
     monkeypatch.setattr(search, "accept", found_late)
-    found = search_effects(problem, RUNS, stuck, given=given)
+    found = search_effects(stuck, given=given)
     assert found.calibrated is not stuck
     assert found.calibrated.model.quantities == pytest.approx(free.model.quantities, abs=0.5 * SIGMA.min())
 
@@ -688,8 +682,8 @@ def test_better_model_found_while_converging_is_calibrated_from(monkeypatch):
 def keep_bare(finding):
     """Finalists that lead to no better model without them."""
 
-    def found(problem, runs, current, hypotheses, bare, tell):
-        return finding(problem, runs, current, hypotheses, bare, tell)[0], bare
+    def found(current, hypotheses, bare, tell):
+        return finding(current, hypotheses, bare, tell)[0], bare
 
     return found
 
@@ -697,13 +691,13 @@ def keep_bare(finding):
 def test_effect_is_selected_only_once_it_has_converged(monkeypatch):
     problem = Toy({}, [sized("drag", 0.8, "right")])
     assert labels(named(problem)) == ["drag right"]
-    converging = cross_validation.converge
+    converging = finalists.converge
 
     def gone(*arguments):
         final, bare = converging(*arguments)
         return replace(final, hypothesis=replace(final.hypothesis, tolerable=True)), bare
 
-    monkeypatch.setattr(cross_validation, "converge", gone)
+    monkeypatch.setattr(finalists, "converge", gone)
     assert labels(named(problem)) == []
 
 
@@ -722,7 +716,7 @@ def test_redundant_effect_is_removed():
     for name, place, value in (("decoy_0", None, 0.2), ("drag", ["right"], 0.5), ("decoy_3", None, -0.1)):
         model = model.with_effect(candidate(problem, name, place), (value,))
     told = []
-    left = remove_redundant(problem, RUNS, fit(problem, RUNS, model), told.append)
+    left = remove_redundant(fit(model, RUNS), told.append)
     assert [c.label for c, _ in left.model.effects] == ["drag right"]
     assert sorted(told[k] for k in range(len(told)) if told[k].startswith("removed")) == [
         "removed: decoy_0 body",
@@ -734,10 +728,10 @@ def test_redundant_effect_is_removed():
 def test_effect_that_replaces_a_parameter_is_removed_for_that_parameter():
     problem = Toy({"gain": 2.0}, [sized("drag", 0.7, "left")], error=1.0)
     drag = candidate(problem, "drag", ["left"])
-    both = fit(problem, RUNS, nominal_model(problem).with_effect(level(), (2.0,)).with_effect(drag, (0.7,)), steps=4)
-    alone = fit(problem, RUNS, both.model.without_effect(0), autocorrelation_time=both.noise.autocorrelation_time, steps=4)
+    both = fit(nominal_model(problem).with_effect(level(), (2.0,)).with_effect(drag, (0.7,)), RUNS, steps=4)
+    alone = fit(both.model.without_effect(0), RUNS, autocorrelation_time=both.noise.autocorrelation_time, steps=4)
     assert alone.cost - both.cost < LEAST_GAIN
-    assert [found.label for found, _ in remove_redundant(problem, RUNS, both).model.effects] == [drag.label]
+    assert [found.label for found, _ in remove_redundant(both).model.effects] == [drag.label]
 
 
 def test_needed_effects_are_kept():
@@ -745,20 +739,18 @@ def test_needed_effects_are_kept():
     model = nominal_model(problem)
     for name, place in (("decoy_0", None), ("drag", ["right"])):
         model = model.with_effect(candidate(problem, name, place), (0.8,))
-    assert len(remove_redundant(problem, RUNS, fit(problem, RUNS, model)).model.effects) == 2
+    assert len(remove_redundant(fit(model, RUNS)).model.effects) == 2
 
 
 def test_gain_after_refit_is_the_fall_of_the_cost():
     problem = Toy({"gain": 1.0}, [sized("decoy_1", 0.5)], error=1.0)
-    current = fit(problem, RUNS, nominal_model(problem))
+    current = fit(nominal_model(problem), RUNS)
     probes, candidates = problem.candidates(None, [], [])
-    scores = screen(candidates, responses(problem, current, RUNS, probes))
-    given = linearise(problem, nominal_model(problem), RUNS)[1]
-    best = refit(problem, RUNS, current, shortlist(scores), given)[0]
-    autocorrelation_time = fit(problem, RUNS, best.model).noise.autocorrelation_time
-    with_it, without = (
-        fit(problem, RUNS, m, autocorrelation_time=autocorrelation_time).cost for m in (best.model, current.model)
-    )
+    scores = screen(candidates, responses(current, probes))
+    given = linearise(nominal_model(problem), RUNS)[1]
+    best = refit(current, shortlist(scores), given)[0]
+    autocorrelation_time = fit(best.model, RUNS).noise.autocorrelation_time
+    with_it, without = (fit(m, RUNS, autocorrelation_time=autocorrelation_time).cost for m in (best.model, current.model))
     assert best.candidate.name == "decoy_1"
     assert best.gain == pytest.approx(without - with_it, rel=0.03)
     assert best.by_run.sum() == pytest.approx(best.gain, rel=0.5)
@@ -805,9 +797,9 @@ def test_no_name_is_looked_for_where_an_unknown_law_acts(monkeypatch, place):
 
 def test_shortlist_keeps_some_of_every_name():
     problem = Toy({}, [sized("drag", 2.0, "left", "right")])
-    current = fit(problem, RUNS, nominal_model(problem))
+    current = fit(nominal_model(problem), RUNS)
     probes, candidates = problem.candidates(None, [], [])
-    scores = screen(candidates, responses(problem, current, RUNS, probes))
+    scores = screen(candidates, responses(current, probes))
     many = [replace(score, gain=100.0) for score in scores for _ in range(4)]
     chosen = shortlist(many)
     names = [score.candidate.name for score in chosen]
@@ -830,7 +822,7 @@ def test_what_was_selected_and_removed_again_is_reported_as_removed():
     look = named(problem).rounds[0]
     assert look.selected is not None
     for kept, outcome in (({look.selected.candidate.label}, "selected"), (set(), "removed")):
-        entries = evidence_of(problem, 1, look, RUNS, kept)
+        entries = evidence_of(1, look, kept)
         assert [entry.outcome for entry in entries if entry.name == "decoy_2"] == [outcome]
 
 
@@ -840,5 +832,5 @@ def test_only_what_gains_enough_fails_cross_validation(gain, outcome):
     look = named(problem).rounds[0]
     assert look.selected is not None
     alone = replace(look.selected, gain=gain, cross_validated=False)
-    entries = evidence_of(problem, 1, replace(look, hypotheses=[alone], selected=None, threshold=LEAST_GAIN), RUNS, ())
+    entries = evidence_of(1, replace(look, hypotheses=[alone], selected=None, threshold=LEAST_GAIN), ())
     assert entries[0].outcome == outcome

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from toy_problem import NOISE, NOMINAL, REACH, SIGMA, Toy, candidate, sized
 
-from wlr_gym.gap.estimation.fit import fit, normal_equations, widened
-from wlr_gym.gap.estimation.model import nominal_model, on_bounds
-from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95, estimates, half_widths, two_sided_95
+from wlr_gym.gap.estimation import (
+    TWO_SIDED_95,
+    Replayed,
+    estimates,
+    fit,
+    half_widths,
+    nominal_model,
+    normal_equations,
+    two_sided_95,
+    widened,
+)
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
 from wlr_gym.gap.selection.hypothesis import Hypothesis, selection_frequency
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, detectable, least_gain, responses, screen
@@ -20,7 +28,7 @@ TRUTH = {"gain": 0.8, "offset": -1.2, "mass": 0.4}
 
 def fitted(problem, size=0.7):
     model = nominal_model(problem).with_effect(candidate(problem, "drag", ["right"]), (size,))
-    return fit(problem, range(len(problem.runs)), model, steps=problem.steps)
+    return fit(model, range(len(problem.runs)))
 
 
 @pytest.mark.slow
@@ -30,7 +38,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(white, error, ar1):
     for seed in range(draws):
         problem = Toy(TRUTH, [sized("drag", 0.7, "right")], seed=seed, white=white, error=error, ar1=ar1, runs=6, rows=120)
         found = fitted(problem, 0.5)
-        inside.append(abs(found.model.effects[0][1][0] - 0.7) < half_widths(problem, found)[-1])
+        inside.append(abs(found.model.effects[0][1][0] - 0.7) < half_widths(found)[-1])
     assert 0.88 <= np.mean(inside) <= 0.995
 
 
@@ -54,7 +62,7 @@ def test_differences_from_run_to_run_widen_the_interval():
             toy._measured[r] = toy._measured[r] + toy.effect_response(sized("drag", own, "right"), r) * np.array(
                 [0.1, 2, 0.001]
             )
-    wide, narrow = (half_widths(toy, fitted(toy))[-1] for toy in (problem, steady))
+    wide, narrow = (half_widths(fitted(toy))[-1] for toy in (problem, steady))
     # six sizes with a spread of 0.42: the error of their mean is 0.19, known to five degrees of freedom
     assert wide == pytest.approx(2.57 * 0.19, rel=0.5)
     assert wide > 2 * narrow
@@ -69,8 +77,8 @@ def test_few_runs_that_differ_tell_little_of_how_much_they_do():
         rng = np.random.default_rng([seed, 3])
         for r in range(3):
             problem._measured[r] = problem._measured[r] + NOISE * rng.normal(0.0, 1.0) * problem.shape("offset")[r]
-        found = fit(problem, range(3), nominal_model(problem), steps=1)
-        inside.append(abs(found.model.quantities[1]) <= half_widths(problem, found)[1])
+        found = fit(nominal_model(problem), range(3), steps=1)
+        inside.append(abs(found.model.quantities[1]) <= half_widths(found)[1])
     assert 0.9 <= np.mean(inside) <= 0.99
 
 
@@ -84,8 +92,8 @@ def test_two_runs_are_helped_by_what_all_numbers_say_of_how_runs_scatter():
         for r in range(2):
             for name in ("gain", "offset", "mass"):
                 problem._measured[r] = problem._measured[r] + NOISE * rng.normal(0.0, 1.0) * problem.shape(name)[r]
-        found = widened(problem, range(2), fit(problem, range(2), nominal_model(problem), steps=1))
-        half = half_widths(problem, found) / SIGMA
+        found = widened(fit(nominal_model(problem), range(2), steps=1))
+        half = half_widths(found) / SIGMA
         inside.append(np.abs(found.model.quantities - NOMINAL) / SIGMA <= half)
         halves.append(half)
     assert 0.85 <= np.mean(inside) <= 0.98
@@ -111,7 +119,7 @@ def test_jackknife_is_leaving_one_run_out():
     curvature = np.sqrt(np.diag(found.covariance()))
     expected = np.where(jackknife > curvature, 2.571 * jackknife, 1.96 * curvature) * np.append(SIGMA, scale)
     assert 0 < (jackknife > curvature).sum() < 4
-    assert half_widths(problem, found) == pytest.approx(expected, rel=0.01)
+    assert half_widths(found) == pytest.approx(expected, rel=0.01)
 
 
 def test_student():
@@ -121,9 +129,9 @@ def test_student():
 
 def test_number_on_its_bound_does_not_widen_the_others():
     beyond = Toy({"gain": REACH + 2.0}, white=1.0, runs=6)
-    found = fit(beyond, range(6), nominal_model(beyond))
-    assert on_bounds(beyond, found.model)[0]
-    halves = half_widths(beyond, found) / SIGMA
+    found = fit(nominal_model(beyond), range(6))
+    assert found.model.on_bounds[0]
+    halves = half_widths(found) / SIGMA
     assert halves[0] == pytest.approx(1.96, abs=0.01)  # no better than beforehand
     # pinned means pinned: the jackknife of the others is that of a model without the number
     tight = np.eye(2)
@@ -142,8 +150,8 @@ def test_number_on_its_bound_does_not_widen_the_others():
 def test_estimates_are_values_with_two_sided_intervals():
     problem = Toy({}, [sized("drag", 0.7, "right")], white=1.5)
     found = fitted(problem)
-    own = estimates(problem, found)[0]["size"]
-    half = half_widths(problem, found)[-1]
+    own = estimates(found)[0]["size"]
+    half = half_widths(found)[-1]
     assert own.value == found.model.effects[0][1][0]
     assert (own.low, own.high) == pytest.approx((own.value - half, own.value + half), rel=1e-3)
     assert own.unit == "1"
@@ -153,10 +161,10 @@ def test_estimates_are_values_with_two_sided_intervals():
 def test_parameter_at_the_edge_of_its_range_keeps_its_interval():
     """The data ask for 0.7, more than 0.5 is not plausible: the fit ends there, and knows how well the data tell it."""
     problem = Toy({}, [sized("drag", 0.7, "right")], white=1.5)
-    (free,) = estimates(problem, fitted(problem))[0].values()
+    (free,) = estimates(fitted(problem))[0].values()
     edge = {"within": lambda v: (min(v[0], 0.5),), "convert": lambda v: {"size": min(v[0], 0.5)}}
     model = nominal_model(problem).with_effect(replace(candidate(problem, "drag", ["right"]), **edge), (0.3,))
-    (held,) = estimates(problem, fit(problem, range(5), model, steps=problem.steps))[0].values()
+    (held,) = estimates(fit(model, range(5)))[0].values()
     assert held.value == 0.5
     assert held.high - held.low == pytest.approx(free.high - free.low, rel=0.3)
 
@@ -165,8 +173,8 @@ def test_what_adds_to_a_known_number_is_known_no_better_than_it():
     """However well the data seem to tell them apart: the errors of simulated responses do that, too."""
     problem = Toy({"gain": 1.0}, white=1.5)
     adds = replace(candidate(problem, "copy"), tolerances=(Tolerance(("gain", "mass"), 0.5, REACH),))
-    found = fit(problem, range(5), nominal_model(problem).with_effect(adds, (1.0,)), steps=problem.steps)
-    own = estimates(problem, replace(found, precision=1e9 * np.eye(4), columns=[1e4 * c for c in found.columns]))[0]["size"]
+    found = fit(nominal_model(problem).with_effect(adds, (1.0,)), range(5))
+    own = estimates(replace(found, precision=1e9 * np.eye(4), columns=[1e4 * c for c in found.columns]))[0]["size"]
     assert own.high - own.value == pytest.approx(TWO_SIDED_95 * 0.5 / np.sqrt(2.0), rel=1e-3)
 
 
@@ -174,18 +182,18 @@ def test_simulators_do_not_disagree_about_places():
     problem = Toy(TRUTH, [sized("drag", 0.7, "right")], white=1.5)
     own = candidate(problem, "drag", ["right"])
     place = replace(own, unknowns=tuple(replace(unknown, is_size=False) for unknown in own.unknowns))
-    found = fit(problem, range(5), nominal_model(problem).with_effect(place, (0.7,)), steps=problem.steps)
-    (plain,) = estimates(problem, found)[0].values()
+    found = fit(nominal_model(problem).with_effect(place, (0.7,)), range(5))
+    (plain,) = estimates(found)[0].values()
     problem.disagreement = 0.1
-    assert estimates(problem, found)[0]["size"] == plain
+    assert estimates(found)[0]["size"] == plain
 
 
 def test_disagreement_of_simulators_adds_a_share_of_the_effect():
     problem = Toy(TRUTH, [sized("drag", 0.7, "right")], white=1.5)
     found = fitted(problem)
-    (narrow,) = estimates(problem, found)[0].values()
+    (narrow,) = estimates(found)[0].values()
     problem.disagreement = 0.1
-    (wide,) = estimates(problem, found)[0].values()
+    (wide,) = estimates(found)[0].values()
     assert wide.value == narrow.value
     both = np.hypot(narrow.high - narrow.value, TWO_SIDED_95 * 0.1 * narrow.value)
     assert wide.high - wide.value == pytest.approx(both, rel=1e-6)
@@ -194,11 +202,11 @@ def test_disagreement_of_simulators_adds_a_share_of_the_effect():
 
 def test_confidence_counts_the_samples_in_which_the_effect_wins():
     problem = Toy({}, [sized("drag", 0.8, "right")], error=0.5)
-    look = search_effects(problem, RUNS, fit(problem, RUNS, nominal_model(problem))).rounds[0]
+    look = search_effects(fit(nominal_model(problem), RUNS)).rounds[0]
     assert look.selected is not None
     assert selection_frequency(look.selected, look.hypotheses) > 0.95
     twin = Toy({}, [sized("drag", 0.8, "left")], error=0.5)
-    look = search_effects(twin, RUNS, fit(twin, RUNS, nominal_model(twin))).rounds[0]
+    look = search_effects(fit(nominal_model(twin), RUNS)).rounds[0]
     assert look.selected is not None
     assert selection_frequency(look.selected, look.hypotheses) == selection_frequency(look.selected, look.hypotheses)
 
@@ -207,7 +215,7 @@ def explained(problem, name, gain, by_run):
     """A hypothesis of so much gain, from runs that fall by so much."""
     own, nominal = candidate(problem, name), nominal_model(problem)
     model = nominal.with_effect(own, (1.0,) * len(own.unknowns))
-    return Hypothesis(own, model, gain, np.array(by_run, float), 1.0, [], nominal, [])
+    return Hypothesis(model, RUNS, [], Replayed(nominal, RUNS, []), gain, np.array(by_run, float), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -241,9 +249,9 @@ def test_confidence_falls_with_a_rival_that_buys_as_much():
 
 
 def screened(problem):
-    found = fit(problem, RUNS, nominal_model(problem))
+    found = fit(nominal_model(problem), RUNS)
     probes, candidates = problem.candidates(None, [], [])
-    return found, responses(problem, found, RUNS, probes), candidates
+    return found, responses(found, probes), candidates
 
 
 def test_detectable_severity_is_where_the_gain_is_just_enough():

@@ -19,10 +19,9 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from wlr_gym.base.errors import InputError
@@ -33,8 +32,8 @@ from wlr_gym.data.format import META_FILE, Profile
 from wlr_gym.data.record import motion_of, record_simulation
 from wlr_gym.data.runs import Run, read_meta, read_run, robot_of, run_files
 from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED
-from wlr_gym.gap.estimation.uncertainty import TWO_SIDED_95
-from wlr_gym.gap.problem import Setting
+from wlr_gym.gap.estimation import TWO_SIDED_95
+from wlr_gym.gap.problem import Array, Setting
 from wlr_gym.gap.report.result import (
     DECIDED,
     NOTHING,
@@ -42,6 +41,7 @@ from wlr_gym.gap.report.result import (
     AdequacyEntry,
     Explanation,
     Result,
+    StatisticEntry,
     explanations,
     read_result,
 )
@@ -196,34 +196,29 @@ def decide(
         InputError: see :func:`wlr_gym.gap.workflow.analyse`; or ``out`` has a history of other data, robot or simulator, or
             another process works in it.
     """
-    known = load_patch(known)
-    asked = _Asked(Path(data), Path(out), budget or Budget(), known, robot, backend, threads, tell)
-    history, last = _resumed(asked)
-    with alone_in(asked.out):
-        return _go_on(asked, record, history, last)
-
-
-def _go_on(asked: _Asked, record: Recorder, history: History, last: DecisionRound | None) -> Decided:
-    """Work through the rounds that are left; ``last``: see :func:`_resumed`."""
-    while True:
-        now, result, left = _analysed(asked, history, last)
-        ended, following = _choice(asked, history, now, result, left)
-        folder, last = asked.folder(now), None
-        if following is None:
-            return Decided(_saved(asked, history, now, ended), result, folder)
-        motion, why = following
-        now = now.model_copy(update={"excitation": motion.name, "why": why})
-        _saved(asked, history, now)
-        recorded = record(motion, asked.data)
-        now = _with_run(now, recorded)
-        if recorded.run is None:
-            return Decided(_saved(asked, history, now, "stopped"), result, folder)
-        history = _saved(asked, history, now)
+    known, data, out = load_patch(known), Path(data), Path(out)
+    session = _Session(data, out, budget or Budget(), known, robot, backend, threads, tell)
+    history, last = session.resumed()
+    with alone_in(out):
+        while True:
+            now, result, left = session.analysed(history, last)
+            ended, following = session.choice(history, now, result, left)
+            folder, last = session.folder(now), None
+            if following is None:
+                return Decided(session.saved(history, now, ended), result, folder)
+            motion, why = following
+            now = now.model_copy(update={"excitation": motion.name, "why": why})
+            session.saved(history, now)
+            recorded = record(motion, data)
+            now = _with_run(now, recorded)
+            history = session.saved(history, now, "" if recorded.run else "stopped")
+            if recorded.run is None:
+                return Decided(history, result, folder)
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What :func:`decide` was asked."""
+class _Session:
+    """The steps of a round, on what :func:`decide` was asked."""
 
     data: Path
     out: Path
@@ -234,96 +229,99 @@ class _Asked:
     threads: int
     tell: Tell
 
-    def history(self) -> History:
-        """An empty history."""
-        robot = None if self.robot is None else str(self.robot)
-        known = [dict(effect.content()) for effect in self.known.effects]
-        return History(data=str(self.data.resolve()), robot=robot, backend=self.backend, known=known)
-
     def folder(self, now: DecisionRound) -> Path:
-        """Where the report of a round goes."""
+        """Return where the report of a round goes."""
         return self.out / f"round_{now.number:02d}"
 
+    def resumed(self) -> tuple[History, DecisionRound | None]:
+        """Return the history of complete rounds, and the last one where it was interrupted or nothing was driven after it."""
+        if not run_files(self.data):
+            raise InputError(
+                f"{self.data}: no run_*.csv or run_*.parquet: record two first: wlr record --excitation straight random"
+            )
+        known, robot = [dict(effect.content()) for effect in self.known.effects], self.robot and str(self.robot)
+        fresh = History(data=str(self.data.resolve()), robot=robot, backend=self.backend, known=known)
+        path = self.out / HISTORY_FILE
+        if not resumes(self.out, HISTORY_FILE):
+            return fresh, None
+        history = parse_config(History, read_yaml(path), str(path))
+        check_same_request(path, dict(history), {name: getattr(fresh, name) for name in ("data", "robot", "backend", "known")})
+        if not history.rounds or history.rounds[-1].run:
+            return history, None
+        *before, last = history.rounds
+        new = [path for path in run_files(self.data) if path.stem not in last.runs]
+        if last.excitation and new:  # it was driven, but nobody was there to note it
+            return history.model_copy(update={"rounds": (*before, _with_run(last, Recorded(new[0])))}), None
+        return history.model_copy(update={"rounds": tuple(before)}), last
 
-# ---- one round -------------------------------------------------------------------------------------------------------
+    def saved(self, history: History, now: DecisionRound, ended: Ending = "") -> History:
+        """Return the history with a further round, and write it."""
+        longer = history.model_copy(update={"rounds": (*history.rounds, now), "ended": ended})
+        write_json(self.out / HISTORY_FILE, longer.model_dump(mode="json"))
+        return longer
 
+    def analysed(
+        self, history: History, last: DecisionRound | None
+    ) -> tuple[DecisionRound, Result | None, tuple[Explanation, ...]]:
+        """Analyse the runs that are there, unless the round that was interrupted, ``last``, has done so."""
+        files = run_files(self.data)
+        runs = tuple(path.stem for path in files)
+        now = DecisionRound(number=len(history.rounds) + 1, runs=runs, verdict=TOO_FEW_RUNS)
+        if len(runs) < LEAST_RUNS:
+            return now, None, ()
+        folder = self.folder(now)
+        path = folder / RESULT_FILE
+        # runs and meta data may have been mended since
+        changed = max(one.stat().st_mtime_ns for one in (*files, self.data / META_FILE) if one.exists())
+        is_current = path.is_file() and path.stat().st_mtime_ns >= changed
+        if last is None or last.runs != runs or not is_current:
+            asked = {"known": self.known, "robot": self.robot, "backend": self.backend, "threads": self.threads}
+            analyse(self.data, folder, **asked, tell=self.tell)
+        result = read_result(path)
+        left = explanations(result)
+        now = now.model_copy(update={"verdict": result.verdict, "names": {one.name: one.probability for one in left}})
+        self.saved(history, now)
+        return now, result, left
 
-def _analysed(
-    asked: _Asked, history: History, last: DecisionRound | None
-) -> tuple[DecisionRound, Result | None, tuple[Explanation, ...]]:
-    """Analyse the runs that are there, unless the round that was interrupted has done so."""
-    runs = tuple(path.stem for path in run_files(asked.data))
-    now = DecisionRound(number=len(history.rounds) + 1, runs=runs, verdict=TOO_FEW_RUNS)
-    if len(runs) < LEAST_RUNS:
-        return now, None, ()
-    folder = asked.folder(now)
-    if last is None or last.runs != runs or not _is_current(folder / RESULT_FILE, asked.data):
-        analyse(
-            asked.data,
-            folder,
-            known=asked.known,
-            robot=asked.robot,
-            backend=asked.backend,
-            threads=asked.threads,
-            tell=asked.tell,
-        )
-    result = read_result(folder / RESULT_FILE)
-    left = explanations(result)
-    now = now.model_copy(update={"verdict": result.verdict, "names": {one.name: one.probability for one in left}})
-    _saved(asked, history, now)
-    return now, result, left
-
-
-def _is_current(result: Path, data: Path) -> bool:
-    """Whether a result is there, and newer than runs and meta data: those may have been mended since."""
-    read = [path for path in (*run_files(data), data / META_FILE) if path.exists()]
-    return result.is_file() and result.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in read)
-
-
-#: The motion that is driven next, and why.
-_Next: TypeAlias = tuple[Motion, str]
-
-
-def _choice(
-    asked: _Asked, history: History, now: DecisionRound, result: Result | None, left: Sequence[Explanation]
-) -> tuple[Ending, _Next | None]:
-    """Return what to drive next; or None and why it ends."""
-    doubt = _doubt(now, result, left)
-    # nothing was selected, and some runs show an effect that runs left out of the fit do not
-    nothing = [] if result is None or result.effects else result.evidence
-    alone = any(one.outcome == FAILS_CROSS_VALIDATION for one in nothing)
-    answered = now.verdict not in (NOT_EXCITED, BAD_DATA) and not doubt and not alone
-    if len(left) == 1 and answered:
-        return "decided", None
-    if len(history.driven) >= asked.budget.runs:
-        return "budget", None
-    runs = {path.stem: read_run(path) for path in run_files(asked.data)}
-    before = [run for name, run in runs.items() if name not in {one.run for one in history.rounds}]
-    own = robot_of(next(iter(runs.values())), asked.robot)
-    driven = [*driven_already(before, own), *history.driven]
-    seconds = asked.budget.seconds - history.seconds
-    motions = motions_to_drive(own, read_meta(asked.data).profile, driven)
-    motions = [motion for motion in motions if motion.duration <= seconds]
-    if not motions:
-        return "budget", None
-    # where there are no explanations to distinguish: what the report recommends, else what shows most effects best
-    advised = [one.excitation for one in result.recommendations] if result is not None else []
-    new = [motion for name in advised for motion in motions if motion.name == name and name not in driven]
-    shows_most = new[0] if new else most_shown(motions, driven)
-    shows_most = shows_most, doubt + ("the report recommends it" if new else "shows most effects best")
-    if result is None or len(left) < 2:
-        return "", shows_most
-    asked.tell("choosing the next run", 1.0)
-    there = [runs[name] for name in now.runs]
-    found = promises(result, left, motions, own, there, known=asked.known, backend=asked.backend, threads=asked.threads)
-    sure = left[0].probability >= DECIDED and left[0].name in {NOTHING, *(effect.name for effect in result.effects)}
-    if max(one.most for one in found) >= (TELLS_OTHERWISE if sure else TELLS):
-        best = found[0]
-        between = f"{best.most:.0f} between {' and '.join(best.pair)}"
-        return "", (best.motion, f"promises {best.telling / best.motion.duration:.2g} per s, {between}")
-    if doubt:
-        return "", shows_most
-    return "decided" if sure and answered else "nothing would tell", None
+    def choice(
+        self, history: History, now: DecisionRound, result: Result | None, left: Sequence[Explanation]
+    ) -> tuple[Ending, tuple[Motion, str] | None]:
+        """Return what to drive next, and why; or None and why it ends."""
+        doubt = _doubt(now, result, left)
+        # nothing was selected, and some runs show an effect that runs left out of the fit do not
+        nothing = [] if result is None or result.effects else result.evidence
+        alone = any(one.outcome == FAILS_CROSS_VALIDATION for one in nothing)
+        answered = now.verdict not in (NOT_EXCITED, BAD_DATA) and not doubt and not alone
+        if len(left) == 1 and answered:
+            return "decided", None
+        if len(history.driven) >= self.budget.runs:
+            return "budget", None
+        runs = {path.stem: read_run(path) for path in run_files(self.data)}
+        before = [run for name, run in runs.items() if name not in {one.run for one in history.rounds}]
+        own = robot_of(next(iter(runs.values())), self.robot)
+        driven = [*driven_already(before, own), *history.driven]
+        motions = motions_to_drive(own, read_meta(self.data).profile, driven)
+        motions = [motion for motion in motions if motion.duration <= self.budget.seconds - history.seconds]
+        if not motions:
+            return "budget", None
+        # where there are no explanations to distinguish: what the report recommends, else what shows most effects best
+        advised = [one.excitation for one in result.recommendations] if result is not None else []
+        new = [motion for name in advised for motion in motions if motion.name == name and name not in driven]
+        why = doubt + ("the report recommends it" if new else "shows most effects best")
+        shows_most = new[0] if new else most_shown(motions, driven), why
+        if result is None or len(left) < 2:
+            return "", shows_most
+        self.tell("choosing the next run", 1.0)
+        there = [runs[name] for name in now.runs]
+        found = promises(result, left, motions, own, there, known=self.known, backend=self.backend, threads=self.threads)
+        sure = left[0].probability >= DECIDED and left[0].name in {NOTHING, *(effect.name for effect in result.effects)}
+        if max(one.most for one in found) >= (TELLS_OTHERWISE if sure else TELLS):
+            best = found[0]
+            between = f"{best.most:.0f} between {' and '.join(best.pair)}"
+            return "", (best.motion, f"promises {best.per_second:.2g} per s, {between}")
+        if doubt:
+            return "", shows_most
+        return "decided" if sure and answered else "nothing would tell", None
 
 
 def _doubt(now: DecisionRound, result: Result | None, left: Sequence[Explanation]) -> str:
@@ -345,54 +343,11 @@ def _with_run(now: DecisionRound, recorded: Recorded) -> DecisionRound:
     if recorded.run is None:
         return now.model_copy(update={"stopped": recorded.reason or "nothing was recorded"})
     t = read_run(recorded.run)["t"]
-    return now.model_copy(
-        update={"run": recorded.run.stem, "seconds": round(float(t[-1] - t[0]), 3), "stopped": recorded.reason}
-    )
-
-
-# ---- the history -----------------------------------------------------------------------------------------------------
-
-
-def _resumed(asked: _Asked) -> tuple[History, DecisionRound | None]:
-    """Return the history of complete rounds, and the last one where it was interrupted or nothing was driven after it."""
-    if not run_files(asked.data):
-        raise InputError(
-            f"{asked.data}: no run_*.csv or run_*.parquet: record two first: wlr record --excitation straight random"
-        )
-    fresh, path = asked.history(), asked.out / HISTORY_FILE
-    if not resumes(asked.out, HISTORY_FILE):
-        return fresh, None
-    history = parse_config(History, read_yaml(path), str(path))
-    requested = {name: getattr(fresh, name) for name in ("data", "robot", "backend", "known")}
-    check_same_request(path, dict(history), requested)
-    if not history.rounds or history.rounds[-1].run:
-        return history, None
-    *before, last = history.rounds
-    new = [path for path in run_files(asked.data) if path.stem not in last.runs]
-    if last.excitation and new:  # it was driven, but nobody was there to note it
-        return history.model_copy(update={"rounds": (*before, _with_run(last, Recorded(new[0])))}), None
-    return history.model_copy(update={"rounds": tuple(before)}), last
-
-
-def _saved(asked: _Asked, history: History, now: DecisionRound, ended: Ending = "") -> History:
-    """Return the history with a further round, and write it."""
-    longer = history.model_copy(update={"rounds": (*history.rounds, now), "ended": ended})
-    write_json(asked.out / HISTORY_FILE, longer.model_dump(mode="json"))
-    return longer
+    own = {"run": recorded.run.stem, "seconds": round(float(t[-1] - t[0]), 3), "stopped": recorded.reason}
+    return now.model_copy(update=own)
 
 
 # ---- the next run ----------------------------------------------------------------------------------------------------
-# Every explanation in play is replayed in every motion, and so is the model with each of its numbers moved. What two
-# explanations predict differently, less what calibrated numbers and their own can take up within their uncertainty, is what a
-# run of that motion would add to the difference of their minus two log evidence, to first order; levels and autocorrelation
-# times are those that the last analysis found. The mean over all pairs is weighted by the probabilities of both (Box and Hill,
-# 1967).
-#
-# An explanation's own numbers are as uncertain as the runs that are there leave them: a law that becomes another one at the
-# edge of a number (Stribeck friction with a large speed is Coulomb friction) cannot be told from it by any run.
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -430,17 +385,15 @@ def motions_to_drive(robot: Robot, profile: Profile, driven: Sequence[str]) -> l
 
 def driven_already(runs: Sequence[Run], robot: Robot) -> list[str]:
     """Return the names of the excitations that some runs are of, as ``wlr record`` drives them."""
-    commands = [motion_of(run).setpoints for run in runs]
     names = [(name, excite(name, robot=robot).setpoints) for name in EXCITATIONS]
-    return [name for own in commands for name, setpoints in names if _alike(own, setpoints)]
-
-
-def _alike(one: Array, two: Array) -> bool:
-    """Whether setpoints are the same in nearly all rows."""
-    rows = min(len(one), len(two))
-    if rows < ALIKE * max(len(one), len(two)):
-        return False
-    return bool(np.isclose(one[:rows], two[:rows], equal_nan=True).all(axis=1).mean() >= ALIKE)
+    found = []
+    for own in (motion_of(run).setpoints for run in runs):
+        for name, setpoints in names:
+            rows, most = sorted((len(own), len(setpoints)))
+            alike = np.isclose(own[:rows], setpoints[:rows], equal_nan=True).all(axis=1)
+            if rows >= ALIKE * most and alike.mean() >= ALIKE:
+                found.append(name)
+    return found
 
 
 def most_shown(motions: Sequence[Motion], driven: Sequence[str]) -> Motion:
@@ -471,70 +424,94 @@ def promises(
         motions: to choose from.
         robot, runs, known, backend, threads: of the analysis.
     """
-    there = RobotProblem(runs, robot, known, backend, threads=threads)
-    free = _own_uncertainty(there, result, explanations)
+
+    def foresight(runs: Sequence[Run]) -> _Foresight:
+        return _Foresight(RobotProblem(runs, robot, known, backend, threads=threads), result, explanations)
+
+    free = foresight(runs).own_uncertainty()
     with tempfile.TemporaryDirectory() as folder:
         bounds = []
         for motion in motions:
             path = record_simulation(Path(folder) / f"run_{motion.name}.parquet", motion, robot, "gibbs_appell")
-            problem = RobotProblem([read_run(path)], robot, known, backend, threads=threads)
-            bounds.append((_promise(problem, result, explanations, motion), problem))
+            seen = foresight([read_run(path)])
+            bounds.append((seen.promise(motion), seen))
         found: list[Promise] = []
-        for bound, problem in sorted(bounds, key=lambda pair: -pair[0].per_second):
+        for bound, seen in sorted(bounds, key=lambda pair: -pair[0].per_second):
             best = max((one.per_second for one in found), default=-math.inf)
             tells = max((one.most for one in found), default=0.0) >= TELLS
             if bound.per_second > best or (bound.most >= TELLS and not tells):
-                found.append(_promise(problem, result, explanations, bound.motion, free))
+                found.append(seen.promise(bound.motion, free))
     return sorted(found, key=lambda one: -one.per_second)
 
 
-def _promise(
-    problem: RobotProblem,
-    result: Result,
-    explanations: Sequence[Explanation],
-    motion: Motion,
-    free: Sequence[Array] | None = None,
-) -> Promise:
-    """What a motion promises; ``free``: see :func:`_own_uncertainty`; None: if no number took up anything, the most it can."""
-    values, deviations = _calibrated(problem, result)
-    moved = [] if free is None else [values + step for step in np.diag(_inside(problem, values, deviations))]
-    bare, *calibrated = _rows(problem, result, [Setting(values), *map(Setting, moved)])
-    columns = np.array(calibrated).reshape(-1, len(bare)) - bare
-    predicted, slopes = _predicted(problem, result, explanations, with_own=free is not None)
-    own = slopes if free is None else [share @ own for share, own in zip(free, slopes, strict=True)]
-    weights = np.maximum([one.probability for one in explanations], LEAST_WEIGHT)
-    pairs = list(itertools.combinations(range(len(explanations)), 2))
-    shares = np.array([weights[i] * weights[j] for i, j in pairs])
-    told = np.array([_told(predicted[i] - predicted[j], np.vstack([columns, own[i], own[j]])) for i, j in pairs])
-    best = tuple(explanations[k].name for k in pairs[int(np.argmax(told))])
-    return Promise(motion, float(shares @ told / shares.sum()), float(told.max()), (best[0], best[1]))
+class _Foresight:
+    """What explanations predict in the runs of a problem, weighted as the last analysis weighs residuals."""
+
+    def __init__(self, problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> None:
+        self.problem, self.explanations = problem, explanations
+        # values and standard deviations of the quantities; nominal, to their tolerance, where the result has none
+        values, steps = [], []
+        for quantity in problem.quantities:
+            entry = result.calibration.get(quantity.name)
+            value = quantity.nominal if entry is None else entry.fitted
+            half = None if entry is None or entry.ci95 is None else 0.5 * (entry.ci95[1] - entry.ci95[0])
+            deviation = quantity.sigma if half is None else min(half / TWO_SIDED_95, quantity.sigma)
+            values.append(value)
+            steps.append(deviation if value + deviation <= quantity.high else -deviation)  # where there is room
+        self.values: Array = np.array(values)
+        self.steps: Array = np.array(steps)
+        # weight (channels) of a squared residual, as of the fit that left what the result says; 0 where nothing was measured
+        adequacy, weights = result.adequacy, np.full(len(problem.signals), 1.0 / problem.tempering)
+        if isinstance(adequacy, AdequacyEntry):
+            scatter = problem.tempering * max(adequacy.constancy.value or 1.0, 1.0)
+            levels, times = _by_channel(adequacy.level.channels), _by_channel(adequacy.whiteness.channels)
+            worth = {k: 1.0 / (max(level, 1.0) ** 2 * times[k] * scatter) for k, level in levels.items() if k in times}
+            weights = np.array([worth.get(signal.name, 0.0) for signal in problem.signals])
+        self._root = np.sqrt(weights)
+
+    def promise(self, motion: Motion, free: Sequence[Array] | None = None) -> Promise:
+        """What a motion promises; ``free``: of :meth:`own_uncertainty`; None: the most it can, if numbers take up nothing."""
+        moved = [] if free is None else [self.values + step for step in np.diag(self.steps)]
+        bare, *calibrated = self._rows([Setting(self.values), *map(Setting, moved)])
+        columns = np.array(calibrated).reshape(-1, len(bare)) - bare
+        predicted, slopes = self._predicted(with_own=free is not None)
+        own = slopes if free is None else [share @ own for share, own in zip(free, slopes, strict=True)]
+        weights = np.maximum([one.probability for one in self.explanations], LEAST_WEIGHT)
+        pairs = list(itertools.combinations(range(len(self.explanations)), 2))
+        shares = np.array([weights[i] * weights[j] for i, j in pairs])
+        told = np.array([_told(predicted[i] - predicted[j], np.vstack([columns, own[i], own[j]])) for i, j in pairs])
+        one, other = (self.explanations[k].name for k in pairs[int(np.argmax(told))])
+        return Promise(motion, float(shares @ told / shares.sum()), float(told.max()), (one, other))
+
+    def own_uncertainty(self) -> list[Array]:
+        """How explanations' own numbers may still move, each (numbers, numbers): rows are independent, of unit variance."""
+        _, columns = self._predicted()
+        found = (np.linalg.inv(np.linalg.cholesky(np.eye(len(own)) + own @ own.T)) for own in columns)
+        return [np.asarray(one, np.float64) for one in found]
+
+    def _predicted(self, *, with_own: bool = True) -> tuple[list[Array], list[Array]]:
+        """Weighted predictions (rows) of explanations, and their change per way of their own numbers (see :data:`STEP`), each
+        (numbers, rows); none of them unless ``with_own``."""
+        models = [(one.effects, *(_own_moved(one) if with_own else ())) for one in self.explanations]
+        rows = self._rows([Setting(self.values, effects) for tried in models for effects in tried])
+        parts = np.split(rows, np.cumsum([len(tried) for tried in models])[:-1])
+        return [part[0] for part in parts], [(part[1:] - part[0]) / STEP for part in parts]
+
+    def _rows(self, settings: Sequence[Setting]) -> Array:
+        """Weighted predictions (settings, rows of all runs and channels)."""
+        runs = self.problem.residuals(settings, range(len(self.problem.runs)))
+        return np.concatenate([(np.nan_to_num(one) * self._root).reshape(len(settings), -1) for one in runs], axis=1)
+
+
+def _by_channel(entries: Mapping[str, StatisticEntry]) -> dict[str, float]:
+    return {name: one.value for name, one in entries.items() if one.value is not None}
 
 
 def _told(difference: Array, columns: Array) -> float:
     """Square of a weighted difference (rows), less what numbers of unit variance, whose columns are given, take up."""
     across = columns @ difference
-    return max(
-        float(difference @ difference - across @ np.linalg.solve(np.eye(len(columns)) + columns @ columns.T, across)), 0.0
-    )
-
-
-def _own_uncertainty(problem: RobotProblem, result: Result, explanations: Sequence[Explanation]) -> list[Array]:
-    """How explanations' own numbers may still move, each (numbers, numbers): rows are independent, of unit variance."""
-    _, columns = _predicted(problem, result, explanations)
-    found = (np.linalg.inv(np.linalg.cholesky(np.eye(len(own)) + own @ own.T)) for own in columns)
-    return [np.asarray(one, np.float64) for one in found]
-
-
-def _predicted(
-    problem: RobotProblem, result: Result, explanations: Sequence[Explanation], *, with_own: bool = True
-) -> tuple[list[Array], list[Array]]:
-    """Weighted predictions (rows) of explanations, and their change per way of their own numbers (see :data:`STEP`), each
-    (numbers, rows); none of them unless ``with_own``."""
-    values, _ = _calibrated(problem, result)
-    models = [(one.effects, *(_own_moved(one) if with_own else ())) for one in explanations]
-    rows = _rows(problem, result, [Setting(values, effects) for tried in models for effects in tried])
-    parts = np.split(rows, np.cumsum([len(tried) for tried in models])[:-1])
-    return [part[0] for part in parts], [(part[1:] - part[0]) / STEP for part in parts]
+    taken = across @ np.linalg.solve(np.eye(len(columns)) + columns @ columns.T, across)
+    return max(float(difference @ difference - taken), 0.0)
 
 
 def _own_moved(one: Explanation) -> list[tuple[PatchEffect, ...]]:
@@ -547,43 +524,3 @@ def _own_moved(one: Explanation) -> list[tuple[PatchEffect, ...]]:
     ways = {name: value - neutral.get(name, 0.0) for name, value in own.parameters.items()}
     moved = [{**own.parameters, name: own.parameters[name] - STEP * way} for name, way in ways.items() if way]
     return [(*before, replace(own, parameters=parameters)) for parameters in moved]
-
-
-def _rows(problem: RobotProblem, result: Result, settings: Sequence[Setting]) -> Array:
-    """Weighted predictions (settings, rows of all runs and channels)."""
-    root = np.sqrt(_weights(problem, result))
-    runs = problem.residuals(settings, range(len(problem.runs)))
-    return np.concatenate([(np.nan_to_num(one) * root).reshape(len(settings), -1) for one in runs], axis=1)
-
-
-def _calibrated(problem: RobotProblem, result: Result) -> tuple[Array, Array]:
-    """Values and standard deviations of the problem's quantities; nominal, to their tolerance, where the result has none."""
-    values, deviations = [], []
-    for quantity in problem.quantities:
-        entry = result.calibration.get(quantity.name)
-        values.append(quantity.nominal if entry is None else entry.fitted)
-        half = None if entry is None or entry.ci95 is None else 0.5 * (entry.ci95[1] - entry.ci95[0])
-        deviations.append(quantity.sigma if half is None else min(half / TWO_SIDED_95, quantity.sigma))
-    return np.array(values), np.array(deviations)
-
-
-def _inside(problem: RobotProblem, values: Array, deviations: Array) -> Array:
-    """The deviations as steps to the side where there is room."""
-    high = np.array([quantity.high for quantity in problem.quantities])
-    return np.where(values + deviations <= high, deviations, -deviations)
-
-
-def _weights(problem: RobotProblem, result: Result) -> Array:
-    """Weight (channels) of a squared residual, as of the fit that left what the result says; 0 where nothing was measured."""
-    adequacy = result.adequacy
-    if not isinstance(adequacy, AdequacyEntry):
-        return np.full(len(problem.signals), 1.0 / problem.tempering)
-    scatter = problem.tempering * max(adequacy.constancy.value or 1.0, 1.0)
-    levels, times = _by_channel(adequacy.level.channels), _by_channel(adequacy.whiteness.channels)
-    worth = {name: 1.0 / (max(level, 1.0) ** 2 * times[name] * scatter) for name, level in levels.items() if name in times}
-    return np.array([worth.get(signal.name, 0.0) for signal in problem.signals])
-
-
-def _by_channel(entries: Mapping[str, object]) -> dict[str, float]:
-    found = {name: getattr(entry, "value", None) for name, entry in entries.items()}
-    return {name: float(value) for name, value in found.items() if value is not None}

@@ -6,6 +6,7 @@ The steps of the workflow (estimation, selection, validation) use only a :class:
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from wlr_gym.physics.effects import EFFECTS, EffectParameter, PatchEffect
 
 Array = NDArray[np.float64]
+#: s; length of a block of rows, longer than residuals depend on each other.
+BLOCK = 2.0
 
 
 @dataclass(frozen=True)
@@ -322,3 +325,9 @@ def since_reversal(time: Array, rate: Array) -> Array:
     """Return the seconds (rows,) since a rate last changed its sign, or since the start: what systems map residuals over."""
     turned = np.concatenate([[True], np.diff(np.sign(rate)) != 0])
     return time - np.maximum.accumulate(np.where(turned, time, -np.inf))
+
+
+def blocks(time: Array) -> list[slice]:
+    """Cut the rows at these times (rows,) into blocks of about :data:`BLOCK` seconds."""
+    inner = np.linspace(time[0], time[-1], max(1, round(float(time[-1] - time[0]) / BLOCK)) + 1)[1:-1]
+    return [slice(first, last) for first, last in itertools.pairwise((0, *np.searchsorted(time, inner).tolist(), len(time)))]

@@ -10,10 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_number, unknown_name
 from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -31,13 +30,23 @@ from wlr_gym.gap.analysis import (
     ParameterEstimate,
     Threshold,
 )
-from wlr_gym.gap.estimation.fit import Fit, fit, widened
-from wlr_gym.gap.estimation.model import mean_of_runs, mean_squares, nominal_model
-from wlr_gym.gap.estimation.uncertainty import estimates, half_widths
+from wlr_gym.gap.estimation import (
+    Columns,
+    Fit,
+    estimates,
+    fit,
+    half_widths,
+    mean_of_runs,
+    mean_squares,
+    nominal_model,
+    quiet,
+    replay,
+    widened,
+)
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, relations, separating_run
 from wlr_gym.gap.selection.hypothesis import INSISTENT, equivalents, selection_frequency
-from wlr_gym.gap.selection.screening import chance, detectable
+from wlr_gym.gap.selection.screening import Score, chance, detectable
 from wlr_gym.gap.selection.search import SearchResult, evidence_of, refuted_evidence, search_effects
 from wlr_gym.gap.validation.data_split import informative_split, named_split
 from wlr_gym.gap.validation.held_out import compare_models, confirmed, most_in, most_left, noise_floor
@@ -45,7 +54,6 @@ from wlr_gym.gap.validation.localisation import informative_traces, localise
 from wlr_gym.gap.validation.residual_tests import adequacy_of, turning
 from wlr_gym.physics.effects import Patch, Source, load_patch
 
-Array = NDArray[np.float64]
 #: Told of the present stage and of the share of the whole work that is done.
 Tell = Callable[[str, float], None]
 
@@ -94,10 +102,9 @@ def analyse(
         InputError: data that cannot be read, a run twice, a run, rig or backend that does not exist, a folder that the results
             cannot go into; the last before the work begins.
     """
-    if threads < 1:
-        raise InputError(f"threads = {threads}: expected 1 or more")
+    check_number("threads", threads, least=1)
     if out is not None:
-        from wlr_gym.gap.report.page import check_folder
+        from wlr_gym.gap.report.page import check_folder, save_analysis
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
@@ -108,18 +115,14 @@ def analyse(
     for finding in findings:
         if finding.fatal and finding.run in heldout:
             raise InputError(f"--heldout {finding.run}: the run cannot be used: {finding.place}: {finding.said}")
-    if problem is not None:
+    if problem is None:
+        done = Analysis(str(data), BAD_DATA, "", tuple(findings), provenance=provenance())
+    else:
         _refuse_copies(problem, data)
-    done = (
-        Analysis(str(data), BAD_DATA, "", tuple(findings), provenance=provenance())
-        if problem is None
-        else analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
-    )
+        done = analyse_problem(problem, str(data), findings, heldout=heldout, tell=tell, known=known)
     if named := named_robot(data, rig, robot):
         done = replace(done, provenance={**done.provenance, "robot": named})
     if out is not None:
-        from wlr_gym.gap.report.page import save_analysis
-
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))
     return done
@@ -127,11 +130,10 @@ def analyse(
 
 def _refuse_copies(problem: Problem, data: str | Path) -> None:
     """A run under two names would count twice, and could be fitted and held out."""
-    readings = [(problem.times(k), problem.measured(k)) for k in range(len(problem.runs))]
-    for one, two in itertools.combinations(range(len(readings)), 2):
-        if all(np.array_equal(*pair, equal_nan=True) for pair in zip(readings[one], readings[two], strict=True)):
-            names = f"{problem.runs[one]} and {problem.runs[two]}"
-            raise InputError(f"{data}: {names} are the same run, reading by reading; keep one of them")
+    readings = [(name, problem.times(k), problem.measured(k)) for k, name in enumerate(problem.runs)]
+    for (one, *own), (two, *others) in itertools.combinations(readings, 2):
+        if all(np.array_equal(*pair, equal_nan=True) for pair in zip(own, others, strict=True)):
+            raise InputError(f"{data}: {one} and {two} are the same run, reading by reading; keep one of them")
 
 
 @_one_thread
@@ -154,38 +156,39 @@ def analyse_problem(
     clock.start("naming")
 
     def find(excluded: Container[str] = ()) -> SearchResult:
-        return search_effects(problem, fitted, start, clock.detail, columns, excluded)
+        return search_effects(start, clock.detail, columns, excluded)
 
-    search = confirmed(problem, fitted, held_out, find(), find)
-    base = search.calibrated
+    search = confirmed(find(), held_out, find)
+    base, final, rounds = search.calibrated, search.fit, search.rounds
     clock.start("proving")
-    models = (nominal_model(problem), base.model, search.fit.model)
-    floor = noise_floor(problem, search.fit.model.setting, held_out)
-    gap, run_gaps, channel_gaps = compare_models(problem, fitted, held_out, models, floor)
+    models = (nominal_model(problem), base.model, final.model)
+    floor = noise_floor(final.model, held_out)
+    gap, run_gaps, channel_gaps = compare_models(models, fitted, held_out, floor)
     error, worst = most_left(gap.fit_after, run_gaps)
-    nameless = not search.fit.model.effects and error > problem.misfit * gap.noise_floor
+    nameless = not final.model.effects and error > problem.misfit * gap.noise_floor
     every = range(len(problem.runs))
     features = problem.features(base.model.setting, every)
     # mean squares that a complete model leaves: the final one, or sensors alone where that cannot be complete
-    complete = mean_of_runs(mean_squares(search.fit.residuals, problem.cap))
+    complete = mean_of_runs(mean_squares(final.residuals, problem.cap))
     complete = np.where(np.isfinite(complete), 1.0, np.nan) if nameless else complete
-    places, maps = localise(problem, base.residuals, complete, search.fit.noise, [features[k] for k in fitted])
-    adequacy = adequacy_of(problem, fitted, search.fit)
-    shown = detectable(search.rounds[-1].scores, search.rounds[-1].threshold)
-    left = [residual[0] for residual in problem.residuals([search.fit.model.setting], every)]
-    turned = turning(problem, left, features)  # few runs turn far, and held-out ones may be those
-    worst_signal = (most_in(channel_gaps) if worst else places[0].name) if nameless else ""
-    somewhere = tuple(
-        FoundEffect(UNKNOWN, (signal.place,), {}, 1.0, math.nan) for signal in problem.signals if signal.name == worst_signal
-    )
+    places, maps = localise(problem, base.residuals, complete, final.noise, [features[k] for k in fitted])
+    adequacy = adequacy_of(final)
+    (left,) = replay([final.model], every)
+    turned = turning(problem, left.residuals, features)  # few runs turn far, and held-out ones may be those
     # without name or formula: what goes with a joint's turning, else what the worst signal tells of
-    periodic = () if turned is None else (FoundEffect(UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
-    effects = _effects(problem, search, fitted) or periodic or somewhere
-    kept = {candidate.label for candidate, _ in search.fit.model.effects}
+    nowhere: tuple[FoundEffect, ...] = ()
+    if turned is not None:
+        nowhere = (FoundEffect(UNKNOWN, (turned.joint,), {}, turned.confidence, math.nan),)
+    elif nameless:
+        worst_signal = most_in(channel_gaps) if worst else places[0].name
+        (place,) = (signal.place for signal in problem.signals if signal.name == worst_signal)
+        nowhere = (FoundEffect(UNKNOWN, (place,), {}, 1.0, math.nan),)
+    effects = _effects(search) or nowhere
+    kept = {candidate.label for candidate, _ in final.model.effects}
     groups = _equivalent(problem, search)
-    evidence = [one for number, look in enumerate(search.rounds, 1) for one in evidence_of(problem, number, look, fitted, kept)]
-    evidence += [refuted_evidence(problem, one, fitted) for one in search.refuted]
-    verdict = _verdict(search, effects, evidence, error / gap.noise_floor)
+    evidence = [one for number, look in enumerate(rounds, 1) for one in evidence_of(number, look, kept)]
+    evidence += map(refuted_evidence, search.refuted)
+    verdict = _verdict(rounds[-1].scores, effects, evidence, error / gap.noise_floor)
     clock.stop()
     return Analysis(
         data=data,
@@ -196,21 +199,23 @@ def analyse_problem(
         heldout_runs=tuple(problem.runs[k] for k in held_out),
         effects=effects,
         equivalent=groups,
-        calibration=_calibration(problem, search.fit),
+        calibration={
+            quantity.name: Calibrated(quantity.nominal, float(value), quantity.unit, quantity.sigma, float(half))
+            for quantity, value, half in zip(problem.quantities, final.model.quantities, half_widths(final), strict=False)
+        },
         evidence=tuple(evidence),
         thresholds=tuple(
-            Threshold(k, look.threshold, chance(look.by_chance), look.probabilities[1])
-            for k, look in enumerate(search.rounds, 1)
+            Threshold(k, look.threshold, chance(look.by_chance), look.probabilities[1]) for k, look in enumerate(rounds, 1)
         ),
         localisation=places,
-        relations=relations(search.rounds[0].scores),
+        relations=relations(rounds[0].scores),
         heat_maps=maps,
-        traces=informative_traces(problem, held_out, models, places),
+        traces=informative_traces(models, held_out, places),
         gap=gap,
         run_gaps=run_gaps,
         channel_gaps=channel_gaps,
-        detectable=shown,
-        recommendations=recommend(search.rounds[-1], groups, verdict, problem.motions),
+        detectable=detectable(rounds[-1].scores, rounds[-1].threshold),
+        recommendations=recommend(rounds[-1], groups, verdict, problem.motions),
         adequacy=adequacy,
         turning=turned,
         known_effects=tuple(effect.content() for effect in load_patch(known).effects),
@@ -220,15 +225,11 @@ def analyse_problem(
 
 
 def calibrated_fit(
-    problem: Problem,
-    fitted: Sequence[int],
-    columns: list[NDArray[np.float32]] | None = None,
-    tell: Callable[[str], None] = lambda text: None,
+    problem: Problem, fitted: Sequence[int], columns: Columns | None = None, tell: Callable[[str], None] = quiet
 ) -> Fit:
     """Fit the model without effects to runs, from its file's numbers; ``columns``: there, where they are known."""
-    start, scatter = nominal_model(problem), SCATTER * problem.tempering
-    base = fit(problem, fitted, start, scatter=scatter, columns=columns, steps=problem.steps, tell=tell)
-    return widened(problem, fitted, base)
+    scatter, own = SCATTER * problem.tempering, None if columns is None else list(columns)
+    return widened(fit(nominal_model(problem), fitted, scatter=scatter, columns=own, tell=tell))
 
 
 class _Clock:
@@ -254,28 +255,28 @@ class _Clock:
             self.seconds[self._stage] = time.perf_counter() - self._since
 
 
-def _verdict(search: SearchResult, effects: Sequence[FoundEffect], evidence: Sequence[Evidence], floors: float) -> str:
-    """The verdict; ``floors``: largest error, in noise floors, NaN where the model cannot tell its own."""
+def _verdict(scores: Sequence[Score], effects: Sequence[FoundEffect], evidence: Sequence[Evidence], floors: float) -> str:
+    """The verdict.
+
+    ``scores``: of the last round; ``floors``: largest error, in noise floors, NaN where the model cannot tell its own.
+    """
     if effects:
         return UNKNOWN if all(effect.name == UNKNOWN for effect in effects) else EFFECT_FOUND
     alone = [one.gain for one in evidence if one.outcome == FAILS_CROSS_VALIDATION]
     if alone and not (floors <= HARDLY_MORE_THAN_NOISE and max(alone) <= INSISTENT):
         return NOT_EXCITED
-    scores = search.rounds[-1].scores
-    visible = {score.candidate.name: False for score in scores}
-    for score in scores:
-        visible[score.candidate.name] |= score.visible
-    return NOTHING_MISSING if sum(visible.values()) >= LEAST_VISIBLE * len(visible) else NOT_EXCITED
+    names = {score.candidate.name for score in scores}
+    visible = {score.candidate.name for score in scores if score.visible}
+    return NOTHING_MISSING if len(visible) >= LEAST_VISIBLE * len(names) else NOT_EXCITED
 
 
-def _effects(problem: Problem, search: SearchResult, fitted: Sequence[int]) -> tuple[FoundEffect, ...]:
-    intervals = estimates(problem, search.fit)
-    found = []
-    setting = search.fit.model.setting
-    for (candidate, values), own in zip(search.fit.model.effects, intervals, strict=True):
+def _effects(search: SearchResult) -> tuple[FoundEffect, ...]:
+    final, found = search.fit, []
+    for (candidate, values), own in zip(final.model.effects, estimates(final), strict=True):
         look, one = next((look, one) for look, one in search.kept if one.candidate.label == candidate.label)
         frequency = selection_frequency(one, look.hypotheses, look.threshold)
-        tried = problem.reach(candidate.effect(values), setting, fitted) if candidate.formula else {}
+        effect, setting = candidate.effect(values), final.model.setting
+        tried = final.problem.reach(effect, setting, final.runs) if candidate.formula else {}
         found.append(replace(found_effect(candidate, own, frequency, one.gain), validity=tried))
     return tuple(sorted(found, key=lambda effect: -effect.gain))
 
@@ -284,9 +285,8 @@ def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], fre
     """Return a fitted candidate as it is written; constants of its formula that were not fitted have no width."""
     fixed = candidate.fixed if candidate.formula else {}
     given = {name: ParameterEstimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
-    parameters = {**own, **given}
     name, where, units = candidate.name, candidate.where, dict(candidate.units)
-    return FoundEffect(name, where, parameters, frequency, gain, candidate.formula, units, doc=candidate.doc)
+    return FoundEffect(name, where, {**own, **given}, frequency, gain, candidate.formula, units, doc=candidate.doc)
 
 
 def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...]:
@@ -298,14 +298,6 @@ def _equivalent(problem: Problem, search: SearchResult) -> tuple[Equivalent, ...
             names, where = (one.candidate.name, *(other.candidate.name for other in others)), one.candidate.where
             groups.append(Equivalent(names, separating_run(names, problem.motions, where), where))
     return tuple(groups)
-
-
-def _calibration(problem: Problem, found: Fit) -> dict[str, Calibrated]:
-    halves = half_widths(problem, found)
-    return {
-        quantity.name: Calibrated(quantity.nominal, float(value), quantity.unit, quantity.sigma, float(half))
-        for quantity, value, half in zip(problem.quantities, found.model.quantities, halves, strict=False)
-    }
 
 
 # ---- opening ---------------------------------------------------------------------------------------------------------

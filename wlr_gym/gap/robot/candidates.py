@@ -13,23 +13,20 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.gap.problem import Candidate, Probe, Quantity, Start, Tolerance, Unknown
+from wlr_gym.gap.problem import Array, Candidate, Probe, Quantity, Start, Tolerance, Unknown
 from wlr_gym.physics.effects import EFFECTS, UNKNOWN_EFFECT, Effect, PatchEffect
-from wlr_gym.physics.effects.effect import Change, Guess, Known, Observed, Places, Search
+from wlr_gym.physics.effects.effect import Guess, Known, Observed, Places, Search
 from wlr_gym.physics.plants.simulator import most_damping
 from wlr_gym.robot import CORNERS, JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameter_table import SPECS, TABLE
 from wlr_gym.robot.parameters import Parameters
-
-Array = NDArray[np.float64]
 
 #: Tolerances that move several numbers as one: a floor is one floor, a host's latency one latency.
 SHARED = {"ground.mu": ("ground.mu_x", "ground.mu_y"), "command.delay": ("command.delay",)}
@@ -74,43 +71,35 @@ def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
         physics_step: s, with which it will be simulated.
     """
     nominal = Parameters.nominal(robot)
+    shared = [(key, [e for name in names for e in SPECS[name].elements]) for key, names in SHARED.items()]
+    single = [(spec.tolerance, [e]) for spec in TABLE if spec.tolerance not in (*UNSEEN, *SHARED) for e in spec.elements]
     found: list[Knob] = []
-    for key, elements in SHARED.items():
+    for key, elements in (*shared, *single):
         if key in robot.tolerances:
-            targets = tuple(element for name in elements for element in SPECS[name].elements)
-            found.append(_knob(key, targets, nominal, robot))
-    for spec in TABLE:
-        if spec.tolerance in robot.tolerances and spec.tolerance not in (*UNSEEN, *SHARED):
-            found += [_knob(spec.tolerance, (element,), nominal, robot) for element in spec.elements]
-    resolved = RESOLVED * most_damping(nominal, physics_step)
+            first, value = elements[0], float(nominal[elements[0]][0])
+            sigma = robot.tolerances[key].sigma(first, value)
+            name = first if len(elements) == 1 else key
+            shares = tuple(float(nominal[element][0]) / value if value else 1.0 for element in elements)
+            found.append(Knob(_quantity(name, first.partition("[")[0], value, sigma), tuple(elements), shares))
     for name, share in GUESSED.items():
-        spec, value = SPECS[name], float(nominal[name].mean())
+        value = float(nominal[name].mean())
         quantity = _quantity(name, name, value, share * value)
         if name == "ground.normal_damping":
+            resolved = RESOLVED * most_damping(nominal, physics_step)
             quantity = replace(quantity, high=max(min(quantity.high, resolved), value))
-        found.append(Knob(quantity, tuple(spec.elements)))
+        found.append(Knob(quantity, tuple(SPECS[name].elements)))
     found += [Knob(_quantity(name, name, 0.0, sigma), tuple(SPECS[name].elements)) for name, sigma in YIELDS.items()]
     imu = robot.sensors.imu
     for name, sigma in (("imu.gyro_bias", imu.gyro_bias), ("imu.accel_bias", imu.accel_bias)):
-        spec = SPECS[name]
-        found += [Knob(replace(_quantity(e, name, 0.0, sigma, REACH_OF_BIAS), drifts=True), (e,)) for e in spec.elements]
+        elements = SPECS[name].elements
+        found += [Knob(replace(_quantity(e, name, 0.0, sigma, REACH_OF_BIAS), drifts=True), (e,)) for e in elements]
     return tuple(knob for knob in found if knob.quantity.sigma > 0.0)  # what is known exactly does not move
-
-
-def _knob(key: str, elements: tuple[str, ...], nominal: Parameters, robot: Robot) -> Knob:
-    name = elements[0] if len(elements) == 1 else key
-    spec = SPECS[elements[0].partition("[")[0]]
-    value = float(nominal[elements[0]][0])
-    sigma = robot.tolerances[key].sigma(elements[0], value)
-    shares = tuple(float(nominal[element][0]) / value if value else 1.0 for element in elements)
-    return Knob(_quantity(name, spec.name, value, sigma), elements, shares)
 
 
 def _quantity(name: str, parameter: str, nominal: float, sigma: float, reach: float = REACH) -> Quantity:
     spec = SPECS[parameter]
-    return Quantity(
-        name, spec.unit, nominal, sigma, max(spec.low, nominal - reach * sigma), min(spec.high, nominal + reach * sigma)
-    )
+    low, high = max(spec.low, nominal - reach * sigma), min(spec.high, nominal + reach * sigma)
+    return Quantity(name, spec.unit, nominal, sigma, low, high)
 
 
 def write(knobs: Sequence[Knob], values: Array, parameters: Parameters) -> None:
@@ -121,7 +110,6 @@ def write(knobs: Sequence[Knob], values: Array, parameters: Parameters) -> None:
 
 
 # ---- effects of the library ------------------------------------------------------------------------------------------
-
 
 #: A prior is no wall: a size is sought so far beyond it too, in its width, where the simulator accepts it.
 BEYOND = 3.0
@@ -148,7 +136,12 @@ def robot_candidates(
         residuals: of the model, (rows, signals) per run.
         drifting: names of the quantities that drift: no effect hides in their tolerance.
     """
-    library = _Library(observe(parameters, measured, simulated, residuals), tolerances, drifting)
+    orders = {joint: order for joint in JOINTS if (order := wave_order(joint, measured, residuals)) is not None}
+    # where the robot has been: by the model, since not all runs have a camera
+    x = np.concatenate([values[:, CHANNELS.index("cam_x")] for values in simulated])
+    reached = x[np.isfinite(x)]  # a simulation may break down
+    travel = (float(reached.min()), float(reached.max())) if reached.size else (0.0, 0.0)
+    library = _Library(Observed(parameters, orders, travel), tolerances, drifting)
     found = [own for effect, search, where in _searches() for own in library.candidates(effect, search, where)]
     return list(library.probes.values()), found
 
@@ -178,33 +171,26 @@ class _Library:
 
     def candidates(self, effect: Effect, search: Search, where: Places) -> list[Candidate]:
         """Return an effect at a set of places, and each component of a vector alone; none where these runs cannot show it."""
-        whole = self._candidate(effect, search, where)
-        if whole is None:
-            return []
-        return [whole, *(_component(whole, k) for k in range(len(whole.unknowns)) if search.components)]
-
-    def _candidate(self, effect: Effect, search: Search, where: Places) -> Candidate | None:
-        """Return an effect at a set of places; None where these runs cannot show it."""
         at_all = set(where) == set(effect.where)
         known = {name: number for name, number in search.known.items() if at_all or "{}" in number.quantity}
         if search.guesses is None:
-            starts: tuple[Start, ...] = (self._known_start(effect, where, known),)
+            starts = [self._known_start(effect, where, known)]
         else:
-            starts = tuple(self._start(effect, where, guess) for guess in search.guesses(where, self.observed))
+            starts = [self._start(effect, where, guess) for guess in search.guesses(where, self.observed)]
         if not starts:
-            return None
+            return []
         own = None if search.coordinates is None else search.coordinates(where, self.observed)
         unknowns = self._unknowns(effect, search)
         if own is not None:
-            numbers = own.numbers.items()
-            unknowns = tuple(Unknown(n, one.unit, one.neutral, one.low, one.high, one.step, one.is_size) for n, one in numbers)
+            unknowns = [Unknown(n, o.unit, o.neutral, o.low, o.high, o.step, o.is_size) for n, o in own.numbers.items()]
         tolerances = tuple(self._tolerance(effect, where, unknown.name, known) for unknown in unknowns) if known else ()
-        candidate = Candidate(effect.name, where, unknowns, starts, tolerances=tolerances, surcharge=search.surcharge)
-        if own is None:
-            return candidate
-        return replace(candidate, fixed=own.fixed, convert=own.parameters, within=own.within)
+        numbers, ways = tuple(unknowns), tuple(starts)
+        whole = Candidate(effect.name, where, numbers, ways, tolerances=tolerances, surcharge=search.surcharge)
+        if own is not None:
+            whole = replace(whole, fixed=own.fixed, convert=own.parameters, within=own.within)
+        return [whole, *(_component(whole, k) for k in range(len(unknowns)) if search.components)]
 
-    def _unknowns(self, effect: Effect, search: Search) -> tuple[Unknown, ...]:
+    def _unknowns(self, effect: Effect, search: Search) -> list[Unknown]:
         """The parameters of an effect; a fit may go :data:`BEYOND` their prior."""
         found = []
         for name, parameter in effect.parameters.items():
@@ -215,35 +201,36 @@ class _Library:
             most = high if high == neutral else min(high + room, parameter.high)
             step = 0.05 * (high - low)
             found.append(Unknown(name, parameter.unit, neutral, low, high, step, parameter.is_size, least, most))
-        return tuple(found)
+        return found
 
     def _known_start(self, effect: Effect, where: Places, known: Mapping[str, Known]) -> Start:
         """Start from responses to calibrated parameters: a tolerance each, or a probe where the robot's file gives none."""
         neutral = {name: effect.parameters[name].neutral_in(self.observed.parameters) for name in known}
         directions, amounts = [], []
         for name, number in known.items():
-            quantities = _quantities(number, where)
+            quantities, scale = _quantities(number, where), number.scale(self.observed)
             step = max((number.step_at(place) for place in where), key=abs)
-            if all(
-                abs(step) < LARGER * number.scale(self.observed) * self.tolerances.get(quantity, 0.0) for quantity in quantities
-            ):
+            if all(abs(step) < LARGER * scale * self.tolerances.get(quantity, 0.0) for quantity in quantities):
                 directions.append(quantities)
-                amounts.append(number.scale(self.observed) * self.tolerances[quantities[0]])
+                amounts.append(scale * self.tolerances[quantities[0]])
             else:
                 changed = {**neutral, name: neutral[name] + step}
                 directions.append(tuple(self._probe(PatchEffect(effect.name, (place,), changed)) for place in where))
                 amounts.append(step)
         middle = tuple(neutral.values())
-        return Start(
-            tuple(directions), lambda a: tuple(float(n + size * k) for n, size, k in zip(middle, amounts, a, strict=True))
-        )
+
+        def values(a: Array) -> tuple[float, ...]:
+            return tuple(float(n + size * k) for n, size, k in zip(middle, amounts, a, strict=True))
+
+        return Start(tuple(directions), values)
 
     def _start(self, effect: Effect, where: Places, guess: Guess) -> Start:
-        def response(changes: Sequence[Change]) -> tuple[str, ...]:
+        directions = []
+        for changes in guess.directions:
             pairs = itertools.product(changes, where)
-            return tuple(self._probe(PatchEffect(c.effect or effect.name, (place,), c.parameters)) for c, place in pairs)
-
-        return Start(tuple(map(response, guess.directions)), guess.values)
+            probes = (PatchEffect(c.effect or effect.name, (place,), c.parameters) for c, place in pairs)
+            directions.append(tuple(map(self._probe, probes)))
+        return Start(tuple(directions), guess.values)
 
     def _probe(self, change: PatchEffect) -> str:
         numbers = (f"{name} {value:g}" for name, value in change.parameters.items())
@@ -285,25 +272,6 @@ ORDERS = range(1, 65)
 PERIODS = 1.5
 #: Fewer rows show no wave.
 LEAST_ROWS = 20
-
-
-def observe(
-    parameters: Parameters, measured: Sequence[Array], simulated: Sequence[Array], residuals: Sequence[Array]
-) -> Observed:
-    """Return what a search may read off a model and its runs.
-
-    Args:
-        parameters: (1) of the model.
-        measured: (rows, signals) per run.
-        simulated: the same by the model.
-        residuals: of the model, (rows, signals) per run.
-    """
-    orders = {joint: order for joint in JOINTS if (order := wave_order(joint, measured, residuals)) is not None}
-    # where the robot has been: by the model, since not all runs have a camera
-    x = np.concatenate([values[:, CHANNELS.index("cam_x")] for values in simulated])
-    reached = x[np.isfinite(x)]  # a simulation may break down
-    travel = (float(reached.min()), float(reached.max())) if reached.size else (0.0, 0.0)
-    return Observed(parameters, orders, travel)
 
 
 def wave_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]) -> float | None:
@@ -466,7 +434,11 @@ def _offered(law: Law, shape: tuple[Unknown, ...] = ()) -> tuple[list[Probe], Ca
         effect = PatchEffect(UNKNOWN_EFFECT, law.where, values | fixed | begin, law.formula, units)
         probes.append(Probe(" ".join([UNKNOWN_EFFECT, *law.where, law.formula, term.name]), (effect,)))
     sizes = tuple(Unknown(t.name, t.unit, 0.0, -t.bound, t.bound, 0.5 * t.probe) for t in law.terms)
-    start = Start(tuple((probe.key,) for probe in probes), _values([term.probe for term in law.terms], tuple(begin.values())))
+
+    def values(amplitude: Array) -> tuple[float, ...]:
+        return (*(float(term.probe * a) for term, a in zip(law.terms, amplitude, strict=True)), *begin.values())
+
+    start = Start(tuple((probe.key,) for probe in probes), values)
     return probes, Candidate(UNKNOWN_EFFECT, law.where, (*sizes, *shape), (start,), law.formula, units, fixed)
 
 
@@ -495,7 +467,3 @@ def wave_frequency(times: Sequence[Array], residuals: Sequence[Array]) -> float:
     near = round(NEIGHBOURHOOD / (WAVE_FREQUENCIES[1] - WAVE_FREQUENCIES[0]))
     background = [np.median(power[max(k - near, 0) : k + near + 1]) for k in range(len(power))]
     return float(WAVE_FREQUENCIES[int(np.argmax(power / np.maximum(background, 1e-12)))])
-
-
-def _values(sizes: Sequence[float], begin: tuple[float, ...]) -> Callable[[Array], tuple[float, ...]]:
-    return lambda amplitude: (*(float(size * a) for size, a in zip(sizes, amplitude, strict=True)), *begin)

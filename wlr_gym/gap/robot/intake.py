@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from wlr_gym.data.format import COMMANDS, increments
 from wlr_gym.data.runs import Run
 from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.gap.problem import Array
 from wlr_gym.physics import servo
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.description import Motor
 
 # ---- a check ---------------------------------------------------------------------------------------------------------
-
-Array = NDArray[np.float64]
 
 
 class Sound(Enum):
@@ -57,8 +56,7 @@ Outcome = ChannelFault | Sound
 WHOLE = ("t", "cmd", "pos")
 
 
-@dataclass(frozen=True)
-class IntakeCheck:
+class IntakeCheck(NamedTuple):
     """One check.
 
     Attributes:
@@ -92,8 +90,8 @@ def findings_of(runs: Sequence[Run], checks: Sequence[IntakeCheck], robot: Robot
             if channel not in told and isinstance(fault, ChannelFault):
                 told.add(channel)
                 time = None if fault.row is None else float(run["t"][fault.row] - run["t"][0])
-                said = fault.text, True, time, fault.expected, fault.remedy
-                found.append(IntakeFinding(run.name, channel, check.kind, *said))
+                where = run.name, channel, check.kind
+                found.append(IntakeFinding(*where, fault.text, True, time, fault.expected, fault.remedy))
     return found
 
 
@@ -188,51 +186,48 @@ def clock_jumps(run: Run, channel: str, robot: Robot) -> Outcome:
     Angles go on by their rates times the true time between two rows. Where that says the usual period and the clock another
     step, the clock has jumped; where rows were lost both say the same.
     """
-    time = run["t"]
-    steps = np.diff(time)
-    passed, missed, speed = _time_by_angles(run)
-    late = (np.abs(passed - steps) > LATE) & (speed > SHOWS_TIME) & (missed < MISSED)
+    steps = np.diff(run["t"])
+    angles = np.stack([np.diff(run[f"pos_{joint}"]) for joint in JOINTS])
+    rates = np.stack([0.5 * (rate[1:] + rate[:-1]) for rate in (rate_of(run, joint) for joint in JOINTS)])
+    squares = np.sum(rates**2, axis=0)
+    passed = np.sum(rates * angles, axis=0) / np.maximum(squares, 1e-12)  # s, by what the joints turn
+    missed = np.max(np.abs(angles - rates * passed), axis=0)  # rad that it leaves unexplained
+    late = (np.abs(passed - steps) > LATE) & (np.sqrt(squares) > SHOWS_TIME) & (missed < MISSED)
     late &= np.abs(passed - np.median(steps)) < LATE  # else rows were lost, in which the rates may have changed
-    hole = steps > LONGEST_HOLE
-    if not (late | hole).any():
+    wrong = late | (steps > LONGEST_HOLE)
+    if not wrong.any():
         return Sound.YES
-    row = int(np.argmax(late | hole))
-    step, count = f"{steps[row]:.3g} s from row {row} to the next", int((late | hole).sum())
-    text = (
-        f"{step}, in which the joints moved as in {1e3 * passed[row]:.0f} ms" if late[row] else f"{step}, nothing between them"
+    row = int(np.argmax(wrong))
+    seen = f"in which the joints moved as in {1e3 * passed[row]:.0f} ms" if late[row] else "nothing between them"
+    times = f" ({wrong.sum()} times in the run)" if wrong.sum() > 1 else ""
+    return ChannelFault(
+        row,
+        f"{steps[row]:.3g} s from row {row} to the next, {seen}{times}",
+        "a monotonic clock, rows 20 ms apart; single lost rows do no harm",
+        "split the run there into two files, or record it again with a monotonic clock",
     )
-    text = f"{text} ({count} times in the run)" if count > 1 else text
-    expected = "a monotonic clock, rows 20 ms apart; single lost rows do no harm"
-    return ChannelFault(row, text, expected, "split the run there into two files, or record it again with a monotonic clock")
 
 
 def clock_rate(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether the clock runs as fast as the servos' rates say; one joint alone would be its rate's fault."""
-    turning = [joint for joint in JOINTS if f"vel_{joint}" in run and np.ptp(run[f"pos_{joint}"]) > RATE_SHOWN]
-    if not turning:
+    slopes = []  # of a joint's turning over the integral of its rate
+    for joint in JOINTS:
+        if f"vel_{joint}" in run and np.ptp(run[f"pos_{joint}"]) > RATE_SHOWN:
+            turned, measured = _turned(run, f"pos_{joint}", f"vel_{joint}")
+            slopes.append(float(turned @ measured) / max(float(measured @ measured), 1e-12))
+    if not slopes:
         return Sound.UNDECIDED
-    rate = float(np.median([_angle_over_rate(run, joint) for joint in turning]))
+    rate = float(np.median(slopes))
     if not abs(rate - 1.0) > CLOCK_RATE:
         return Sound.YES
     text = f"by the servos' rates {rate:.2f} times as much time passes between rows as the clock says"
     return ChannelFault(0, text, "seconds", "write the time at which each row was read, in s")
 
 
-def _angle_over_rate(run: Run, joint: str) -> float:
-    """Slope of a joint's turning over the integral of its rate, over half a second each."""
-    rate = run[f"vel_{joint}"]
-    rows = np.isfinite(rate)
-    turned, measured = increments(run["t"][rows], run[f"pos_{joint}"][rows], rate[rows])
-    return float(turned @ measured) / max(float(measured @ measured), 1e-12)
-
-
-def _time_by_angles(run: Run) -> tuple[Array, Array, Array]:
-    """Time between rows (rows - 1,) by what the joints turn, s; the largest angle it leaves unexplained, rad; speed, rad/s."""
-    angles = np.stack([np.diff(run[f"pos_{joint}"]) for joint in JOINTS])
-    rates = np.stack([0.5 * (rate[1:] + rate[:-1]) for rate in (rate_of(run, joint) for joint in JOINTS)])
-    squares = np.sum(rates**2, axis=0)
-    passed = np.sum(rates * angles, axis=0) / np.maximum(squares, 1e-12)
-    return passed, np.max(np.abs(angles - rates * passed), axis=0), np.sqrt(squares)
+def _turned(run: Run, angle: str, rate: str) -> tuple[Array, Array]:
+    """How far an angle turns by itself and by its rate, over half a second each, where the rate was measured."""
+    rows = np.isfinite(run[rate])
+    return increments(run["t"][rows], run[angle][rows], run[rate][rows])
 
 
 def motors_off(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -305,13 +300,12 @@ def wrapped(run: Run, channel: str, robot: Robot) -> Outcome:
 def dead(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether a joint shows nothing of what it is asked to do, in the whole run."""
     joint = place(channel)
-    asked, shown = _motions(run, joint)
-    if not len(asked) or _size(joint, asked) < ASKED:
+    asked, shown = (_size(joint, motion) for motion in _motions(run, joint))
+    if asked < ASKED:
         return Sound.YES if np.ptp(run[channel]) > 0.0 else Sound.UNDECIDED
-    if _size(joint, shown) >= SHOWN * _size(joint, asked) or _sees(run, joint, robot, slice(None)):
+    if shown >= SHOWN * asked or _sees(run, joint, robot, slice(None)):
         return Sound.YES
-    text = f"commanded to move by {_size(joint, asked):.2g} rad and shows {_size(joint, shown):.2g} rad"
-    return ChannelFault(_first_asked(run, joint), text, *_FOLLOWS)
+    return ChannelFault(_first_asked(run, joint), f"commanded to move by {asked:.2g} rad and shows {shown:.2g} rad", *_FOLLOWS)
 
 
 _FOLLOWS = "an encoder that follows", "dead encoder, or the motor is not on: check its cable and its torque switch"
@@ -322,23 +316,22 @@ def stuck(run: Run, channel: str, robot: Robot) -> Outcome:
 
     Or, of a leg, while its effort changes: that is gain times lag, so that an effort cannot change unless the angle does.
     """
-    joint = place(channel)
+    joint, t = place(channel), run["t"]
     held = np.diff(run[channel], prepend=np.nan) == 0.0
     pushed = np.abs(asked_torque(run, joint, robot)) > PUSHED * _motor(robot, joint).stall_torque
-    for start, end in _stretches(pushed & held):
-        rows = slice(start, end)
-        if run["t"][end - 1] - run["t"][start] > STUCK and not _sees(run, joint, robot, rows):
-            return ChannelFault(start, f"{_reads(run, channel, start, end)} while its setpoint is elsewhere", *_FOLLOWS)
-    for start, end in _stretches(held) if joint in LEGS else ():
-        lag = _unseen_lag(run, joint, robot, slice(start, end))
+    faults = []
+    for rows in _stretches(pushed & held):
+        if t[rows][-1] - t[rows.start] > STUCK and not _sees(run, joint, robot, rows):
+            faults.append((rows, "while its setpoint is elsewhere"))
+    for rows in _stretches(held) if joint in LEGS else ():
+        lag = _unseen_lag(run, joint, robot, rows)
         if lag > LEAST_COUNTS * robot.sensors.encoder.position:
-            text = f"{_reads(run, channel, start, end)} while its effort changes by what takes a lag of {1e3 * lag:.0f} mrad"
-            return ChannelFault(start, text, *_FOLLOWS)
-    return Sound.YES
-
-
-def _reads(run: Run, channel: str, start: int, end: int) -> str:
-    return f"reads {run[channel][start]:.4g} rad for {run['t'][end - 1] - run['t'][start]:.2f} s"
+            faults.append((rows, f"while its effort changes by what takes a lag of {1e3 * lag:.0f} mrad"))
+    if not faults:
+        return Sound.YES
+    rows, meanwhile = faults[0]
+    reads = f"reads {run[channel][rows.start]:.4g} rad for {t[rows][-1] - t[rows.start]:.2f} s"
+    return ChannelFault(rows.start, f"{reads} {meanwhile}", *_FOLLOWS)
 
 
 def _unseen_lag(run: Run, joint: str, robot: Robot, rows: slice) -> float:
@@ -347,8 +340,8 @@ def _unseen_lag(run: Run, joint: str, robot: Robot, rows: slice) -> float:
     lag = run[f"cmd_{joint}"][rows] - run[f"pos_{joint}"][rows]
     if len(effort) < LEAST_HELD or not np.isfinite(effort).all() or not np.isfinite(lag).all():
         return 0.0
-    motor, supply = robot.servo.leg, robot.servo.supply_voltage
-    stiffness = motor.kp * motor.stall_torque / supply
+    motor = robot.servo.leg
+    stiffness = motor.kp * motor.stall_torque / robot.servo.supply_voltage
     return float(np.ptp(np.quantile(effort, (0.025, 0.975)))) / stiffness - float(np.ptp(lag))
 
 
@@ -356,7 +349,7 @@ def mirrored(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether a joint moves against its command."""
     joint = place(channel)
     asked, shown = _motions(run, joint)
-    if not len(asked) or _size(joint, asked) < ASKED:
+    if _size(joint, asked) < ASKED:
         return Sound.UNDECIDED
     slope = float(asked @ shown / max(float(asked @ asked), 1e-12))
     if slope >= MIRRORED:
@@ -368,17 +361,20 @@ def mirrored(run: Run, channel: str, robot: Robot) -> Outcome:
 def rate_against_angle(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether a servo's rate is against the turning of its angle, over half a second each."""
     angle = f"pos_{place(channel)}"
-    rows = np.isfinite(run[channel])
-    if rows.sum() < LEAST_ROWS:
+    if np.isfinite(run[channel]).sum() < LEAST_ROWS:
         return Sound.UNDECIDED
-    turned, measured, together = correlation(*increments(run["t"][rows], run[angle][rows], run[channel][rows]))
+    turned, measured, together = correlation(*_turned(run, angle, channel))
     if min(turned, measured) < TURNED:
         return Sound.UNDECIDED
     if together > OPPOSITE:
         return Sound.YES
     text = f"turns against {angle} (correlation {together:.2f}): one of the two has the wrong sign"
-    row = int(np.argmax(np.abs(np.nan_to_num(run[channel]))))
-    return ChannelFault(row, text, "a correlation near 1", "check the sign in the hardware file")
+    return ChannelFault(_largest(run, channel), text, "a correlation near 1", "check the sign in the hardware file")
+
+
+def _largest(run: Run, channel: str) -> int:
+    """The row of a channel's largest reading."""
+    return int(np.argmax(np.abs(np.nan_to_num(run[channel]))))
 
 
 def without_signal(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -390,9 +386,8 @@ def without_signal(run: Run, channel: str, robot: Robot) -> Outcome:
     if np.ptp(run[channel][on]) > 0.0:
         return Sound.YES
     text = f"reads {run[channel][on][0]:g} throughout while the joint turns by {np.ptp(run[f'pos_{joint}'][on]):.2g} rad"
-    return ChannelFault(
-        int(np.argmax(on)), text, "readings that change with the motion", "leave the column out, or record it again"
-    )
+    remedy = "leave the column out, or record it again"
+    return ChannelFault(int(np.argmax(on)), text, "readings that change with the motion", remedy)
 
 
 def leg_effort_against(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -495,7 +490,7 @@ def _motions(run: Run, joint: str) -> tuple[Array, Array]:
 
 
 def _size(joint: str, motion: Array) -> float:
-    return float(np.ptp(motion) if joint in LEGS else np.abs(motion).sum())
+    return float(np.ptp(motion) if joint in LEGS and motion.size else np.abs(motion).sum())
 
 
 def _first_asked(run: Run, joint: str) -> int:
@@ -505,10 +500,10 @@ def _first_asked(run: Run, joint: str) -> int:
     return int(np.argmax(np.abs(np.nan_to_num(command - rest)) > 0.0))
 
 
-def _stretches(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First row and end of every run of chosen rows."""
+def _stretches(chosen: NDArray[np.bool_]) -> list[slice]:
+    """Every unbroken run of chosen rows."""
     edges = np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    return [slice(first, end) for first, end in edges.reshape(-1, 2).tolist()]
 
 
 # ---- inertial sensors ------------------------------------------------------------------------------------------------
@@ -549,18 +544,21 @@ def in_degrees(run: Run, channel: str, robot: Robot) -> Outcome:
             continue
         if measured < IN_DEGREES * turned:
             return Sound.YES
-        text = f"turns {measured / turned:.0f} times as much as {name} (correlation {together:.2f})"
-        return _degrees(int(np.argmax(np.abs(np.nan_to_num(run[channel])))), text)
-    noise = _noise_at_rest(run, channel) / robot.sensors.imu.gyro_noise
-    if 0.0 < noise < IN_DEGREES:
-        return Sound.YES
-    if NOISE_IN_DEGREES[0] < noise < NOISE_IN_DEGREES[1]:
-        return _degrees(0, f"its noise at rest is {noise:.0f} times the robot file's")
-    return Sound.UNDECIDED
-
-
-def _degrees(row: int, text: str) -> ChannelFault:
-    return ChannelFault(row, f"{text}: degrees per second?", "rad/s", "multiply by pi/180 = 0.017453")
+        row, seen = (
+            _largest(run, channel),
+            f"turns {measured / turned:.0f} times as much as {name} (correlation {together:.2f})",
+        )
+        break
+    else:
+        changes = np.diff(run[channel])[~moving(run)[1:]]  # in rows in which nothing has moved since the row before
+        changes = changes[np.isfinite(changes)]
+        if len(changes) < LEAST_AT_REST:
+            return Sound.UNDECIDED
+        noise = float(np.median(np.abs(changes))) * NORMAL / math.sqrt(2.0) / robot.sensors.imu.gyro_noise
+        if not NOISE_IN_DEGREES[0] < noise < NOISE_IN_DEGREES[1]:
+            return Sound.YES if 0.0 < noise < IN_DEGREES else Sound.UNDECIDED
+        row, seen = 0, f"its noise at rest is {noise:.0f} times the robot file's"
+    return ChannelFault(row, f"{seen}: degrees per second?", "rad/s", "multiply by pi/180 = 0.017453")
 
 
 def _turning(run: Run, channel: str, angle: Array) -> tuple[float, float, float]:
@@ -573,27 +571,21 @@ def _turning(run: Run, channel: str, angle: Array) -> tuple[float, float, float]
 
 def _references(run: Run, channel: str, robot: Robot) -> list[tuple[str, Array]]:
     """What else shows how far the body turned about an axis, the best first: names and angles (rows,), rad."""
+
+    def measured(name: str) -> bool:
+        return name in run and np.isfinite(run[name]).sum() >= LEAST_ROWS
+
     camera = {"gyro_z": "cam_yaw", "gyro_y": "cam_pitch"}.get(channel, "")
-    seen = [(camera, run[camera])] if camera in run and np.isfinite(run[camera]).sum() >= LEAST_ROWS else []
-    return [*seen, *_references_on_board(run, channel, robot)]
-
-
-def _references_on_board(run: Run, channel: str, robot: Robot) -> list[tuple[str, Array]]:
-    if channel == "gyro_z":
-        return [("the wheels", _yaw_of_wheels(run, robot))]
+    found = [(camera, run[camera])] if measured(camera) else []
+    if channel == "gyro_z":  # heading of a body whose wheels roll without slip: spins in the body's frame, legs included
+        travel = {w: run[f"pos_{w}"] + run[f"pos_{leg}"] for w, leg in zip(WHEELS, LEGS, strict=True)}
+        across = (travel["wheel_rf"] + travel["wheel_rr"]) - (travel["wheel_lf"] + travel["wheel_lr"])
+        return [*found, ("the wheels", across * (robot.wheel.radius / (4.0 * robot.hip_position.y)))]
     across = "acc_y" if channel == "gyro_x" else "acc_x"
-    if not all(name in run and np.isfinite(run[name]).sum() >= LEAST_ROWS for name in (across, "acc_z")):
-        return []
-    tilt = np.arctan2(_averaged(run, across), _averaged(run, "acc_z"))
-    return [("gravity in the accelerometer", tilt if channel == "gyro_x" else -tilt)]
-
-
-def _yaw_of_wheels(run: Run, robot: Robot) -> Array:
-    """Heading (rows,), rad, of a body whose wheels roll without slip: spins in the body's frame, legs included."""
-    travel = {w: run[f"pos_{w}"] + run[f"pos_{leg}"] for w, leg in zip(WHEELS, LEGS, strict=True)}
-    right = travel["wheel_rf"] + travel["wheel_rr"]
-    left = travel["wheel_lf"] + travel["wheel_lr"]
-    return (right - left) * (robot.wheel.radius / (4.0 * robot.hip_position.y))
+    if measured(across) and measured("acc_z"):
+        tilt = np.arctan2(_averaged(run, across), _averaged(run, "acc_z"))
+        found.append(("gravity in the accelerometer", tilt if channel == "gyro_x" else -tilt))
+    return found
 
 
 def _averaged(run: Run, channel: str) -> Array:
@@ -603,13 +595,6 @@ def _averaged(run: Run, channel: str) -> Array:
     half = max(1, round(0.5 * AVERAGED / float(np.median(np.diff(run["t"])))))
     padded = np.pad(values, half, mode="edge")
     return np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), mode="valid")
-
-
-def _noise_at_rest(run: Run, channel: str) -> float:
-    """Noise (one sigma), from rows in which nothing has moved since the row before; NaN where they are too few."""
-    changes = np.diff(run[channel])[~moving(run)[1:]]
-    changes = changes[np.isfinite(changes)]
-    return float(np.median(np.abs(changes))) * NORMAL / math.sqrt(2.0) if len(changes) >= LEAST_AT_REST else math.nan
 
 
 def gyro_against(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -622,7 +607,7 @@ def gyro_against(run: Run, channel: str, robot: Robot) -> Outcome:
         if together > OPPOSITE:
             return Sound.YES
         text = f"turns against {name} (correlation {together:.2f})"
-        return ChannelFault(int(np.argmax(np.abs(np.nan_to_num(run[channel])))), text, "a correlation near 1", remedy)
+        return ChannelFault(_largest(run, channel), text, "a correlation near 1", remedy)
     return Sound.UNDECIDED
 
 
@@ -645,66 +630,54 @@ def imu_saturated(run: Run, channel: str, robot: Robot) -> Outcome:
         if counts[end] >= AT_END and counts[end] > PILED_UP * float(np.mean(counts[inside])):
             text = f"{counts[end]} rows at its extreme of {levels[end]:.4g}, bit for bit"
             row = int(np.argmax(rows & (run[channel] == levels[end])))
-            return ChannelFault(
-                row, text, "a range that the motion does not reach", "set a wider range of the sensor and record again"
-            )
+            remedy = "set a wider range of the sensor and record again"
+            return ChannelFault(row, text, "a range that the motion does not reach", remedy)
     return Sound.YES
 
 
 def imu_without_signal(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether a sensor that has noise repeats one value while the robot moves.
 
-    A simulation without noise may do so rightly: a run whose other channels repeat themselves at rest is left alone.
+    A simulation without noise may do so rightly: a run is left alone in which no inertial channel changes from row to row while
+    nothing moves.
     """
-    if not _has_noise(run):
-        return Sound.UNDECIDED
-    same = (np.diff(run[channel], prepend=np.nan) == 0.0) | ~np.isfinite(run[channel])
-    first, longest = _longest(same)
-    seconds = float(run["t"][first + longest - 1] - run["t"][first]) if longest else 0.0
-    if seconds < IMU_STUCK or not moving(run)[first : first + longest].any() or np.isnan(run[channel][first]):
+    moves, reading = moving(run), run[channel]
+    if (~moves).sum() >= LEAST_AT_REST:
+        at_rest = [run[name][~moves & np.isfinite(run[name])] for name in IMU if name in run]
+        if not any(len(np.unique(values)) > 0.5 * (~moves).sum() for values in at_rest):
+            return Sound.UNDECIDED
+    same = (np.diff(reading, prepend=np.nan) == 0.0) | ~np.isfinite(reading)
+    rows = max(_stretches(same), key=lambda rows: rows.stop - rows.start, default=slice(0, 1))
+    seconds = float(run["t"][rows.stop - 1] - run["t"][rows.start])
+    if seconds < IMU_STUCK or not moves[rows].any() or np.isnan(reading[rows.start]):
         return Sound.YES
-    text = f"reads {run[channel][first]:.4g} for {seconds:.2f} s while the robot moves"
-    return ChannelFault(first, text, "noise at least", "leave the column out, or record it again: check the sensor's cable")
-
-
-def _has_noise(run: Run) -> bool:
-    """Whether any inertial channel changes from row to row while nothing moves; yes where something always moves."""
-    still = ~moving(run)
-    if still.sum() < LEAST_AT_REST:
-        return True
-    names = [name for name in IMU if name in run]
-    return any(len(np.unique(run[name][still][np.isfinite(run[name][still])])) > 0.5 * still.sum() for name in names)
-
-
-def _longest(chosen: NDArray[np.bool_]) -> tuple[int, int]:
-    """First row and length of the longest stretch of chosen rows."""
-    edges = np.flatnonzero(np.diff(chosen.astype(np.int8), prepend=0, append=0))
-    if not len(edges):
-        return 0, 0
-    lengths = edges[1::2] - edges[::2]
-    return int(edges[::2][np.argmax(lengths)]), int(lengths.max())
+    text = f"reads {reading[rows.start]:.4g} for {seconds:.2f} s while the robot moves"
+    remedy = "leave the column out, or record it again: check the sensor's cable"
+    return ChannelFault(rows.start, text, "noise at least", remedy)
 
 
 # ---- all checks ------------------------------------------------------------------------------------------------------
 
+_POS, _VEL, _EFF = (tuple(f"{kind}_{joint}" for joint in JOINTS) for kind in ("pos", "vel", "eff"))
+_GYRO = ("gyro_z", "gyro_y", "gyro_x")
 #: In the order in which they are made: what a check compares with has been checked before.
 CHECKS: tuple[IntakeCheck, ...] = (
     IntakeCheck("short", ("t",), too_short),
     IntakeCheck("missing", ("cmd",), motors_off),
     IntakeCheck("still", ("pos",), stands_still),
-    IntakeCheck("wrap", tuple(f"pos_{joint}" for joint in JOINTS), wrapped),
+    IntakeCheck("wrap", _POS, wrapped),
     IntakeCheck("clock", ("t",), clock_rate),
     IntakeCheck("clock", ("t",), clock_jumps),
-    IntakeCheck("dead", tuple(f"pos_{joint}" for joint in JOINTS), dead),
-    IntakeCheck("mirrored", tuple(f"pos_{joint}" for joint in JOINTS), mirrored),
-    IntakeCheck("dead", tuple(f"pos_{joint}" for joint in JOINTS), stuck),
-    IntakeCheck("mirrored", tuple(f"vel_{joint}" for joint in JOINTS), rate_against_angle),
-    IntakeCheck("dead", tuple(f"{kind}_{joint}" for kind in ("vel", "eff") for joint in JOINTS), without_signal),
+    IntakeCheck("dead", _POS, dead),
+    IntakeCheck("mirrored", _POS, mirrored),
+    IntakeCheck("dead", _POS, stuck),
+    IntakeCheck("mirrored", _VEL, rate_against_angle),
+    IntakeCheck("dead", (*_VEL, *_EFF), without_signal),
     IntakeCheck("mirrored", tuple(f"eff_{leg}" for leg in LEGS), leg_effort_against),
     IntakeCheck("mirrored", tuple(f"eff_{wheel}" for wheel in WHEELS), wheel_effort_against),
     IntakeCheck("saturated", IMU, imu_saturated),
     IntakeCheck("dead", IMU, imu_without_signal),
     IntakeCheck("mirrored", ("acc_z",), upside_down),
-    IntakeCheck("units", ("gyro_z", "gyro_y", "gyro_x"), in_degrees),
-    IntakeCheck("mirrored", ("gyro_z", "gyro_y", "gyro_x"), gyro_against),
+    IntakeCheck("units", _GYRO, in_degrees),
+    IntakeCheck("mirrored", _GYRO, gyro_against),
 )

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import in_threads
@@ -19,7 +18,7 @@ from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.runs import Run, read_dataset, robot_of
 from wlr_gym.data.sensors import channel_noise, noise_parts
 from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding
-from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
+from wlr_gym.gap.problem import Array, Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
 from wlr_gym.gap.robot.candidates import Knob, formula_candidates, knobs, robot_candidates, shown_by, tried_effects, write
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
 from wlr_gym.gap.robot.replay_loop import TRUTH, Replays
@@ -30,9 +29,6 @@ from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.forces import MEMORY, Force, features_read
 from wlr_gym.robot import JOINTS, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
-
-Array = NDArray[np.float64]
-
 
 #: Channels that a motor or the IMU reads only after a first step.
 UNREAD = [c for c, name in enumerate(CHANNELS) if name.startswith(("eff_", "gyro_", "acc_", "volt"))]
@@ -85,12 +81,13 @@ class RobotProblem:
     ) -> None:
         if not runs:
             raise InputError("no runs to analyse")
+        profile = runs[0].meta.profile
+        if any(run.meta.profile != profile for run in runs):
+            raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
         self.metric: str = (
             f"RMS over channels of measured minus replayed, in units of sensor noise ({CAP:g} at most per reading), "
             f"windows of {window:g} s"
         )
-        if any(run.meta.profile != runs[0].meta.profile for run in runs):
-            raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
         self.cap, self.steps, self.tempering = CAP, STEPS, TEMPERING
         self.disagreement, self.misfit = DISAGREEMENT, MISFIT
         self.thorough, self.held_out = False, ()
@@ -104,31 +101,27 @@ class RobotProblem:
         }
         self.robot: Robot = robot or robot_of(runs[0])
         self.known: Patch = load_patch(known)
-        self.backend, self.threads = backend, threads
+        self.backend, self.threads, self._window = backend, threads, window
         self.clocks: list[RunClock] = in_threads(threads, lambda run: RunClock(run, window), runs)
         self.runs: tuple[str, ...] = tuple(run.name for run in runs)
         self._knobs: tuple[Knob, ...] = knobs(self.robot, PHYSICS_STEP)
         self.quantities: tuple[Quantity, ...] = tuple(knob.quantity for knob in self._knobs)
         noise = channel_noise(self.robot)
-        self.signals: tuple[MeasuredSignal, ...] = tuple(
-            MeasuredSignal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group, _place(name)) for name in CHANNELS
-        )
-        self._noise = np.array([signal.noise for signal in self.signals])
-        if not self._noise.all():
-            name = self.signals[int(np.argmin(self._noise))].name
-            raise InputError(
-                f"robot '{self.robot.name}': sensors: '{name}' has no noise and no count, and errors are counted in them"
-            )
-        split = noise_parts(self.robot)
-        self._analogue, self._count = (np.array([split[name][k] for name in CHANNELS]) for k in (0, 1))
-        self._window = window
+        for name in CHANNELS:
+            if not noise[name]:
+                lacks = f"'{name}' has no noise and no count, and errors are counted in them"
+                raise InputError(f"robot '{self.robot.name}': sensors: {lacks}")
+        signals = []
+        for name in CHANNELS:
+            joint = name.partition("_")[2]
+            place = joint if joint in JOINTS else "body"
+            signals.append(MeasuredSignal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group, place))
+        self.signals: tuple[MeasuredSignal, ...] = tuple(signals)
+        self._noise = np.array([noise[name] for name in CHANNELS])
         self._tried = _by_slot(Patch(tried_effects()).forces)
-        self._base = profile_parameters(Parameters.nominal(self.robot), runs[0].meta.profile)
-        self._measured = [
-            np.stack([run[name] if name in run else np.full(len(run["t"]), np.nan) for name in CHANNELS], axis=1)
-            for run in runs
-        ]
-
+        self._base = profile_parameters(Parameters.nominal(self.robot), profile)
+        tables = (run.table.reindex(columns=list(CHANNELS)) for run in runs)
+        self._measured: list[Array] = [np.array(table, np.float64, order="C") for table in tables]
         self._compared = [values.copy() for values in self._measured]
         for values, clock in zip(self._compared, self.clocks, strict=True):
             if not clock.lead:  # a robot that is put into motion has no torque and no acceleration in its first row
@@ -147,21 +140,23 @@ class RobotProblem:
         table = Parameters(np.repeat(self._base.values, len(settings), axis=0))
         write(self._knobs, np.stack([setting.quantities for setting in settings]), table)
         for row, setting in enumerate(settings):
-            effects = (*self.known.effects, *setting.effects)
-            if effects:
-                one = apply_patch(Patch(effects), Parameters(table.values[row : row + 1]))
-                table.values[row] = one.values[0]
+            patch = self._patch(setting)
+            if patch.effects:
+                table.values[row] = apply_patch(patch, Parameters(table.values[row : row + 1])).values[0]
         return table
+
+    def _patch(self, setting: Setting) -> Patch:
+        """The effects of a setting and those that are known."""
+        return Patch((*self.known.effects, *setting.effects))
 
     def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Return what the sensors would have read: (settings, rows, signals) per run, SI."""
-        groups = self._alike(settings)
+        groups, clocks = self._alike(settings), [self.clocks[r] for r in runs]
         if len(groups) == 1:
-            return [replays.values for replays in self._replay(settings, runs)]
+            return [replays.values for replays in self._replay(settings, clocks)]
         results = [np.zeros((len(settings), len(self.times(r)), len(CHANNELS))) for r in runs]
         for members in groups:
-            chosen = [settings[k] for k in members]
-            for result, replays in zip(results, self._replay(chosen, runs), strict=True):
+            for result, replays in zip(results, self._replay([settings[k] for k in members], clocks), strict=True):
                 result[members] = replays.values
         return results
 
@@ -172,18 +167,16 @@ class RobotProblem:
         """
         groups: dict[str, list[int]] = {kernel: [] for kernel in (*KERNELS, "formulas")}
         for k, setting in enumerate(settings):
-            has_formula = bool(Patch((*self.known.effects, *setting.effects)).forces)
-            groups["formulas" if has_formula else kernel_of(self.parameters([setting]))].append(k)
+            groups["formulas" if self._patch(setting).forces else kernel_of(self.parameters([setting]))].append(k)
         for place, kernel in enumerate(KERNELS[:-1], 1):
             if len(groups[kernel]) < WORTH_APART and any(groups[slower] for slower in KERNELS[place:]):
                 groups[KERNELS[place]] += groups.pop(kernel)
         return [sorted(group) for group in groups.values() if group]
 
-    def _replay(self, settings: Sequence[Setting], runs: Sequence[int], with_truth: bool = False) -> list[Replays]:
+    def _replay(self, settings: Sequence[Setting], clocks: Iterable[RunClock], with_truth: bool = False) -> list[Replays]:
         forces, constants = self._forces(settings)
-        clocks = [self.clocks[r] for r in runs]
         table = self.parameters(settings)
-        return replay_batch(self.robot, clocks, table, self.backend, forces, constants, with_truth, self.threads)
+        return replay_batch(self.robot, list(clocks), table, self.backend, forces, constants, with_truth, self.threads)
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
         """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
@@ -223,24 +216,21 @@ class RobotProblem:
 
         Nothing where the simulation of a run breaks down.
         """
-        forces, constants = self._forces([setting])
         clocks = in_threads(self.threads, lambda r: RunClock(self.clocks[r].run, window=math.inf), runs)  # without anchors
-        table = self.parameters([setting])
-        clean = replay_batch(self.robot, clocks, table, self.backend, forces, constants, threads=self.threads)
-        whole = [replays.values[0] for replays in clean]
+        whole = [replays.values[0] for replays in self._replay([setting], clocks)]
         return whole if all(np.isfinite(values).all() for values in whole) else []
 
     def _read(self, r: int, values: Array, rng: np.random.Generator) -> Run:
         """Return run ``r`` with ``values`` (rows, signals) in place of what was measured, noisy and rounded as sensors do."""
-        run = self.clocks[r].run
+        run, split = self.clocks[r].run, noise_parts(self.robot)
         table = run.table.copy()
-        for c, signal in enumerate(self.signals):
-            if signal.name not in run:
+        for c, name in enumerate(CHANNELS):
+            if name not in run:
                 continue
-            noisy = values[:, c] + self._analogue[c] * rng.standard_normal(len(values))
-            count = self._count[c]
+            analogue, count = split[name]
+            noisy = values[:, c] + analogue * rng.standard_normal(len(values))
             rounded = np.round(noisy / count) * count if count > 0.0 else noisy
-            table[signal.name] = np.where(np.isfinite(self._measured[r][:, c]), rounded, np.nan)
+            table[name] = np.where(np.isfinite(self._measured[r][:, c]), rounded, np.nan)
         return replace(run, table=table)
 
     def candidates(
@@ -268,7 +258,7 @@ class RobotProblem:
 
         Of some effects a place holds one: beside another such effect a probe's may be the same, but no fit could move it.
         """
-        if _taken((*self.known.effects, *setting.effects)) & _taken(probe.effects):
+        if _taken(self._patch(setting).effects) & _taken(probe.effects):
             return False
         try:
             self.parameters([replace(setting, effects=(*setting.effects, *probe.effects))])
@@ -278,7 +268,7 @@ class RobotProblem:
 
     def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
         """Return over which range of each feature a formula was tried; see :meth:`wlr_gym.gap.problem.Problem.reach`."""
-        replayed = self._replay([setting], runs, with_truth=True)
+        replayed = self._replay([setting], [self.clocks[r] for r in runs], with_truth=True)
         inputs = _formula_inputs(np.concatenate([replays.truth[0] for replays in replayed if replays.truth is not None]))
         inputs["supply_voltage"] = np.concatenate([replays.values[0, :, CHANNELS.index("volt")] for replays in replayed])
         inputs["time"] = np.concatenate([self.times(run) - self.times(run)[0] for run in runs])
@@ -289,7 +279,7 @@ class RobotProblem:
 
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
         """Return joint speeds, loads, slip and place over the rows of each run."""
-        found = self._replay([setting], runs, with_truth=True)
+        found = self._replay([setting], [self.clocks[r] for r in runs], with_truth=True)
         features = zip(runs, found, strict=True)
         return [_features(replays.truth[0], self.times(run)) for run, replays in features if replays.truth is not None]
 
@@ -299,19 +289,13 @@ class RobotProblem:
         The same formula twice at one place is two forces: not all are linear in their constants. Where one of the formulas to
         try is among them, all are: every other choice would be compiled anew, for longer than it runs.
         """
-        own = [_by_slot(Patch((*self.known.effects, *setting.effects)).forces) for setting in settings]
+        own = [_by_slot(self._patch(setting).forces) for setting in settings]
         samples = {slot: force for forces in own for slot, force in forces.items()}
         if not self._tried.keys().isdisjoint(samples):
             samples = {**self._tried, **samples}
         names = [(slot, name) for slot, force in samples.items() for name in force.parameters]
         constants = [[forces[slot].parameters[name] if slot in forces else 0.0 for slot, name in names] for forces in own]
         return tuple(samples.values()), np.array(constants).reshape(len(settings), len(names))
-
-
-def _place(channel: str) -> str:
-    """The joint that a channel tells of; of the others, the body."""
-    joint = channel.partition("_")[2]
-    return joint if joint in JOINTS else "body"
 
 
 #: Place and formula of a force, and how many alike came before.
@@ -357,11 +341,10 @@ def _features(truth: Array, t: Array) -> Mapping[str, Array]:
         TRUTH_LAYOUT.channels[name].elements[k]: column for (name, k), column in _columns(truth).items() if name != "quaternion"
     }
     for joint in JOINTS:
-        rate = features[f"joint_velocity[{joint}]"]
-        features[f"time_since_reversal[{joint}]"] = since_reversal(t, rate)
+        features[f"time_since_reversal[{joint}]"] = since_reversal(t, features[f"joint_velocity[{joint}]"])
     for wheel in WHEELS:
-        along, across = features[f"slip_velocity[{wheel},x]"], features[f"slip_velocity[{wheel},y]"]
-        features[f"slip_speed[{wheel}]"] = np.hypot(along, across)
+        slip = (features[f"slip_velocity[{wheel},{axis}]"] for axis in "xy")
+        features[f"slip_speed[{wheel}]"] = np.hypot(*slip)
     return features
 
 

@@ -19,14 +19,13 @@ from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.data.format import CHANNELS
+from wlr_gym.gap.problem import Array
 from wlr_gym.gap.robot.windows import CLOCK, RunClock
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Plant, PlantState, Sensors, Truth
 from wlr_gym.physics.plants.gibbs_appell.plant import CompiledTick, GibbsAppellPlant
 from wlr_gym.physics.plants.sensors import measure_rows
 from wlr_gym.robot import FIRST_WHEEL, WHEEL_SLICE, WHEELS
 from wlr_gym.robot.parameters import Parameters
-
-Array = NDArray[np.float64]
 
 
 class Schedule(NamedTuple):

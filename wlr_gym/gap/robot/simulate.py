@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.jobs import in_threads
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import euler_angles, quaternion, rest_pose
+from wlr_gym.gap.problem import Array
 from wlr_gym.gap.robot.replay_loop import POSE_TICKS, Recorder, Replays, WrittenSetpoints, follower
 from wlr_gym.gap.robot.windows import CLOCK, Anchors, RunClock
 from wlr_gym.physics.plants import drive, ground, make_plant
@@ -31,8 +32,6 @@ from wlr_gym.physics.plants.simulator import Simulator
 from wlr_gym.physics.servo import reference_per_effort, reference_per_rate
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
-
-Array = NDArray[np.float64]
 
 #: s; of the plant.
 PHYSICS_STEP = 0.001

@@ -26,11 +26,10 @@ from wlr_gym.data.run_states import (
     starts_at_rest,
 )
 from wlr_gym.data.runs import Run
+from wlr_gym.gap.problem import Array
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
-
-Array = NDArray[np.float64]
 
 #: s; length of a window.
 WINDOW = 2.0

@@ -15,13 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from wlr_gym.gap.estimation.model import FittedModel, Noise
-from wlr_gym.gap.problem import Candidate, Problem
+from wlr_gym.gap.estimation import FittedModel, Noise, Replayed
+from wlr_gym.gap.problem import Array, Candidate
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, asked_of
-
-Array = NDArray[np.float64]
 
 #: An effect that helps some runs and harms others is none: harm, as a share of the help, that is put down to chance.
 MOST_HARM = 0.2
@@ -32,43 +29,36 @@ NOTICED = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One candidate after its refit.
+class Hypothesis(Replayed):
+    """One candidate after its refit: the model with the effect as its last, and what it leaves.
 
     Attributes:
-        candidate: the effect.
-        model: with the effect.
+        base: the model without the effect, refitted as long.
         gain: fall of minus two log posterior.
         by_run: (runs) fall of the weighted squares in each run.
         predicted_gain: the improvement that the score test predicted.
-        residuals: of the model.
-        base, base_residuals: the model without the effect, refitted as long.
         cross_validated: whether runs are replayed better by a fit to the other runs (checked for finalists only).
         tolerable: whether the tolerances of calibrated parameters allow as much.
-        occam: what its unknowns cost beside its gain (:func:`wlr_gym.gap.selection.hypothesis.occam`).
+        occam: what its unknowns cost beside its gain (:func:`occam`).
     """
 
-    candidate: Candidate
-    model: FittedModel
+    base: Replayed = field(repr=False)
     gain: float
     by_run: Array
     predicted_gain: float
-    residuals: list[Array] = field(repr=False)
-    base: FittedModel = field(repr=False)
-    base_residuals: list[Array] = field(repr=False)
     cross_validated: bool = True
     tolerable: bool = False
     occam: float = 0.0
 
     @property
+    def candidate(self) -> Candidate:
+        """The effect."""
+        return self.model.effects[-1][0]
+
+    @property
     def values(self) -> tuple[float, ...]:
         """Values of the candidate's unknowns."""
         return self.model.effects[-1][1]
-
-    @property
-    def evidence(self) -> float:
-        """Twice the log evidence beyond that of the model without it."""
-        return self.gain - self.occam
 
     @property
     def at_bound(self) -> bool:
@@ -96,12 +86,12 @@ class Hypothesis:
         return bool(harm <= MOST_HARM * help_)
 
 
-def within_tolerance(problem: Problem, model: FittedModel) -> bool:
+def within_tolerance(model: FittedModel) -> bool:
     """Whether the tolerances of the numbers that the last effect meets allow what number and effect do together."""
     candidate, values = model.effects[-1]
     if not any(candidate.tolerances):
         return False
-    known = {q.name: (q, value) for q, value in zip(problem.quantities, model.quantities, strict=True)}
+    known = {q.name: (q, value) for q, value in zip(model.problem.quantities, model.quantities, strict=True)}
     for unknown, value, tolerance in zip(candidate.unknowns, values, candidate.tolerances, strict=True):
         if tolerance is None:
             if abs(value - unknown.neutral) > NOTICED * unknown.step:
@@ -155,7 +145,7 @@ def probabilities(hypotheses: Sequence[Hypothesis], scores: Sequence[Score]) -> 
     logs = [np.log(NOTHING)]
     for one in hypotheses:
         shared = (1.0 - NOTHING) / max(len(places), 1) / max(places[one.candidate.name], 1)
-        logs.append(-np.inf if one.tolerable else np.log(shared) + 0.5 * one.evidence)
+        logs.append(-np.inf if one.tolerable else np.log(shared) + 0.5 * (one.gain - one.occam))
     weights = np.exp(np.array(logs) - max(logs))
     shares = (weights / weights.sum()).tolist()
     return shares[1:], shares[0]
@@ -219,14 +209,9 @@ def equivalents(selected: Hypothesis, others: Sequence[Hypothesis], credible: Se
     found: dict[str, Hypothesis] = {}
     for other in others:
         name = other.candidate.name
-        possible = not other.at_bound and not other.tolerable
-        if (
-            name != selected.candidate.name
-            and possible
-            and name not in found
-            and (name in credible or _as_good(selected, other))
-        ):
-            found[name] = other
+        possible = name != selected.candidate.name and not other.at_bound and not other.tolerable
+        if possible and (name in credible or _as_good(selected, other)):
+            found.setdefault(name, other)
     return list(found.values())
 
 

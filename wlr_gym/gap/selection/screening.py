@@ -20,7 +20,6 @@ The best candidates are refitted (:func:`shortlist`); :func:`detectable` says wh
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -30,21 +29,19 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.jobs import in_threads
 from wlr_gym.gap.analysis import Detectable
-from wlr_gym.gap.estimation.fit import Fit, bounded_minimum, by_channel, normal_equations
-from wlr_gym.gap.estimation.model import (
+from wlr_gym.gap.estimation import (
+    Columns,
+    Fit,
     Noise,
+    bounded_minimum,
+    by_channel,
     channel_costs,
     estimate_noise,
-    prior_tightness,
-    room,
+    normal_equations,
     run_scatter,
-    scaled_nominal,
-    scaled_numbers,
     series_times,
 )
-from wlr_gym.gap.problem import Candidate, Probe, Problem, Setting, Start
-
-Array = NDArray[np.float64]
+from wlr_gym.gap.problem import Array, Candidate, Probe, Setting, Start, blocks
 
 #: Fall of minus two log posterior below which no effect is accepted; see :mod:`wlr_gym.gap.selection.screening`.
 LEAST_GAIN = 16.0
@@ -66,13 +63,6 @@ def least_gain(unknowns: int, threshold: float = LEAST_GAIN) -> float:
 def asked_of(candidate: Candidate, threshold: float = LEAST_GAIN) -> float:
     """Return by how much a candidate must improve the fit; ``threshold``: as for :func:`least_gain`."""
     return least_gain(len(candidate.unknowns), threshold) + candidate.surcharge
-
-
-def least_amplitude(candidate: Candidate, information: Array, k: int, threshold: float = LEAST_GAIN) -> float:
-    """Return the smallest amplitude of direction ``k`` that would be accepted: clear, and beyond what a tolerance allows."""
-    clear = float(np.sqrt(asked_of(candidate, threshold) / max(float(information[k, k]), 1e-12)))
-    tolerance = candidate.tolerances[k] if k < len(candidate.tolerances) else None
-    return clear if tolerance is None else max(clear, tolerance.reach)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,21 +89,42 @@ class Score:
     visible: bool = False
     step: Array | None = field(default=None, repr=False)
 
+    def least_amplitude(self, k: int, threshold: float) -> float:
+        """Return the smallest amplitude of direction ``k`` that is accepted: clear, and beyond what a tolerance allows."""
+        clear = float(np.sqrt(asked_of(self.candidate, threshold) / max(float(self.information[k, k]), 1e-12)))
+        tolerance = self.candidate.tolerances[k] if k < len(self.candidate.tolerances) else None
+        return clear if tolerance is None else max(clear, tolerance.reach)
+
+    def is_visible(self, threshold: float) -> bool:
+        """Whether the smallest severity that would be accepted lies in the plausible range, in some direction."""
+        for k in range(len(self.information)):
+            for sign in (1.0, -1.0):
+                amplitude = np.zeros(len(self.information))
+                amplitude[k] = sign * self.least_amplitude(k, threshold)
+                pairs = list(zip(self.candidate.unknowns, self.start.values(amplitude), strict=True))
+                if all(u.low <= v <= u.high for u, v in pairs) and any(v != u.neutral for u, v in pairs if u.is_size):
+                    return True
+        return False
+
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Normal equations of the fitted numbers and all probes: what :func:`screen` scores candidates with.
+    """What candidates beyond a fit are scored with: columns of its numbers and of all probes, and their normal equations.
 
     Attributes:
+        fit: the model without the candidates.
         keys: row of a quantity or probe.
+        columns: of all, one (numbers and probes, rows x channels) array per run.
         response, push: ``C W C^T`` and ``C W r`` of all, tolerances not added.
         tight, away: (fitted numbers) weight of their tolerance, and how far they are from nominal.
         information: ``response`` with the fitted numbers projected out.
         low, high: (fitted numbers) how far they may still move.
-        columns: of all, one (numbers and probes, rows x channels) array per run.
+        products: of columns and residuals, channel by channel.
     """
 
+    fit: Fit
     keys: dict[str, int]
+    columns: Columns = field(repr=False)
     response: Array
     push: Array
     tight: Array
@@ -121,106 +132,88 @@ class Responses:
     information: Array
     low: Array
     high: Array
-    columns: Sequence[NDArray[np.float32]] = field(repr=False)
+    products: Products = field(repr=False)
 
+    def directions(self, start: Start) -> Array:
+        """Return which columns (directions, columns) each direction of a start adds up."""
+        mix = np.zeros((len(start.directions), len(self.push)))
+        for row, names in zip(mix, start.directions, strict=True):
+            row[[self.keys[name] for name in names]] = 1.0
+        return mix
 
-def responses(problem: Problem, fit: Fit, runs: Sequence[int], probes: Sequence[Probe]) -> Responses:
-    """Simulate all probes on top of a fitted model and project the fitted numbers out."""
-    settings = [Setting(fit.model.quantities, (*fit.model.patch, *probe.effects)) for probe in probes]
-    found = problem.residuals(settings, runs)
+    def with_directions(self, mix: Array) -> tuple[Array, Array, Array]:
+        """Return the columns (numbers, columns) of the fitted numbers and of directions, and their normal equations."""
+        rows = np.vstack([np.eye(len(self.low), len(self.push)), mix])
+        return rows, *self.with_tolerances(rows @ self.response @ rows.T, rows @ self.push)
 
-    def with_own(run: tuple[Array, Array, NDArray[np.float32]]) -> NDArray[np.float32]:
-        r, base, known = run
-        return np.vstack([known, np.nan_to_num(r - base).reshape(len(probes), -1).astype(np.float32)])
+    def with_tolerances(self, matrix: Array, gradient: Array) -> tuple[Array, Array]:
+        """Add to normal equations, in place, the tolerances of the fitted numbers and a little stiffness of the directions.
 
-    columns = in_threads(problem.threads, with_own, zip(found, fit.residuals, fit.columns, strict=True))
-    return project(problem, fit, columns, [probe.key for probe in probes])
+        Tolerances hold the quantities, not a direction that is the same response without its tolerance.
+        """
+        known = np.arange(len(self.tight))
+        own = np.arange(len(known), len(gradient))
+        matrix[known, known] += self.tight
+        gradient[known] += self.tight * self.away
+        matrix[own, own] += stiffness(matrix[own, own])
+        return matrix, gradient
 
-
-def project(problem: Problem, fit: Fit, columns: Sequence[NDArray[np.float32]], keys: Sequence[str]) -> Responses:
-    """Project the fitted numbers out of the probes' columns, which follow theirs."""
-    known = fit.model.size
-    response, push = normal_equations(columns, fit.residuals, fit.noise, problem.threads)
-    tight = prior_tightness(problem, fit.model)
-    away = scaled_numbers(problem, fit.model) - scaled_nominal(problem, fit.model)
-    imitation = np.linalg.solve(fit.hessian, response[:known])  # how the fitted numbers would follow each column
-    information = response - response[:known].T @ imitation
-    names = [*(quantity.name for quantity in problem.quantities)]
-    places = {name: k for k, name in enumerate(names)} | {key: known + k for k, key in enumerate(keys)}
-    return Responses(places, response, push, tight, away, information, *room(problem, fit.model), columns)
-
-
-def screen(candidates: Sequence[Candidate], found: Responses, threshold: float = LEAST_GAIN) -> list[Score]:
-    """Return the score of every candidate, best first; ``threshold``: see :func:`least_gain`."""
-    nothing = _fall(found, np.zeros((0, len(found.push))))[0]
-    scores = [score for candidate in candidates if (score := _score(candidate, found, nothing)) is not None]
-    seen = [replace(score, visible=is_visible(score, threshold)) for score in scores]
-    return sorted(seen, key=lambda score: -score.gain)
-
-
-def _score(candidate: Candidate, found: Responses, nothing: float) -> Score | None:
-    best: Score | None = None
-    for start in candidate.starts:
-        mix = directions(start, found)
-        information = mix @ found.information @ mix.T
-        raw = np.diag(mix @ found.response @ mix.T)
-        own = float(np.max(np.diag(information) / np.maximum(raw, 1e-12)))
-        fall, amplitude = _fall(found, mix)
-        values, share = shortened(candidate, start, amplitude, SHARES)
-        gain = (fall - nothing) * (2.0 * share - share**2)  # along the way to the minimum of a parabola
-        if best is None or gain > best.gain:
-            best = Score(candidate, values, gain, own, information, start)
-    return best
-
-
-def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
-    """Fall of the cost if the calibrated parameters, within bounds, and the directions ``mix`` move together; amplitudes."""
-    known = len(found.low)
-    rows = np.vstack([np.eye(known, len(found.push)), mix])
-    matrix, gradient = with_tolerances(rows @ found.response @ rows.T, rows @ found.push, found)
-    free = np.full(len(mix), np.inf)
-    x = bounded_minimum(matrix, gradient, np.concatenate([found.low, -free]), np.concatenate([found.high, free]))
-    return -float(2.0 * gradient @ x + x @ matrix @ x), x[known:]
-
-
-def is_visible(score: Score, threshold: float) -> bool:
-    """Whether the smallest severity that would be accepted lies in the plausible range, in some direction."""
-    candidate, start, information = score.candidate, score.start, score.information
-    for k in range(len(information)):
-        for sign in (1.0, -1.0):
-            amplitude = np.zeros(len(information))
-            amplitude[k] = sign * least_amplitude(candidate, information, k, threshold)
-            values = start.values(amplitude)
-            pairs = list(zip(candidate.unknowns, values, strict=True))
-            if all(u.low <= v <= u.high for u, v in pairs) and any(v != u.neutral for u, v in pairs if u.is_size):
-                return True
-    return False
-
-
-def directions(start: Start, found: Responses) -> Array:
-    """Return which columns (directions, columns) each direction of a start adds up."""
-    mix = np.zeros((len(start.directions), len(found.push)))
-    for row, names in zip(mix, start.directions, strict=True):
-        row[[found.keys[name] for name in names]] = 1.0
-    return mix
-
-
-def with_tolerances(matrix: Array, gradient: Array, found: Responses) -> tuple[Array, Array]:
-    """Add to normal equations, in place, the tolerances of the fitted numbers and a little stiffness of the directions.
-
-    Tolerances hold the quantities, not a direction that is the same response without its tolerance.
-    """
-    known = np.arange(len(found.tight))
-    own = np.arange(len(known), len(gradient))
-    matrix[known, known] += found.tight
-    gradient[known] += found.tight * found.away
-    matrix[own, own] += stiffness(matrix[own, own])
-    return matrix, gradient
+    def minimum(self, matrix: Array, gradient: Array) -> Array:
+        """Return where fitted numbers, within bounds, and free directions go."""
+        free = np.full(len(gradient) - len(self.low), np.inf)
+        return bounded_minimum(matrix, gradient, np.concatenate([self.low, -free]), np.concatenate([self.high, free]))
 
 
 def stiffness(information: Array) -> Array:
     """Return a little stiffness of directions with this information: a probe that does nothing gets nothing."""
     return LEAST_OWN * information + 1e-9
+
+
+def responses(fit: Fit, probes: Sequence[Probe]) -> Responses:
+    """Simulate all probes on top of a fitted model and project the fitted numbers out."""
+    model, problem, known = fit.model, fit.problem, fit.model.size
+    found = problem.residuals([Setting(model.quantities, (*model.patch, *probe.effects)) for probe in probes], fit.runs)
+
+    def with_own(run: tuple[Array, Array, NDArray[np.float32]]) -> NDArray[np.float32]:
+        r, base, own = run
+        return np.vstack([own, np.nan_to_num(r - base).reshape(len(probes), -1).astype(np.float32)])
+
+    columns = in_threads(problem.threads, with_own, zip(found, fit.residuals, fit.columns, strict=True))
+    response, push = normal_equations(columns, fit.residuals, fit.noise, problem.threads)
+    imitation = np.linalg.solve(fit.hessian, response[:known])  # how the fitted numbers would follow each column
+    information = response - response[:known].T @ imitation
+    keys = {quantity.name: k for k, quantity in enumerate(problem.quantities)}
+    keys |= {probe.key: known + k for k, probe in enumerate(probes)}
+    away = model.scaled - model.nominal
+    products = Products(fit, columns)
+    return Responses(fit, keys, columns, response, push, model.tightness, away, information, *model.room, products)
+
+
+def screen(candidates: Sequence[Candidate], found: Responses, threshold: float = LEAST_GAIN) -> list[Score]:
+    """Return the score of every candidate, best first; ``threshold``: see :func:`least_gain`."""
+    nothing = _fall(found, np.zeros((0, len(found.push))))[0]
+    best = [max((_score(c, start, found, nothing) for start in c.starts), key=lambda s: s.gain) for c in candidates if c.starts]
+    seen = [replace(score, visible=score.is_visible(threshold)) for score in best]
+    return sorted(seen, key=lambda score: -score.gain)
+
+
+def _score(candidate: Candidate, start: Start, found: Responses, nothing: float) -> Score:
+    """One start's score; ``nothing``: fall of the cost without it."""
+    mix = found.directions(start)
+    information = mix @ found.information @ mix.T
+    raw = np.diag(mix @ found.response @ mix.T)
+    own = float(np.max(np.diag(information) / np.maximum(raw, 1e-12)))
+    fall, amplitude = _fall(found, mix)
+    values, share = shortened(candidate, start, amplitude, SHARES)
+    gain = (fall - nothing) * (2.0 * share - share**2)  # along the way to the minimum of a parabola
+    return Score(candidate, values, gain, own, information, start)
+
+
+def _fall(found: Responses, mix: Array) -> tuple[float, Array]:
+    """Fall of the cost if the calibrated parameters, within bounds, and the directions ``mix`` move together; amplitudes."""
+    _, matrix, gradient = found.with_directions(mix)
+    x = found.minimum(matrix, gradient)
+    return -float(2.0 * gradient @ x + x @ matrix @ x), x[len(found.low) :]
 
 
 def shortened(candidate: Candidate, start: Start, amplitude: Array, shares: Sequence[float]) -> tuple[tuple[float, ...], float]:
@@ -245,17 +238,12 @@ SCORED_PER_GROUP = 4
 ALTERNATIVE_SHARES = (1.0, 0.85, 0.7, 0.5, 0.3, 0.15, 0.05, 0.0)
 
 
-def rescored(
-    problem: Problem, fit: Fit, found: Responses, products: Products, scores: Sequence[Score]
-) -> tuple[list[Score], list[Score]]:
+def rescored(found: Responses, scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:
     """Score candidates under the alternative.
 
     Args:
-        problem: the system.
-        fit: the model without the candidates.
-        found: responses of its numbers and of the candidates' probes.
-        products: of both.
-        scores: to first order, under the noise of ``fit``.
+        found: responses of the fitted numbers and of the candidates' probes.
+        scores: to first order, under the noise of the model without the candidates.
 
     Returns:
         All scores, best first, with gain and values under the alternative; a candidate that explains too little to be
@@ -265,22 +253,18 @@ def rescored(
     """
     if not scores:
         return [], []
-    system = _System(problem, fit, found, products, np.arange(len(products.rows)))
-    best, rest = system.best(scores, SCORED)
+    rows = found.products.rows
+    best, rest = _System(found, np.arange(len(rows))).best(scores, SCORED)
     everywhere = sorted([*best, *(replace(s, gain=min(s.gain, 0.0)) for s in rest)], key=lambda score: -score.gain)
     groups: dict[str, list[int]] = {}
-    for channel, signal in enumerate(problem.signals):
-        if products.rows[channel]:
+    for channel, signal in enumerate(found.fit.problem.signals):
+        if rows[channel]:
             groups.setdefault(signal.group, []).append(channel)
     here = replace(found, away=np.zeros_like(found.away))  # numbers that a group says nothing about stay
-    alone = [
-        _System(problem, fit, here, products, np.array(channels)).best(scores, SCORED_PER_GROUP)[0][0]
-        for channels in groups.values()
-    ]
+    alone = [_System(here, np.array(channels)).best(scores, SCORED_PER_GROUP)[0][0] for channels in groups.values()]
     return everywhere, sorted(alone, key=lambda score: -score.gain)
 
 
-@dataclass(frozen=True, eq=False)
 class Products:
     """Products of columns and residuals, channel by channel.
 
@@ -294,19 +278,7 @@ class Products:
         columns: one (channels, columns, rows) array per run.
     """
 
-    by_run: NDArray[np.float32]
-    by_run_known: NDArray[np.float32]
-    push_by_run: Array
-    gram: Array
-    push: Array
-    square: Array
-    rows: Array
-    columns: list[NDArray[np.float32]] = field(repr=False)
-
-    @staticmethod
-    def of(fit: Fit, found: Responses, threads: int = 1) -> Products:
-        """Form the products of a fit's residuals with all columns of the responses."""
-
+    def __init__(self, fit: Fit, columns: Columns) -> None:
         def of_one(run: tuple[NDArray[np.float32], Array]) -> tuple[NDArray[np.float32], NDArray[np.float32], Array, Array]:
             column, residual = run
             own = by_channel(column, residual.shape[1])
@@ -314,38 +286,39 @@ class Products:
             push = (own @ known.astype(np.float32)[:, :, None])[:, :, 0].astype(np.float64)
             return own, own @ own.transpose(0, 2, 1), push, (known * known).sum(axis=1)
 
-        parts = in_threads(threads, of_one, zip(found.columns, fit.residuals, strict=True))
-        columns = [own for own, *_ in parts]
-        by_run, push_by_run = np.stack([gram for _, gram, *_ in parts]), np.stack([push for *_, push, _ in parts])
-        square = np.sum([square for *_, square in parts], axis=0)
-        rows = np.sum([np.isfinite(r).sum(axis=0) for r in fit.residuals], axis=0)
-        gram, push = by_run.sum(axis=0, dtype=np.float64), push_by_run.sum(axis=0)
-        known = len(found.tight)
-        by_run_known = by_run[:, :, :known, :known].reshape(*by_run.shape[:2], -1)
-        return Products(by_run, by_run_known, push_by_run, gram, push, np.asarray(square), rows, columns)
+        known = fit.model.size
+        parts = in_threads(fit.problem.threads, of_one, zip(columns, fit.residuals, strict=True))
+        self.columns: list[NDArray[np.float32]] = [own for own, *_ in parts]
+        self.by_run: NDArray[np.float32] = np.stack([gram for _, gram, *_ in parts])
+        self.by_run_known: NDArray[np.float32] = self.by_run[:, :, :known, :known].reshape(*self.by_run.shape[:2], -1)
+        self.push_by_run: Array = np.stack([push for *_, push, _ in parts])
+        self.gram: Array = self.by_run.sum(axis=0, dtype=np.float64)
+        self.push: Array = self.push_by_run.sum(axis=0)
+        self.square: Array = np.asarray(np.sum([square for *_, square in parts], axis=0))
+        self.rows: Array = np.sum([np.isfinite(r).sum(axis=0) for r in fit.residuals], axis=0)
 
 
 class _System:
     """What candidates are scored with, of some signals (``channels``) or all; arrays as in :class:`Products`."""
 
-    def __init__(self, problem: Problem, fit: Fit, found: Responses, products: Products, channels: NDArray[np.intp]) -> None:
-        self.problem, self.fit, self.found, self.products = problem, fit, found, products
+    def __init__(self, found: Responses, channels: NDArray[np.intp]) -> None:
+        products, self.found, self.fit = found.products, found, found.fit
         self.known: int = len(found.tight)
         self.is_whole: bool = len(channels) == len(products.rows)
         self.rows, self.square, self.push = products.rows[channels], products.square[channels], products.push[channels]
         self.gram: Array = products.gram[channels]
         self.gram_known: Array = np.ascontiguousarray(self.gram[:, : self.known, : self.known])
-        self.residuals: list[Array] = [np.ascontiguousarray(residual.T[channels]) for residual in fit.residuals]
+        self.residuals: list[Array] = [np.ascontiguousarray(residual.T[channels]) for residual in self.fit.residuals]
         every = products.columns
         self.columns: list[NDArray[np.float32]] = every if self.is_whole else [columns[channels] for columns in every]
+        noise = self.fit.noise
         #: Of the model without a candidate, every row independent.
-        self.white = Noise(fit.noise.square[channels], np.full(len(channels), fit.noise.scatter), self.rows, fit.noise.scatter)
+        self.white = Noise(noise.square[channels], np.full(len(channels), noise.scatter), self.rows, noise.scatter)
 
     def best(self, scores: Sequence[Score], count: int) -> tuple[list[Score], list[Score]]:
         """Return the candidates that explain most squares, or gain most under the noise of the model without them, best
         first, scored under the alternative; and the rest. A vector and its components take one place of ``count``.
         """
-        threads = self.problem.threads
         starts = [start for score in scores for start in score.candidate.starts]
         edges = np.cumsum([0, *(len(score.candidate.starts) for score in scores)])
         rough = np.maximum.reduceat(self._rough(starts), edges[:-1])
@@ -353,86 +326,116 @@ class _System:
         lasting = dict.fromkeys(labels[k] for k in np.argsort(rough)[::-1])
         leading = dict.fromkeys(labels[k] for k in np.argsort([score.gain for score in scores])[::-1])
         chosen = {*list(lasting)[:count], *list(leading)[: count // 2]}
-        best = in_threads(threads, self._scored, [s for s in scores if s.candidate.label in chosen])
+        best = in_threads(self.fit.problem.threads, self._scored, [s for s in scores if s.candidate.label in chosen])
         return sorted(best, key=lambda score: -score.gain), [s for s in scores if s.candidate.label not in chosen]
 
     def _rough(self, starts: Sequence[Start]) -> Array:
         """Improvement by each start if every row were independent: what orders candidates before their noise is known."""
         weight, known = self.white.weight, self.known
         whole, push = np.tensordot(weight, self.gram, 1), weight @ self.push
-        own, gradient = with_tolerances(whole[:known, :known].copy(), push[:known].copy(), self.found)
+        own, gradient = self.found.with_tolerances(whole[:known, :known].copy(), push[:known].copy())
         following = -np.linalg.solve(own, np.column_stack([gradient, whole[:known]]))  # how the fitted numbers follow
         steps = np.zeros((len(starts) + 1, len(push)))  # the last one is that of the model without any
         steps[:, :known] = following[:, 0]
         for step, start in zip(steps, starts, strict=False):
-            mix = directions(start, self.found)
+            mix = self.found.directions(start)
             border, corner = mix @ whole[:, :known], mix @ whole @ mix.T
             corner[np.diag_indices(len(mix))] += stiffness(np.diag(corner))
             amplitude = -np.linalg.solve(corner + border @ (following[:, 1:] @ mix.T), mix @ push + border @ following[:, 0])
             step += amplitude @ mix
             step[:known] += following[:, 1:] @ (amplitude @ mix)
-        curved = in_threads(self.problem.threads, lambda gram: np.einsum("sm,sm->s", steps @ gram, steps), self.gram)
+        curved = in_threads(self.fit.problem.threads, lambda gram: np.einsum("sm,sm->s", steps @ gram, steps), self.gram)
         squares = self.square + 2.0 * steps @ self.push.T + np.stack(curved, axis=1)  # (steps, channels) after them
         after = channel_costs(np.maximum(squares, 0.0) / np.maximum(self.rows, 1)) @ self.rows
         return after[-1] - after[:-1]
 
-    def _parts(self, start: Start) -> _Directions:
-        """Products of the fitted numbers and of the directions of a start."""
-        mix, known = directions(start, self.found), self.known
-        used = np.flatnonzero(mix.any(axis=0))
-        own, own_gram, pushed = mix[:, used], self.gram[:, used], self.push
-        border = (own @ own_gram[:, :, :known]).transpose(0, 2, 1)
-        corner = own @ own_gram[:, :, used] @ own.T
-        push = np.concatenate([pushed[:, :known], pushed[:, used] @ own.T], axis=1)
-        return _Directions(self.gram_known, border, corner, push, self.square, self.rows)
-
     def _scored(self, score: Score) -> Score:
         """The candidate's best start, under the alternative."""
-        tried = [(*self._under_alternative(score.candidate, start), start) for start in score.candidate.starts]
+        tried = [(*_Alternative(self, score.candidate, start).improvement(), start) for start in score.candidate.starts]
         gain, values, step, start = max(tried, key=lambda one: one[0])
         return replace(score, gain=gain, values=values, start=start, step=step)
 
-    def _under_alternative(self, candidate: Candidate, start: Start) -> tuple[float, tuple[float, ...], Array]:
-        """Improvement of the fit by one start of a candidate, the values it leads to, and the step of the fitted numbers."""
-        parts, found, known = self._parts(start), self.found, self.known
-        noise = self.fit.noise if self.is_whole else self.white
+
+class _Alternative:
+    """One start of a candidate beside the fitted numbers, in the signals of a system.
+
+    Attributes:
+        used: columns that its directions add up. own: (directions, used) which ones each of them does.
+        border, corner: (channels, ...) products of the fitted numbers' columns and the directions, and of the directions.
+        push: (channels, numbers) products of all and the residuals.
+    """
+
+    def __init__(self, system: _System, candidate: Candidate, start: Start) -> None:
+        self.system, self.found, self.candidate, self.start, known = system, system.found, candidate, start, system.known
+        mix = self.found.directions(start)
+        self.used: NDArray[np.intp] = np.flatnonzero(mix.any(axis=0))
+        self.own: Array = mix[:, self.used]
+        own_gram, pushed = system.gram[:, self.used], system.push
+        self.border: Array = (self.own @ own_gram[:, :, :known]).transpose(0, 2, 1)
+        self.corner: Array = self.own @ own_gram[:, :, self.used] @ self.own.T
+        self.push: Array = np.concatenate([pushed[:, :known], pushed[:, self.used] @ self.own.T], axis=1)
+
+    def improvement(self) -> tuple[float, tuple[float, ...], Array]:
+        """Return the improvement of the fit, the values it leads to, and the step of the fitted numbers."""
+        found, known, rows = self.found, self.system.known, self.system.rows
+        noise = self.system.fit.noise if self.system.is_whole else self.system.white
         for _ in range(ROUNDS):
-            x, _ = _step(parts, noise, found, candidate, start)
-            noise = self._noise_after(parts, start, x)
-        x, values = _step(parts, noise, found, candidate, start)
-        matrix, gradient = with_tolerances(*parts.normal(noise.weight), found)
+            noise = self._noise_after(self._step(noise)[0])
+        x, values = self._step(noise)
+        matrix, gradient = found.with_tolerances(*self._normal(noise.weight))
         bare = np.zeros(len(x))
         bare[:known] = bounded_minimum(matrix[:known, :known], gradient[:known], found.low, found.high)
-        before, after = (channel_costs(parts.mean_squares(step)) for step in (bare, x))
+        before, after = (channel_costs(self._mean_squares(step)) for step in (bare, x))
         priors = [float(found.tight @ (found.away + step[:known]) ** 2) for step in (bare, x)]
-        ranges = [2.0 * (v - u.neutral) / (u.high - u.low) for u, v in zip(candidate.unknowns, values, strict=True)]
-        improved = float((self.rows / noise.autocorrelation_time) @ (before - after))
+        ranges = [2.0 * (v - u.neutral) / (u.high - u.low) for u, v in zip(self.candidate.unknowns, values, strict=True)]
+        improved = float((rows / noise.autocorrelation_time) @ (before - after))
         return improved + priors[0] - priors[1] - float(np.square(ranges).sum()), values, x[:known]
 
-    def _noise_after(self, parts: _Directions, start: Start, x: Array) -> Noise:
+    def _normal(self, weight: Array) -> tuple[Array, Array]:
+        """Normal equations under weights (channels)."""
+        known, border, corner = (np.tensordot(weight, part, 1) for part in (self.system.gram_known, self.border, self.corner))
+        return np.block([[known, border], [border.T, corner]]), weight @ self.push
+
+    def _mean_squares(self, x: Array) -> Array:
+        """Mean squares (channels) of the residuals after a step (numbers)."""
+        known, own = np.split(x, [self.system.known])
+        both = (self.system.gram_known @ known) @ known + 2.0 * (self.border @ own) @ known + (self.corner @ own) @ own
+        total = self.system.square + 2.0 * self.push @ x + both
+        return np.maximum(total, 0.0) / np.maximum(self.system.rows, 1)
+
+    def _step(self, noise: Noise) -> tuple[Array, tuple[float, ...]]:
+        """Where fitted numbers and directions go together, within bounds and the plausible range; the candidate's values."""
+        found, known = self.found, self.system.known
+        matrix, gradient = found.with_tolerances(*self._normal(noise.weight))
+        x = found.minimum(matrix, gradient)
+        values, share = shortened(self.candidate, self.start, x[known:], ALTERNATIVE_SHARES)
+        if share < 1.0:
+            x[known:] *= share
+            pull = gradient[:known] + matrix[:known, known:] @ x[known:]
+            x[:known] = bounded_minimum(matrix[:known, :known], pull, found.low, found.high)
+        return x, values
+
+    def _noise_after(self, x: Array) -> Noise:
         """Noise of what is left after a step, the scatter of the runs under it included."""
-        known, mix = self.known, directions(start, self.found)
-        used = np.flatnonzero(mix.any(axis=0))
-        steps, change = x[:known].astype(np.float32), (x[known:] @ mix[:, used]).astype(np.float32)
+        system, known, used = self.system, self.system.known, self.used
+        steps, change = x[:known].astype(np.float32), (x[known:] @ self.own).astype(np.float32)
         left = [
             residual + steps @ columns[:, :known] + change @ columns[:, used]
-            for residual, columns in zip(self.residuals, self.columns, strict=True)
+            for residual, columns in zip(system.residuals, system.columns, strict=True)
         ]
-        own = series_times(left)
-        scatter = self.fit.noise.scatter
-        noise = Noise(parts.mean_squares(x), scatter * own, parts.rows, scatter)
-        if self.is_whole:
-            scatter = min(scatter, self._scatter(noise, start, x))
-        return Noise(noise.square, scatter * own, parts.rows, scatter)
+        times, scatter = series_times(left), system.fit.noise.scatter
+        noise = Noise(self._mean_squares(x), scatter * times, system.rows, scatter)
+        if system.is_whole:
+            scatter = min(scatter, self._scatter(noise, x))
+        return replace(noise, autocorrelation_time=scatter * times, scatter=scatter)
 
-    def _scatter(self, noise: Noise, start: Start, x: Array) -> float:
-        """Scatter of the runs after a step; see :func:`wlr_gym.gap.estimation.fit.widened`."""
-        products, known, mix = self.products, self.known, directions(start, self.found)
-        used = np.flatnonzero(mix.any(axis=0))
-        which, own = np.concatenate([np.arange(known), used]), mix[:, used]
+    def _scatter(self, noise: Noise, x: Array) -> float:
+        """Scatter of the runs after a step; see :func:`wlr_gym.gap.estimation.widened`."""
+        products, known, used = self.found.products, self.system.known, self.used
+        which = np.concatenate([np.arange(known), used])
         rows = np.zeros((len(x), len(which)))
         rows[np.arange(known), np.arange(known)] = 1.0
-        rows[known:, known:] = own
+        rows[known:, known:] = self.own
         border = products.by_run[:, :, used][:, :, :, which]  # symmetric
         inner = noise.weight.astype(np.float32) @ products.by_run_known
         grams = np.zeros((len(border), len(which), len(which)))
@@ -442,62 +445,13 @@ class _System:
         matrices = rows @ grams @ rows.T
         vectors = np.einsum("c,rcm->rm", noise.weight, products.push_by_run[:, :, which]) @ rows.T + matrices @ x
         differ = run_scatter(matrices, vectors)
-        return np.inf if differ is None else max(self.problem.tempering * noise.scatter * differ, 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class _Directions:
-    """The products of the fitted numbers and a candidate's directions (channels, ...); see :class:`Products`.
-
-    Attributes:
-        known: of the fitted numbers' columns.
-        border: of those and the directions.
-        corner: of the directions.
-        push, square, rows: of all columns and the residuals; of the residuals; measured rows.
-    """
-
-    known: Array
-    border: Array
-    corner: Array
-    push: Array
-    square: Array
-    rows: Array
-
-    def normal(self, weight: Array) -> tuple[Array, Array]:
-        """Normal equations under weights (channels)."""
-        known, border, corner = (np.tensordot(weight, part, 1) for part in (self.known, self.border, self.corner))
-        return np.block([[known, border], [border.T, corner]]), weight @ self.push
-
-    def mean_squares(self, x: Array) -> Array:
-        """Mean squares (channels) of the residuals after a step (numbers)."""
-        known, own = np.split(x, [self.known.shape[1]])
-        both = (self.known @ known) @ known + 2.0 * (self.border @ own) @ known + (self.corner @ own) @ own
-        total = self.square + 2.0 * self.push @ x + both
-        return np.maximum(total, 0.0) / np.maximum(self.rows, 1)
-
-
-def _step(
-    parts: _Directions, noise: Noise, found: Responses, candidate: Candidate, start: Start
-) -> tuple[Array, tuple[float, ...]]:
-    """Where fitted numbers and directions go together, within bounds and the candidate's plausible range; its values there."""
-    known = len(found.tight)
-    matrix, gradient = with_tolerances(*parts.normal(noise.weight), found)
-    free = np.full(len(gradient) - known, np.inf)
-    x = bounded_minimum(matrix, gradient, np.concatenate([found.low, -free]), np.concatenate([found.high, free]))
-    values, share = shortened(candidate, start, x[known:], ALTERNATIVE_SHARES)
-    if share < 1.0:
-        x[known:] *= share
-        pull = gradient[:known] + matrix[:known, known:] @ x[known:]
-        x[:known] = bounded_minimum(matrix[:known, :known], pull, found.low, found.high)
-    return x, values
+        return np.inf if differ is None else max(self.system.fit.problem.tempering * noise.scatter * differ, 1.0)
 
 
 # ---- what chance gives -----------------------------------------------------------------------------------------------
 
 #: Draws of the signs.
 DRAWS = 200
-#: s; length of a block.
-BLOCK = 2.0
 #: Share of the draws whose largest improvement lies below the threshold.
 QUANTILE = 0.98
 
@@ -517,63 +471,40 @@ def chance(by_chance: Array) -> float:
     return float(np.quantile(by_chance, QUANTILE)) if by_chance.size else math.nan
 
 
-def largest_by_chance(
-    problem: Problem, runs: Sequence[int], fit: Fit, found: Responses, products: Products, scores: Sequence[Score]
-) -> Array:
+def largest_by_chance(found: Responses, scores: Sequence[Score]) -> Array:
     """Return the largest improvement (:data:`DRAWS`) of any candidate where only the signs of blocks of residuals are random.
 
     Nothing where there is no candidate. What further unknowns of a candidate cost is taken off, so that all compare with one
-    threshold.
-
-    Args:
-        problem, runs: what is fitted.
-        fit: the model without the candidates.
-        found: responses of its numbers and of the candidates' probes.
-        products: of both.
-        scores: of the candidates, best first.
+    threshold. ``scores``: of the candidates, best first.
     """
     if not scores:
         return np.zeros(0)
-    left = _left_by(scores[0], fit, found)
+    fit, known = found.fit, len(found.tight)
+    # to first order, what the best candidate would leave: without it the residuals are no noise
+    rows, matrix, gradient = found.with_directions(found.directions(scores[0].start))
+    moves = (-np.linalg.solve(matrix, gradient) @ rows).astype(np.float32)
+    left = [r + (moves @ column).reshape(r.shape) for r, column in zip(fit.residuals, found.columns, strict=True)]
     noise = estimate_noise(left, scatter=fit.noise.scatter)
-    known = len(found.tight)
-    response = np.tensordot(noise.weight, products.gram, 1)
+    response = np.tensordot(noise.weight, found.products.gram, 1)
     follow = np.linalg.solve(response[:known, :known] + np.diag(found.tight), response[:known])
     information = response - response[:known].T @ follow  # the calibrated parameters follow each column
-    pushes = _block_pushes(problem, runs, left, noise.weight, found)
-    drawn = np.random.default_rng(0).choice((-1.0, 1.0), (DRAWS, len(pushes))) @ pushes
+    pushes = []  # weighted products (columns) of columns and residuals, of every block
+    for run, column, residual in zip(fit.runs, found.columns, left, strict=True):
+        weighted = (np.nan_to_num(residual) * noise.weight).astype(np.float32)
+        shaped = column.reshape(len(column), *residual.shape)
+        for rows in blocks(fit.problem.times(run)):
+            pushes.append(shaped[:, rows].reshape(len(column), -1) @ weighted[rows].ravel())
+    drawn = np.random.default_rng(0).choice((-1.0, 1.0), (DRAWS, len(pushes))) @ np.stack(pushes).astype(np.float64)
     own = drawn - drawn[:, :known] @ follow
     largest = np.zeros(DRAWS)
     for score in scores:
         for start in score.candidate.starts:
-            mix = directions(start, found)
-            inner = mix @ information @ mix.T + np.diag(LEAST_OWN * np.diag(mix @ response @ mix.T) + 1e-9)
+            mix = found.directions(start)
+            inner = mix @ information @ mix.T + np.diag(stiffness(np.diag(mix @ response @ mix.T)))
             push = own @ mix.T
             improved = (push * np.linalg.solve(inner, push.T).T).sum(axis=1)
             np.maximum(largest, improved - PER_UNKNOWN * (len(score.candidate.unknowns) - 1), out=largest)
     return largest
-
-
-def _left_by(best: Score, fit: Fit, found: Responses) -> list[Array]:
-    """Residuals (rows, channels) per run that a candidate would leave, to first order: without it they are no noise."""
-    mix = directions(best.start, found)
-    rows = np.vstack([np.eye(len(found.tight), len(found.push)), mix])
-    matrix, gradient = with_tolerances(rows @ found.response @ rows.T, rows @ found.push, found)
-    moves = (-np.linalg.solve(matrix, gradient) @ rows).astype(np.float32)
-    return [r + (moves @ column).reshape(r.shape) for r, column in zip(fit.residuals, found.columns, strict=True)]
-
-
-def _block_pushes(problem: Problem, runs: Sequence[int], left: Sequence[Array], weight: Array, found: Responses) -> Array:
-    """Weighted products (blocks of all runs, columns) of columns and residuals."""
-    blocks = []
-    for run, column, residual in zip(runs, found.columns, left, strict=True):
-        t = problem.times(run)
-        inner = np.linspace(t[0], t[-1], max(1, round(float(t[-1] - t[0]) / BLOCK)) + 1)[1:-1]
-        weighted = (np.nan_to_num(residual) * weight).astype(np.float32)
-        shaped = column.reshape(len(column), *residual.shape)
-        for first, last in itertools.pairwise((0, *np.searchsorted(t, inner).tolist(), len(t))):
-            blocks.append(shaped[:, first:last].reshape(len(column), -1) @ weighted[first:last].ravel())
-    return np.stack(blocks).astype(np.float64)
 
 
 # ---- what is refitted ------------------------------------------------------------------------------------------------
@@ -645,31 +576,26 @@ def detectable(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> dict[s
 
     Of an effect with directions of its own (x, y, z of a displaced mass) it is the one that shows best: in another it may hide
     at any size. First order: the gain of an effect grows with the square of its severity. Where no plausible size would show,
-    its size is NaN. Formulas are left out: their laws have no size in common. ``threshold``: see
-    :func:`wlr_gym.gap.selection.screening.asked_of`.
+    its size is NaN. Formulas are left out: their laws have no size in common. ``threshold``: see :func:`asked_of`.
     """
     found: dict[str, tuple[float, Detectable]] = {}
     for score in scores:
-        if len(score.candidate.where) > 1 or score.candidate.formula:
+        candidate, start, shown = score.candidate, score.start, np.diag(score.information)
+        if len(candidate.where) > 1 or candidate.formula:
             continue
-        start = score.start
-        shown = np.diag(score.information)
-        which = max((k for k in _sizes(score.candidate) if k < len(shown)), key=lambda k: float(shown[k]))
-        amplitude = least_amplitude(score.candidate, score.information, which, threshold)
+        # which unknowns are sizes in the vocabulary; all where none is in it, as of a wave's sine and cosine
+        own, unknowns = candidate.vocabulary, candidate.unknowns
+        sizes = [k for k, u in enumerate(unknowns) if u.name in own and own[u.name].is_size] or range(len(unknowns))
+        which = max((k for k in sizes if k < len(shown)), key=lambda k: float(shown[k]))
+        amplitude = score.least_amplitude(which, threshold)
         steps = np.zeros(len(start.directions))
         steps[min(which, len(steps) - 1)] = amplitude
-        entry = _largest(score.candidate, start.values(steps))
+        entry = _largest(candidate, start.values(steps))
         if not score.visible:
             amplitude, entry = np.inf, replace(entry, value=np.nan)
-        if score.candidate.name not in found or amplitude > found[score.candidate.name][0]:
-            found[score.candidate.name] = (amplitude, entry)
+        if candidate.name not in found or amplitude > found[candidate.name][0]:
+            found[candidate.name] = (amplitude, entry)
     return {name: entry for name, (_, entry) in sorted(found.items())}
-
-
-def _sizes(candidate: Candidate) -> list[int]:
-    """Which unknowns are sizes in the vocabulary; all where none is in it, as of a wave's sine and cosine."""
-    own, unknowns = candidate.vocabulary, candidate.unknowns
-    return [k for k, u in enumerate(unknowns) if u.name in own and own[u.name].is_size] or list(range(len(unknowns)))
 
 
 def _largest(candidate: Candidate, values: Sequence[float]) -> Detectable:

@@ -10,11 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.gap.estimation.fit import linearise
-from wlr_gym.gap.estimation.model import nominal_model
-from wlr_gym.gap.problem import Candidate, Problem
-
-Array = NDArray[np.float64]
+from wlr_gym.gap.estimation import Columns, Replayed, linearise, nominal_model
+from wlr_gym.gap.problem import Array, Candidate, Problem
 
 #: Share of the runs that is held out.
 HELD_OUT_SHARE = 0.3
@@ -51,7 +48,7 @@ def informative_split(problem: Problem) -> tuple[list[int], list[int], list[NDAr
     its response less what the numbers imitate.
 
     Returns:
-        Runs to fit, held-out runs, and the columns (:func:`wlr_gym.gap.estimation.fit.linearise`) of the runs to fit where they
+        Runs to fit, held-out runs, and the columns (:func:`wlr_gym.gap.estimation.linearise`) of the runs to fit where they
         were needed.
 
     Raises:
@@ -63,8 +60,8 @@ def informative_split(problem: Problem) -> tuple[list[int], list[int], list[NDAr
     if count <= LEAST_FITTED:
         raise InputError(f"{count} runs: at least {LEAST_FITTED + 1} are needed, so that one can be held out")
     held_out = min(math.ceil(HELD_OUT_SHARE * count), count - LEAST_FITTED)
-    residuals, columns = linearise(problem, nominal_model(problem), range(count))
-    shown = information_of(problem, residuals, columns)
+    now, columns = linearise(nominal_model(problem), range(count))
+    shown = information_of(now, columns)
     kept = list(range(count))
     while len(kept) > count - held_out:
         kept.remove(max(kept, key=lambda k: shown.of_numbers([other for other in kept if other != k])))
@@ -119,16 +116,15 @@ def _exchanged(shown: Information, kept: list[int], count: int) -> list[int]:
         kept, best = tries[place], worths[place]
 
 
-def information_of(problem: Problem, residuals: Sequence[Array], columns: Sequence[NDArray[np.float32]]) -> Information:
+def information_of(now: Replayed, columns: Columns) -> Information:
     """Return what each run tells of the numbers, and of each named effect at its largest set of places.
 
     Args:
-        problem: the system.
-        residuals: of the model as its file says, all runs.
+        now: the model as its file says, in all runs.
         columns: of its numbers there.
     """
-    model, runs = nominal_model(problem), range(len(problem.runs))
-    _, candidates = problem.candidates(model.setting, [np.zeros_like(residual) for residual in residuals], runs)
+    problem, model, runs = now.problem, now.model, now.runs
+    _, candidates = problem.candidates(model.setting, [np.zeros_like(residual) for residual in now.residuals], runs)
     largest: dict[str, Candidate] = {}
     for candidate in sorted(candidates, key=lambda one: -len(one.where)):
         if not candidate.formula:
@@ -141,8 +137,8 @@ def information_of(problem: Problem, residuals: Sequence[Array], columns: Sequen
             added[name] = [places[key] for key in keys]
     more = [candidate for name, candidate in largest.items() if name not in added]
     settings = [model.with_effect(one, one.probed(one.starts[0])).setting for one in more]
-    found = problem.residuals(settings, runs) if settings else [np.zeros((0, *residual.shape)) for residual in residuals]
-    own = [np.nan_to_num(r - base).reshape(len(r), -1) for r, base in zip(found, residuals, strict=True)]
+    found = problem.residuals(settings, runs) if settings else [np.zeros((0, *residual.shape)) for residual in now.residuals]
+    own = [np.nan_to_num(r - base).reshape(len(r), -1) for r, base in zip(found, now.residuals, strict=True)]
     return Information(
         np.stack([column @ column.T for column in columns]).astype(np.float64) / AUTOCORRELATION_TIME,
         np.stack([column @ one.T for column, one in zip(columns, own, strict=True)]) / AUTOCORRELATION_TIME,

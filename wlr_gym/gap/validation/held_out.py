@@ -9,7 +9,6 @@ fitted model itself made, with the same sensors (:func:`noise_floor`).
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import replace
@@ -19,15 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import ChannelGap, GapFigures, RunGap
-from wlr_gym.gap.estimation.model import FittedModel, level, mean_of_runs, mean_squares
-from wlr_gym.gap.estimation.uncertainty import two_sided_95
-from wlr_gym.gap.problem import Problem, Setting
-from wlr_gym.gap.selection.cross_validation import improvement
+from wlr_gym.gap.estimation import (
+    FittedModel,
+    Replayed,
+    level,
+    mean_of_runs,
+    mean_squares,
+    minus_two_log_likelihood,
+    replay,
+    two_sided_95,
+)
+from wlr_gym.gap.problem import Array, Problem, blocks
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.screening import LEAST_GAIN
 from wlr_gym.gap.selection.search import SearchResult, without_each
-
-Array = NDArray[np.float64]
 
 #: Held-out runs that an interval of their mean needs.
 LEAST_FOR_INTERVAL = 3
@@ -39,26 +43,20 @@ LEAST_GROWTH = 0.02
 LEAST_ROOM = 1e-9
 
 
-def confirmed(
-    problem: Problem,
-    fitted: Sequence[int],
-    held_out: Sequence[int],
-    search: SearchResult,
-    again: Callable[[Container[str]], SearchResult],
-) -> SearchResult:
-    """The search, none of whose effects runs refute that no fit has used.
+def confirmed(search: SearchResult, held_out: Sequence[int], again: Callable[[Container[str]], SearchResult]) -> SearchResult:
+    """Return the search, none of whose effects runs refute that no fit has used.
 
     Each effect is judged beside the others. Where one of several is refuted, ``again`` searches without it: a wrong effect
     changes what others seem to gain. A single one, or what :data:`MOST_SEARCHES` more find, is left out: to try names until one
     passes would wear the test out.
 
     Args:
-        problem, fitted, held_out: the system and its runs.
         search: what has been found.
+        held_out: the runs.
         again: the whole search without effects of these labels.
     """
     refuted: list[Hypothesis] = []
-    while (worst := _refuted(problem, fitted, held_out, search)) is not None:
+    while (worst := _refuted(search, held_out)) is not None:
         if len(search.fit.model.effects) == 1 or len(refuted) >= MOST_SEARCHES:
             return _left_out(search, refuted)
         refuted += [replace(one, cross_validated=False) for _, one in search.kept if one.candidate.label == worst]
@@ -69,63 +67,58 @@ def confirmed(
 def _left_out(search: SearchResult, refuted: Sequence[Hypothesis]) -> SearchResult:
     """The search without its effects, which count as failing cross-validation."""
     seen = {one: replace(one, cross_validated=False) for _, one in search.kept}
-    rounds = [
-        replace(
-            look,
-            hypotheses=[seen.get(one, one) for one in look.hypotheses],
-            selected=None if look.selected is None else seen.get(look.selected, look.selected),
-        )
-        for look in search.rounds
-    ]
+    rounds = []
+    for look in search.rounds:
+        selected = None if look.selected is None else seen.get(look.selected, look.selected)
+        rounds.append(replace(look, hypotheses=[seen.get(one, one) for one in look.hypotheses], selected=selected))
     last = max(k for k, look in enumerate(search.rounds, 1) if look.selected in seen)
     return SearchResult(search.calibrated, search.calibrated, rounds[:last], {}, refuted)
 
 
-def _refuted(problem: Problem, fitted: Sequence[int], held_out: Sequence[int], search: SearchResult) -> str | None:
+def _refuted(search: SearchResult, held_out: Sequence[int]) -> str | None:
     """Label of the effect that the held-out runs refute most; None: none of them."""
     effects, tau = search.fit.model.effects, search.fit.noise.autocorrelation_time
     if not effects:
         return None
-    without = [search.calibrated] if len(effects) == 1 else without_each(problem, fitted, search.fit)
-    found = problem.residuals([one.model.setting for one in (*without, search.fit)], held_out)
-    beyond = [_beyond_need(problem, [r[[k, -1]] for r in found], tau) for k in range(len(without))]
+    without = [search.calibrated] if len(effects) == 1 else without_each(search.fit)
+    *before, after = replay([one.model for one in (*without, search.fit)], held_out)
+    beyond = [_beyond_need(one, after, tau) for one in before]
     return effects[int(np.argmin(beyond))][0].label if min(beyond) < 0.0 else None
 
 
-def _beyond_need(problem: Problem, found: Sequence[Array], autocorrelation_time: Array) -> float:
+def _beyond_need(before: Replayed, after: Replayed, autocorrelation_time: Array) -> float:
     """How much more the held-out runs gain by an effect, in minus two log likelihood, than they must.
 
     By chance they may lose, but not as much as an effect must gain to be selected (:data:`LEAST_GAIN`). Where their error
-    clearly grows, they must gain as much. ``found``: residuals (2, rows, channels) per run, without the effect and with it.
+    clearly grows, they must gain as much.
     """
-    before, after = (level(mean_squares([r[k] for r in found], problem.cap)) for k in (0, 1))
-    grows = after > (1.0 + LEAST_GROWTH) * before
-    return improvement(found, autocorrelation_time) - (LEAST_GAIN if grows else -LEAST_GAIN)
+    was, now = (level(mean_squares(one.residuals, one.problem.cap)) for one in (before, after))
+    least = LEAST_GAIN if now > (1.0 + LEAST_GROWTH) * was else -LEAST_GAIN
+    gained = minus_two_log_likelihood(before.residuals, autocorrelation_time)
+    return gained - minus_two_log_likelihood(after.residuals, autocorrelation_time) - least
 
 
-def noise_floor(problem: Problem, setting: Setting, runs: Sequence[int]) -> float:
+def noise_floor(model: FittedModel, runs: Sequence[int]) -> float:
     """Return the level that a model reaches on runs that it made itself, with the same sensors; NaN where it breaks down."""
-    made = next(problem.remade(setting, runs, 1), None)
-    return math.nan if made is None else level(mean_squares(made, problem.cap))
+    made = next(model.problem.remade(model.setting, runs, 1), None)
+    return math.nan if made is None else level(mean_squares(made, model.problem.cap))
 
 
 def compare_models(
-    problem: Problem, fitted: Sequence[int], heldout: Sequence[int], models: Sequence[FittedModel], floor: float
+    models: Sequence[FittedModel], fitted: Sequence[int], heldout: Sequence[int], floor: float
 ) -> tuple[GapFigures, tuple[RunGap, ...], tuple[ChannelGap, ...]]:
     """Compare three models on fitted and held-out runs.
 
     Args:
-        problem: the system.
-        fitted, heldout: runs.
         models: as its file says; calibrated; with the effects.
+        fitted, heldout: runs.
         floor: level that a perfect model reaches.
     """
-    settings = [model.setting for model in models]
-    found = problem.residuals(settings, [*fitted, *heldout])
-    squares = [mean_squares([r[k] for r in found], problem.cap) for k in range(3)]
+    problem = models[0].problem
+    found = replay(models, [*fitted, *heldout])
+    squares = [mean_squares(one.residuals, problem.cap) for one in found]
     inside, outside = slice(0, len(fitted)), slice(len(fitted), None)
     before, calibrated, after = (level(s[outside]) for s in squares)
-    singly = [min(reduction(was, now, floor), 1.0) for was, now in zip(squares[1], squares[2], strict=True)]
     figures = GapFigures(
         problem.metric,
         level(squares[0][inside]),
@@ -138,24 +131,18 @@ def compare_models(
         _interval(squares[1][outside], squares[2][outside], floor),
         problem.cap,
     )
-    gaps = tuple(
-        RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=closed)
-        for k, (run, closed) in enumerate(zip((*fitted, *heldout), singly, strict=True))
-    )
-    worse = worse_channels(problem, heldout, *([r[k] for r in found[outside]] for k in (1, 2)))
+    gaps = []
+    for k, run in enumerate((*fitted, *heldout)):
+        closed = min(reduction(squares[1][k], squares[2][k], floor), 1.0)
+        gaps.append(RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=closed))
+    worse = worse_channels(problem, heldout, *(one.residuals[outside] for one in found[1:]))
+    levels = np.sqrt([mean_of_runs(s[outside]) for s in squares])
     channels = tuple(
-        ChannelGap(
-            signal.name,
-            signal.unit,
-            signal.noise,
-            *(float(np.sqrt(mean_of_runs(s[outside])[c])) for s in squares),
-            group=signal.group,
-            worse=bool(worse[c]),
-        )
+        ChannelGap(signal.name, signal.unit, signal.noise, *levels[:, c].tolist(), group=signal.group, worse=bool(worse[c]))
         for c, signal in enumerate(problem.signals)
         if np.isfinite(squares[0][outside][:, c]).any()
     )
-    return figures, gaps, channels
+    return figures, tuple(gaps), channels
 
 
 def reduction(calibrated: Array, after: Array, floor: float) -> float:
@@ -187,8 +174,6 @@ def _interval(calibrated: Array, after: Array, floor: float) -> tuple[float, flo
 
 # ---- channels that effects make worse --------------------------------------------------------------------------------
 
-#: s; length of a block.
-BLOCK = 2.0
 #: Bootstrap samples of the blocks.
 SAMPLES = 2000
 #: Share by which a channel's mean square must rise.
@@ -220,11 +205,8 @@ def worse_channels(
 
 def _block_squares(problem: Problem, run: int, residual: Array) -> Array:
     """Sums of squares (blocks, signals) of one run; what is beyond the problem's cap counts as that."""
-    t = problem.times(run)
-    inner = np.linspace(t[0], t[-1], max(1, round(float(t[-1] - t[0]) / BLOCK)) + 1)[1:-1]
     squares = np.nan_to_num(np.minimum(residual**2, problem.cap**2))
-    edges = (0, *np.searchsorted(t, inner).tolist(), len(t))
-    return np.stack([squares[first:last].sum(axis=0) for first, last in itertools.pairwise(edges)])
+    return np.stack([squares[rows].sum(axis=0) for rows in blocks(problem.times(run))])
 
 
 # ---- runs that are replayed worst ------------------------------------------------------------------------------------

@@ -7,13 +7,10 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import HeatMap, Place, Trace
-from wlr_gym.gap.estimation.model import FittedModel, Noise
-from wlr_gym.gap.problem import Problem
-
-Array = NDArray[np.float64]
+from wlr_gym.gap.estimation import FittedModel, Noise
+from wlr_gym.gap.problem import Array, Problem
 
 #: Bins of a feature, by its quantiles.
 BINS = 5
@@ -121,33 +118,26 @@ MOST = 6
 USUAL = ("gyro_z", "cam_x", "eff_leg_lf", "vel_wheel_lf", "position")
 
 
-def informative_traces(
-    problem: Problem, heldout: Sequence[int], models: Sequence[FittedModel], places: Sequence[Place]
-) -> tuple[Trace, ...]:
+def informative_traces(models: Sequence[FittedModel], heldout: Sequence[int], places: Sequence[Place]) -> tuple[Trace, ...]:
     """Return measured and replayed traces of held-out runs, channels in the order of their share of the gap.
 
     Args:
-        problem: the system.
-        heldout: runs.
         models: as its file says; calibrated; with the effects.
+        heldout: runs.
         places: where the gap is.
     """
+    problem = models[0].problem
     names = [signal.name for signal in problem.signals]
     wanted = [place.name for place in places] + [name for name in USUAL if name in names]
-    chosen = list(dict.fromkeys(wanted))[:MOST]
     settings = [model.setting for model in models]
-    replayed = problem.simulate(settings, heldout)
-    residuals = problem.residuals(settings[1:], heldout)
+    replayed, residuals = problem.simulate(settings, heldout), problem.residuals(settings[1:], heldout)
     found = []
-    for name in chosen:
+    for name in list(dict.fromkeys(wanted))[:MOST]:
         c = names.index(name)
-        sizes = [float(np.nan_to_num(np.nansum(r[0][:, c] ** 2))) for r in residuals]
-        k = int(np.argmax(sizes))
-        measured = problem.measured(heldout[k])[:, c]
-        if not np.isfinite(measured).any():
-            continue
-        lines = [replayed[k][m][:, c] for m in range(3)]
-        errors = [residuals[k][m][:, c] * problem.signals[c].noise for m in range(2)]
-        run, unit = problem.runs[heldout[k]], problem.signals[c].unit
-        found.append(Trace(run, name, unit, problem.times(heldout[k]), measured, *lines, *errors))
+        k = int(np.argmax([float(np.nan_to_num(np.nansum(r[0][:, c] ** 2))) for r in residuals]))
+        run, signal, measured = heldout[k], problem.signals[c], problem.measured(heldout[k])[:, c]
+        if np.isfinite(measured).any():
+            errors = residuals[k][:, :, c] * signal.noise
+            lines = (problem.times(run), measured, *replayed[k][:, :, c], *errors)
+            found.append(Trace(problem.runs[run], name, signal.unit, *lines))
     return tuple(found)

@@ -1,7 +1,7 @@
 """Is the final model adequate? What it leaves in the runs, beside what it would leave in runs that it made itself.
 
 Three statistics of the fitted runs (:func:`adequacy_of`): *level*, the root mean square of the residuals; *whiteness*, their
-integrated autocorrelation time in rows (see :mod:`wlr_gym.gap.estimation.model`); *constancy*, the scatter of the runs'
+integrated autocorrelation time in rows (see :mod:`wlr_gym.gap.estimation`); *constancy*, the scatter of the runs'
 estimates of the model's numbers over what their rows predict. A parametric bootstrap shows what chance alone leaves: the same
 runs are made anew by the final model with the same sensors, the model's numbers are fitted to each such set by one linear step
 with the columns of the fit, drawn towards the numbers that made it, and the same statistics are taken. No decision depends on
@@ -21,14 +21,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.gap.analysis import Adequacy, Pulled, Statistic, Turning
-from wlr_gym.gap.estimation.fit import Fit
-from wlr_gym.gap.estimation.model import Noise, estimate_noise, on_bounds, prior_tightness, run_scatter
-from wlr_gym.gap.problem import Problem
-
-Array = NDArray[np.float64]
+from wlr_gym.gap.estimation import Fit, Noise, by_channel, estimate_noise, run_scatter
+from wlr_gym.gap.problem import Array, Problem
 
 #: Sets of runs that the model makes: the least of which the largest is a limit of 5 %.
 REPLICATES = 19
@@ -41,7 +37,7 @@ class _Left:
     """What a model leaves in one set of runs.
 
     Attributes:
-        noise: of the residuals, without scatter.
+        noise: of the residuals, without scatter; NaN in channels that were not measured.
         scatter: of the runs' estimates of the numbers over what their rows predict; NaN = the data are informative about none.
         pulls: (runs, numbers) by how many standard errors each run pulls each number away from the others.
     """
@@ -50,38 +46,22 @@ class _Left:
     scatter: float
     pulls: Array
 
-    @property
-    def level(self) -> Array:
-        """Root mean square (channels); NaN where not measured."""
-        return np.where(self.noise.rows > 0, np.sqrt(self.noise.square), np.nan)
-
-    @property
-    def autocorrelation_time(self) -> Array:
-        """Integrated autocorrelation time in rows (channels); NaN where not measured."""
-        return np.where(self.noise.rows > 0, self.noise.autocorrelation_time, np.nan)
-
 
 class _Columns:
     """The columns of a fit and their products, channel by channel: what a set of runs pulls costs next to nothing with them."""
 
-    def __init__(self, problem: Problem, found: Fit) -> None:
-        channels = len(problem.signals)
-        self._by_channel = [
-            np.ascontiguousarray(column.reshape(len(column), -1, channels).transpose(2, 0, 1)) for column in found.columns
-        ]
+    def __init__(self, found: Fit) -> None:
+        self._by_channel = [by_channel(column, len(found.problem.signals)) for column in found.columns]
         self._products = np.stack([c @ c.transpose(0, 2, 1) for c in self._by_channel])  # (runs, channels, numbers, numbers)
-        self._free = ~on_bounds(problem, found.model)
-        self._tight = prior_tightness(problem, found.model)
+        self._free = ~found.model.on_bounds
+        self._tight = found.model.tightness
         self._found = found
 
     def refitted(self, residuals: Sequence[Array]) -> list[Array]:
         """Return the residuals (rows, channels) per run after one linear step of the fit."""
         pull = np.einsum("c,rcn->n", self._found.noise.weight, self._vectors(residuals))
-        step = -np.linalg.solve(self._found.hessian, pull)
-        return [
-            residual + (step.astype(np.float32) @ column).T
-            for residual, column in zip(residuals, self._by_channel, strict=True)
-        ]
+        step = -np.linalg.solve(self._found.hessian, pull).astype(np.float32)
+        return [residual + (step @ column).T for residual, column in zip(residuals, self._by_channel, strict=True)]
 
     def left(self, residuals: Sequence[Array]) -> _Left:
         """Take the statistics of residuals (rows, channels), one array per run."""
@@ -91,7 +71,8 @@ class _Columns:
         scatter = run_scatter(matrices, vectors)
         pulls = np.zeros((len(residuals), len(self._free)))
         pulls[:, self._free] = _pulls(matrices, vectors, self._tight[self._free])
-        return _Left(noise, np.nan if scatter is None else scatter, pulls)
+        times, squares = (np.where(noise.rows > 0, v, np.nan) for v in (noise.autocorrelation_time, noise.square))
+        return _Left(Noise(squares, times, noise.rows), math.nan if scatter is None else scatter, pulls)
 
     def _vectors(self, residuals: Sequence[Array]) -> Array:
         """Products (runs, channels, numbers) of columns and residuals."""
@@ -108,41 +89,31 @@ def _pulls(matrices: Array, vectors: Array, tight: Array) -> Array:
     return np.where((np.diag(total) > INFORMATIVE) & (errors > 0.0), np.abs(shifts) / np.where(errors > 0.0, errors, 1.0), 0.0)
 
 
-def adequacy_of(problem: Problem, runs: Sequence[int], found: Fit) -> Adequacy | None:
+def adequacy_of(found: Fit) -> Adequacy | None:
     """Compare what a fitted model leaves in the runs it was fitted to with what it leaves in runs that it made itself.
 
     None where it cannot make them.
-
-    Args:
-        problem: the system.
-        runs: the fitted runs.
-        found: the final model; its columns are of these runs.
     """
-    columns = _Columns(problem, found)
-    made = problem.remade(found.model.setting, runs, REPLICATES)
+    problem, columns = found.problem, _Columns(found)
+    made = problem.remade(found.model.setting, found.runs, REPLICATES)
     seen = columns.left(found.residuals)
-    all_left = [seen, *(columns.left(columns.refitted(residuals)) for residuals in made)]
-    if len(all_left) == 1:
+    every = [seen, *(columns.left(columns.refitted(residuals)) for residuals in made)]
+    if len(every) == 1:
         return None
-    levels, autocorrelation_times = (
-        np.stack([one.level for one in all_left]),
-        np.stack([one.autocorrelation_time for one in all_left]),
-    )
+    levels = np.sqrt([one.noise.square for one in every])
+    times = np.stack([one.noise.autocorrelation_time for one in every])
     run, which = np.unravel_index(int(np.argmax(seen.pulls)), seen.pulls.shape)
     names = [quantity.name for quantity in problem.quantities]
     names += [f"{candidate.label} {one.name}" for candidate, _ in found.model.effects for one in candidate.unknowns]
+    pulled = compared(np.array([one.pulls.max() for one in every]))
     return Adequacy(
         REPLICATES,
         compared(np.sqrt(np.nanmean(levels**2, axis=1))),
-        compared(np.exp(np.nanmean(np.log(autocorrelation_times), axis=1))),
-        compared(np.array([one.scatter for one in all_left])),
-        Pulled(
-            names[int(which)],
-            problem.runs[runs[int(run)]],
-            compared(np.array([one.pulls.max() for one in all_left])),
-        ),
+        compared(np.exp(np.nanmean(np.log(times), axis=1))),
+        compared(np.array([one.scatter for one in every])),
+        Pulled(names[int(which)], problem.runs[found.runs[int(run)]], pulled),
         {
-            signal.name: (compared(levels[:, c]), compared(autocorrelation_times[:, c]))
+            signal.name: (compared(levels[:, c]), compared(times[:, c]))
             for c, signal in enumerate(problem.signals)
             if seen.noise.rows[c] > 0
         },

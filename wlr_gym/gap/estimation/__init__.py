@@ -1,1 +1,0 @@
-"""Estimation: fit models to runs, with the uncertainty of what was fitted."""
