@@ -10,7 +10,7 @@ from wlr_gym.data.format import CHANNELS, COMMANDS
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import euler_angles
 from wlr_gym.data.sensors import noise_parts
-from wlr_gym.gap.robot.simulate import PHYSICS_STEP
+from wlr_gym.gap.robot.replay import PHYSICS_STEP
 from wlr_gym.gap.robot.windows import CLOCK
 from wlr_gym.physics.effects import apply_patch, load_patch
 from wlr_gym.physics.plants import make_plant

@@ -12,11 +12,9 @@ from wlr_gym.data import RunMeta
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.sensors import channel_noise
 from wlr_gym.gap.estimation import nominal_model
-from wlr_gym.gap.robot import replay_loop as loop
-from wlr_gym.gap.robot import simulate
+from wlr_gym.gap.robot import replay as simulate
 from wlr_gym.gap.robot.problem import RobotProblem
-from wlr_gym.gap.robot.replay_loop import TRUTH, WrittenSetpoints
-from wlr_gym.gap.robot.simulate import replay_batch
+from wlr_gym.gap.robot.replay import TRUTH, WrittenSetpoints, replay_batch
 from wlr_gym.gap.robot.windows import CLOCK, RunClock, anchored_residuals
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT
 from wlr_gym.robot import JOINTS
@@ -132,7 +130,7 @@ def test_the_compiled_loop_does_what_steps_from_python_do(run, other, monkeypatc
     """Two runs of different length and with other windows, motors that are off for a while, the truth."""
     clocks, table = [RunClock(run, window=0.3), RunClock(other)], several(3)
     compiled = replay_batch(ROBOT, clocks, table, with_truth=True)
-    monkeypatch.setattr(loop, "GibbsAppellPlant", type(None))
+    monkeypatch.setattr(simulate, "GibbsAppellPlant", type(None))
     stepped = replay_batch(ROBOT, clocks, table, with_truth=True)
     for one, same in zip(compiled, stepped, strict=True):
         assert np.array_equal(one.values, same.values)

@@ -79,7 +79,7 @@ def test_same_run_leaves_nothing():
 def test_simulated_pose_and_wheel_angles_of_a_window_do_not_matter(seed):
     measured, simulated = drive(), np.stack([drive(bend=0.02), drive(turn=0.82)])
     plain = residuals(measured, simulated)
-    elsewhere = residuals(measured, np.stack([WINDOWS.moved(seed) for s in simulated]))
+    elsewhere = residuals(measured, np.stack([moved(s, WINDOWS, seed) for s in simulated]))
     assert elsewhere == pytest.approx(plain, abs=1e-4, nan_ok=True)
     assert np.nanmax(np.abs(plain[:, :, YAW])) > 1.0
 

@@ -182,36 +182,38 @@ RUNS = [0, 2, 3]
 ROWS = 1000
 
 
-def residuals(seed):
+def left(residuals):
+    """What a model leaves in the runs."""
+    return Replayed(nominal_model(Toy(runs=4, rows=ROWS)), RUNS, residuals)
+
+
+def coloured_left(seed):
     rng = np.random.default_rng(seed)
-    return [coloured(rng, (ROWS, 3), 0.9) for _ in RUNS]
+    return left([coloured(rng, (ROWS, 3), 0.9) for _ in RUNS])
 
 
 def test_a_channel_that_gets_worse_in_all_runs_is_named_and_no_other():
-    problem, before = Toy(runs=4, rows=ROWS), residuals(0)
-    after = [r * [1.0, 1.05, 1.005] for r in before]  # mean squares up by 0, 10 and 1 %
-    assert worse_channels(problem, RUNS, before, after).tolist() == [False, True, False]
-    assert not worse_channels(problem, RUNS, after, before).any()
+    before = coloured_left(0)
+    after = left([r * [1.0, 1.05, 1.005] for r in before.residuals])  # mean squares up by 0, 10 and 1 %
+    assert worse_channels(before, after).tolist() == [False, True, False]
+    assert not worse_channels(after, before).any()
 
 
 def test_other_noise_of_the_same_size_is_not_worse():
-    problem = Toy(runs=4, rows=ROWS)
-    found = [worse_channels(problem, RUNS, residuals(k), residuals(1000 + k)) for k in range(60)]
+    found = [worse_channels(coloured_left(k), coloured_left(1000 + k)) for k in range(60)]
     assert np.mean(found) <= 0.04
 
 
 def test_one_bad_block_does_not_make_a_channel_worse():
-    problem, before = Toy(runs=4, rows=ROWS), residuals(3)
-    after = [r.copy() for r in before]
-    after[0][:50, 0] += 6.0
-    assert np.sum(after[0][:, 0] ** 2) > 1.2 * np.sum(before[0][:, 0] ** 2)
-    assert not worse_channels(problem, RUNS, before, after).any()
+    before, after = coloured_left(3), coloured_left(3)
+    after.residuals[0][:50, 0] += 6.0
+    assert np.sum(after.residuals[0][:, 0] ** 2) > 1.2 * np.sum(before.residuals[0][:, 0] ** 2)
+    assert not worse_channels(before, after).any()
 
 
 def test_channels_that_were_not_measured_are_neither():
-    problem = Toy(runs=4, rows=ROWS)
-    silent = [np.full((ROWS, 3), np.nan) for _ in RUNS]
-    assert not worse_channels(problem, RUNS, silent, silent).any()
+    silent = left([np.full((ROWS, 3), np.nan) for _ in RUNS])
+    assert not worse_channels(silent, silent).any()
 
 
 def test_the_report_says_so_first():

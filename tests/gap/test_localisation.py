@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from toy_problem import CHANNELS, Toy
 
-from wlr_gym.gap.estimation import estimate_noise
+from wlr_gym.gap.estimation import Replayed, estimate_noise, nominal_model
 from wlr_gym.gap.validation.localisation import BINS, localise
 
 RUNS = 4
@@ -15,8 +15,11 @@ def states(problem):
 
 
 def localised(residuals, problem, expected=None):
-    expected = np.ones(3) if expected is None else expected
-    return localise(problem, residuals, expected, estimate_noise(residuals), states(problem))
+    return located(problem, residuals, states(problem), np.ones(3) if expected is None else expected)
+
+
+def located(problem, residuals, features, expected):
+    return localise(Replayed(nominal_model(problem), range(RUNS), residuals), expected, estimate_noise(residuals), features)
 
 
 def white(problem, seed=0, size=1.0):
@@ -49,7 +52,7 @@ def test_a_range_without_data_is_not_where_the_error_is_smallest():
     gains = [np.repeat([100.0, 200.0, 400.0, 800.0], 100)] * RUNS
     for residual in residuals:
         residual[:, 2] += np.where(gains[0] > 300.0, 6.0, 0.0)
-    places, _ = localise(problem, residuals, np.ones(3), estimate_noise(residuals), [{"gain": gain} for gain in gains])
+    places, _ = located(problem, residuals, [{"gain": gain} for gain in gains], np.ones(3))
     smallest = places[0].dependence.partition("smallest ")[2]
     assert smallest.startswith(("100 to ", "200 to "))
     assert float(smallest.rpartition("(")[2].rstrip(")")) == pytest.approx(1.0, abs=0.1)
@@ -127,6 +130,6 @@ def test_constant_state_is_no_reason():
     problem = Toy(runs=RUNS, rows=200)
     residuals = white(problem, size=3.0)
     features = [{"parked": np.zeros(200)} for _ in range(RUNS)]
-    places, maps = localise(problem, residuals, np.ones(3), estimate_noise(residuals), features)
+    places, maps = located(problem, residuals, features, np.ones(3))
     assert maps == ()
     assert {p.dependence for p in places} == {"no clear dependence on the state"}

@@ -12,7 +12,7 @@ from gap_examples import EFFECT_FOUND
 from toy_problem import CHANNELS, NOISE, Toy
 
 from wlr_gym.gap.analysis import UNKNOWN, Turning
-from wlr_gym.gap.estimation import fit, nominal_model
+from wlr_gym.gap.estimation import Replayed, fit, nominal_model
 from wlr_gym.gap.report.page import save_analysis
 from wlr_gym.gap.report.result import read_result
 from wlr_gym.gap.report.text import adequacy, sentence
@@ -190,7 +190,7 @@ def found_in(made, ways):
         left = RNG.standard_normal((len(angle), len(problem().signals)))
         left[:, 0] += made(angle, k)
         residuals.append(left)
-    return turning(problem(), residuals, [{"angle": angle} for angle in ways])
+    return turning(Replayed(nominal_model(problem()), range(len(ways)), residuals), [{"angle": angle} for angle in ways])
 
 
 @pytest.mark.parametrize("order", [1, 2, 3])

@@ -242,7 +242,7 @@ def test_autocorrelation_is_the_sum_over_lags_of_what_was_measured():
     rng = np.random.default_rng(3)
     series = [np.cumsum(rng.standard_normal((300, 2)), axis=0) * 0.1 + rng.standard_normal((300, 2)) for _ in range(2)]
     series[0][::7, 1] = np.nan
-    found = autocorrelation_times(series)
+    found = autocorrelation_times([one.T for one in series])
     for c in range(2):
         known = [s[np.isfinite(s[:, c]), c] for s in series]
         rho = np.array([sum(s[lag:] @ s[: len(s) - lag] for s in known) for lag in range(100)]) / sum(s @ s for s in known)

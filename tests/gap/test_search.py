@@ -299,7 +299,7 @@ def test_parameter_that_an_effect_replaces_is_a_rival_of_it():
 @pytest.mark.parametrize(("effects", "names"), [([], []), ([sized("drag", 0.8, "right")], ["drag right"])])
 def test_stuck_calibration_is_done_anew_from_where_refits_have_been(monkeypatch, effects, names):
     monkeypatch.setattr(
-        search, "shortlist", lambda scores, threshold: scores[:2]
+        search, "shortlist", lambda scores, threshold, alone: scores[:2]
     )  # also where none is predicted to improve the fit
     problem = Toy({"gain": 2.0, "offset": -2.0}, effects, rows=400)
     stuck, free, given = stuck_and_free(problem)

@@ -4,15 +4,12 @@ Everything is in noise units and one tolerance of a quantity moves its shape by 
 and in most effects; ``play`` starts with its square, ``ripple`` has an amplitude and a phase.
 """
 
-import math
-from collections.abc import Mapping
 from functools import cache
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Start, Unknown
+from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Problem, Quantity, Start, Unknown
 from wlr_gym.physics.effects import PatchEffect
 
 NOISE = np.array([0.1, 2.0, 0.001])
@@ -52,7 +49,7 @@ def coloured(rng, shape, ar1):
     return series
 
 
-class Toy:
+class Toy(Problem):
     """A :class:`wlr_gym.gap.problem.Problem` that costs microseconds.
 
     Args:
@@ -63,11 +60,7 @@ class Toy:
         ar1: of that error, correlation of neighbouring rows.
     """
 
-    metric, cap, steps, threads, thorough, tempering, disagreement = "RMS in noise units", 50.0, 4, 1, False, 1.0, 0.0
-    held_out: tuple[str, ...] = ()
-    misfit = math.inf
-    turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
-    motions: Mapping[str, str] = MappingProxyType({})
+    metric, cap, steps = "RMS in noise units", 50.0, 4
 
     def __init__(self, truth=None, effects=(), seed=0, *, runs=5, rows=200, white=1.0, error=0.0, ar1=0.9, reach=REACH):
         self.runs = tuple(f"run_{k + 1}" for k in range(runs))

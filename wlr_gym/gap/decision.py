@@ -372,12 +372,9 @@ class Promise:
 
 
 def motions_to_drive(robot: Robot, profile: Profile, driven: Sequence[str]) -> list[Motion]:
-    """Return the excitations that may be driven with a servo profile; one that was driven already is drawn anew.
+    """Return the excitations made for a servo profile, within a robot's limits; what was driven already is drawn anew.
 
-    Args:
-        robot: whose limits they keep.
-        profile: of the runs that are there. A motion made for another one is left out.
-        driven: names of the excitations that were driven, once for each time.
+    ``driven``: names of the excitations that were driven, once for each time.
     """
     names = [name for name, excitation in EXCITATIONS.items() if excitation.profile in (GENTLE, profile)]
     return [replace(excite(name, list(driven).count(name), robot), profile=profile) for name in names]
@@ -418,11 +415,7 @@ def promises(
     What numbers take up costs most to know, and only lowers a promise: motions that promise less even without it, and would
     tell no more, are left out.
 
-    Args:
-        result: of the last analysis: its calibration, and what its model leaves.
-        explanations: in play, two or more.
-        motions: to choose from.
-        robot, runs, known, backend, threads: of the analysis.
+    ``result`` and what follows ``motions`` are of the last analysis; ``explanations`` are those in play, two or more.
     """
 
     def foresight(runs: Sequence[Run]) -> _Foresight:

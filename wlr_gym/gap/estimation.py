@@ -81,18 +81,15 @@ class Noise:
 
 
 def estimate_noise(residuals: Sequence[Array], autocorrelation_time: Array | None = None, scatter: float = 1.0) -> Noise:
-    """Return level and autocorrelation time of residuals, one (rows, channels) array per run.
+    """Return level and autocorrelation time of residuals, one (rows, channels) array per run, NaN where not measured.
 
-    Args:
-        residuals: noise units, NaN where not measured.
-        autocorrelation_time: (channels) of another model that this one is compared with; None = estimated.
-        scatter: of the runs; see :class:`Noise`.
+    ``autocorrelation_time``: (channels) of another model that this one is compared with; None = estimated.
     """
     total = np.sum([np.nansum(r * r, axis=0) for r in residuals], axis=0)
     rows = np.sum([np.isfinite(r).sum(axis=0) for r in residuals], axis=0)
     return Noise(
         total / np.maximum(rows, 1),
-        scatter * autocorrelation_times(residuals) if autocorrelation_time is None else autocorrelation_time,
+        scatter * autocorrelation_times([r.T for r in residuals]) if autocorrelation_time is None else autocorrelation_time,
         rows,
         scatter,
     )
@@ -110,13 +107,10 @@ def channel_costs(square: Array) -> Array:
 
 
 def run_scatter(matrices: Array, vectors: Array) -> float | None:
-    """Return how many times more than expected the runs differ in where they pull the numbers.
+    """Return how many times more than expected the runs differ in where they pull the numbers, by their normal equations.
 
     The runs' gradients at their common best fit should scatter as their curvature says (White's information equality); the mean
     ratio over the directions that the data are informative about; None where there is none.
-
-    Args:
-        matrices, vectors: (runs, numbers, numbers), (runs, numbers) normal equations of each run.
     """
     runs = len(vectors)
     if runs < 2:
@@ -130,13 +124,11 @@ def run_scatter(matrices: Array, vectors: Array) -> float | None:
     return float(ratio.mean())
 
 
-def autocorrelation_times(residuals: Sequence[Array]) -> Array:
-    """Integrated autocorrelation (channels) in rows: summed until it first falls below 0.05, over measured rows only."""
-    return series_times([residual.T for residual in residuals])
+def autocorrelation_times(series: Sequence[Array]) -> Array:
+    """Integrated autocorrelation (channels) in rows of residuals (channels, rows) per run, over measured rows only.
 
-
-def series_times(series: Sequence[Array]) -> Array:
-    """The same of residuals (channels, rows)."""
+    It is summed until it first falls below 0.05.
+    """
     edges = np.cumsum([0, *(part.shape[1] for part in series)])
     return _integrated(np.concatenate(series, axis=1, dtype=np.float64), edges, LONGEST)
 
@@ -612,7 +604,7 @@ def _noise_within_reach(now: Replayed, columns: Columns, scatter: float) -> Nois
     for _ in range(ROUNDS):
         change = _step(now, columns, noise).astype(np.float32)
         left = [r + (change @ c).reshape(r.shape) for r, c in zip(now.residuals, columns, strict=True)]
-        own = autocorrelation_times(left)
+        own = autocorrelation_times([r.T for r in left])
         noise = estimate_noise(left, scatter * own, scatter)
         less = min(scatter, _scatter(replace(now, residuals=left), columns, noise))
         noise = replace(noise, autocorrelation_time=less * own, scatter=less)

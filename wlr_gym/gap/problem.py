@@ -7,8 +7,10 @@ The steps of the workflow (estimation, selection, validation) use only a :class:
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -227,7 +229,7 @@ class Range:
 
 
 class Problem(Protocol):
-    """A system, its measured runs, and a simulator of it.
+    """A system, its measured runs, and a simulator of it; a class that derives from it takes over what it does not set.
 
     Attributes:
         runs: names.
@@ -252,14 +254,14 @@ class Problem(Protocol):
     metric: str
     cap: float
     steps: int
-    tempering: float
-    disagreement: float
-    threads: int
-    thorough: bool
-    misfit: float
-    motions: Mapping[str, str]
-    held_out: tuple[str, ...]
-    turning: Mapping[str, tuple[str, tuple[str, ...]]]
+    tempering: float = 1.0
+    disagreement: float = 0.0
+    threads: int = 1
+    thorough: bool = False
+    misfit: float = math.inf
+    motions: Mapping[str, str] = MappingProxyType({})
+    held_out: tuple[str, ...] = ()
+    turning: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType({})
     runs: tuple[str, ...]
     signals: tuple[MeasuredSignal, ...]
     quantities: tuple[Quantity, ...]

@@ -171,10 +171,10 @@ def analyse_problem(
     # mean squares that a complete model leaves: the final one, or sensors alone where that cannot be complete
     complete = mean_of_runs(mean_squares(final.residuals, problem.cap))
     complete = np.where(np.isfinite(complete), 1.0, np.nan) if nameless else complete
-    places, maps = localise(problem, base.residuals, complete, final.noise, [features[k] for k in fitted])
+    places, maps = localise(base, complete, final.noise, [features[k] for k in fitted])
     adequacy = adequacy_of(final)
     (left,) = replay([final.model], every)
-    turned = turning(problem, left.residuals, features)  # few runs turn far, and held-out ones may be those
+    turned = turning(left, features)  # few runs turn far, and held-out ones may be those
     # without name or formula: what goes with a joint's turning, else what the worst signal tells of
     nowhere: tuple[FoundEffect, ...] = ()
     if turned is not None:
@@ -333,10 +333,8 @@ def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | No
     """Return what ``--robot`` takes for the robot that is analysed; None = nothing names it, or it is a rig."""
     from wlr_gym.data.runs import names_file, read_meta, shipped_robots
 
-    if rig is not None:
-        return None
-    if robot is not None:
-        return str(robot)
+    if robot is not None or rig is not None:
+        return None if rig is not None else str(robot)
     named = read_meta(data).robot
     if named is None:
         return None

@@ -14,7 +14,7 @@ from wlr_gym.data.format import Profile
 from wlr_gym.gap.analysis import EFFECT_FOUND, Equivalent, Recommendation, Relation
 from wlr_gym.gap.problem import Candidate
 from wlr_gym.gap.report.text import places
-from wlr_gym.gap.selection.cross_validation import shown_by_some_runs_only
+from wlr_gym.gap.selection.finalists import shown_by_some_runs_only
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score
 from wlr_gym.gap.selection.search import Round
 from wlr_gym.physics.effects import EFFECTS

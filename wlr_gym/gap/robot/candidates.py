@@ -64,12 +64,7 @@ RESOLVED = 0.8
 
 
 def knobs(robot: Robot, physics_step: float) -> tuple[Knob, ...]:
-    """Return what calibration may move, from the robot's tolerances.
-
-    Args:
-        robot: the robot.
-        physics_step: s, with which it will be simulated.
-    """
+    """Return what calibration may move, from the tolerances of a robot that is simulated with a physics step, s."""
     nominal = Parameters.nominal(robot)
     shared = [(key, [e for name in names for e in SPECS[name].elements]) for key, names in SHARED.items()]
     single = [(spec.tolerance, [e]) for spec in TABLE if spec.tolerance not in (*UNSEEN, *SHARED) for e in spec.elements]

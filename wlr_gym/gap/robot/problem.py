@@ -18,11 +18,10 @@ from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.runs import Run, read_dataset, robot_of
 from wlr_gym.data.sensors import channel_noise, noise_parts
 from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding
-from wlr_gym.gap.problem import Array, Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, since_reversal
+from wlr_gym.gap.problem import Array, Candidate, MeasuredSignal, Probe, Problem, Range, Setting, since_reversal
 from wlr_gym.gap.robot.candidates import Knob, formula_candidates, knobs, robot_candidates, shown_by, tried_effects, write
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
-from wlr_gym.gap.robot.replay_loop import TRUTH, Replays
-from wlr_gym.gap.robot.simulate import KERNELS, PHYSICS_STEP, kernel_of, replay_batch
+from wlr_gym.gap.robot.replay import KERNELS, PHYSICS_STEP, TRUTH, Replays, kernel_of, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, RunClock, anchored_residuals
 from wlr_gym.physics.effects import EFFECTS, Patch, PatchEffect, Source, apply_patch, load_patch
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
@@ -55,7 +54,7 @@ WORTH_APART = 12
 MOST_REMADE = 256
 
 
-class RobotProblem:
+class RobotProblem(Problem):
     """Measured runs of the robot, and a simulator of it; see :class:`wlr_gym.gap.problem.Problem`.
 
     Args:
@@ -84,18 +83,15 @@ class RobotProblem:
         profile = runs[0].meta.profile
         if any(run.meta.profile != profile for run in runs):
             raise InputError(f"{runs[0].path.parent}: runs with different servo profiles; analyse them apart")
-        self.metric: str = (
+        self.metric = (
             f"RMS over channels of measured minus replayed, in units of sensor noise ({CAP:g} at most per reading), "
             f"windows of {window:g} s"
         )
         self.cap, self.steps, self.tempering = CAP, STEPS, TEMPERING
         self.disagreement, self.misfit = DISAGREEMENT, MISFIT
-        self.thorough, self.held_out = False, ()
         seen = any("cam_x" in run for run in runs)
-        self.motions: Mapping[str, str] = {
-            name: motion for name, motion in shown_by().items() if seen or not name.startswith("camera_")
-        }
-        self.turning: Mapping[str, tuple[str, tuple[str, ...]]] = {
+        self.motions = {name: motion for name, motion in shown_by().items() if seen or not name.startswith("camera_")}
+        self.turning = {
             wheel: (f"joint_position[{wheel}]", (*(f"{kind}_{wheel}" for kind in ("pos", "vel", "eff")), *ROCKING))
             for wheel in WHEELS
         }
@@ -103,9 +99,9 @@ class RobotProblem:
         self.known: Patch = load_patch(known)
         self.backend, self.threads, self._window = backend, threads, window
         self.clocks: list[RunClock] = in_threads(threads, lambda run: RunClock(run, window), runs)
-        self.runs: tuple[str, ...] = tuple(run.name for run in runs)
+        self.runs = tuple(run.name for run in runs)
         self._knobs: tuple[Knob, ...] = knobs(self.robot, PHYSICS_STEP)
-        self.quantities: tuple[Quantity, ...] = tuple(knob.quantity for knob in self._knobs)
+        self.quantities = tuple(knob.quantity for knob in self._knobs)
         noise = channel_noise(self.robot)
         for name in CHANNELS:
             if not noise[name]:
@@ -116,7 +112,7 @@ class RobotProblem:
             joint = name.partition("_")[2]
             place = joint if joint in JOINTS else "body"
             signals.append(MeasuredSignal(name, COLUMNS[name].unit, noise[name], COLUMNS[name].group, place))
-        self.signals: tuple[MeasuredSignal, ...] = tuple(signals)
+        self.signals = tuple(signals)
         self._noise = np.array([noise[name] for name in CHANNELS])
         self._tried = _by_slot(Patch(tried_effects()).forces)
         self._base = profile_parameters(Parameters.nominal(self.robot), profile)
@@ -128,11 +124,9 @@ class RobotProblem:
                 values[0, UNREAD] = np.nan
 
     def times(self, run: int) -> Array:
-        """Return the times (rows,) of a run, s."""
         return self.clocks[run].t
 
     def measured(self, run: int) -> Array:
-        """Return what was measured (rows, signals), SI; NaN where not."""
         return self._measured[run]
 
     def parameters(self, settings: Sequence[Setting]) -> Parameters:
@@ -150,7 +144,6 @@ class RobotProblem:
         return Patch((*self.known.effects, *setting.effects))
 
     def simulate(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
-        """Return what the sensors would have read: (settings, rows, signals) per run, SI."""
         groups, clocks = self._alike(settings), [self.clocks[r] for r in runs]
         if len(groups) == 1:
             return [replays.values for replays in self._replay(settings, clocks)]
@@ -179,7 +172,6 @@ class RobotProblem:
         return replay_batch(self.robot, list(clocks), table, self.backend, forces, constants, with_truth, self.threads)
 
     def residuals(self, settings: Sequence[Setting], runs: Sequence[int]) -> list[Array]:
-        """Replay runs under every setting; see :meth:`wlr_gym.gap.problem.Problem.residuals`."""
         return in_threads(self.threads, self._residuals, zip(runs, self.simulate(settings, runs), strict=True))
 
     def _residuals(self, replayed: tuple[int, Array]) -> Array:
@@ -192,7 +184,6 @@ class RobotProblem:
         return found
 
     def remade(self, setting: Setting, runs: Sequence[int], count: int) -> Iterator[list[Array]]:
-        """Replay data sets that a model itself would have recorded; see :meth:`wlr_gym.gap.problem.Problem.remade`."""
         draws = [generator(r, "gap", "floor") for r in runs]
         whole = self._whole(setting, runs)
         at_once = max(1, MOST_REMADE // len(runs))
@@ -236,7 +227,6 @@ class RobotProblem:
     def candidates(
         self, setting: Setting, residuals: Sequence[Array], runs: Sequence[int]
     ) -> tuple[list[Probe], list[Candidate]]:
-        """Return the effects of the library and the formulas to try, and their probes."""
         parameters = self.parameters([setting])
         tolerances = {quantity.name: quantity.sigma for quantity in self.quantities}
         measured = [self._measured[r] for r in runs]
@@ -267,7 +257,6 @@ class RobotProblem:
         return True
 
     def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
-        """Return over which range of each feature a formula was tried; see :meth:`wlr_gym.gap.problem.Problem.reach`."""
         replayed = self._replay([setting], [self.clocks[r] for r in runs], with_truth=True)
         inputs = _formula_inputs(np.concatenate([replays.truth[0] for replays in replayed if replays.truth is not None]))
         inputs["supply_voltage"] = np.concatenate([replays.values[0, :, CHANNELS.index("volt")] for replays in replayed])
@@ -278,7 +267,6 @@ class RobotProblem:
         return {name: Range(float(np.min(values)), float(np.max(values)), unit) for name, (unit, values) in read}
 
     def features(self, setting: Setting, runs: Sequence[int]) -> list[Mapping[str, Array]]:
-        """Return joint speeds, loads, slip and place over the rows of each run."""
         found = self._replay([setting], [self.clocks[r] for r in runs], with_truth=True)
         features = zip(runs, found, strict=True)
         return [_features(replays.truth[0], self.times(run)) for run, replays in features if replays.truth is not None]

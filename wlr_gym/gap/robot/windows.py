@@ -155,15 +155,12 @@ def _calm(residual: Array) -> None:
 
     How it bounces depends on tyre, chassis and floor in ways that no simulator here has; the slow part says what the masses do.
     """
-    rows = residual.shape[1]
+    rows = np.arange(residual.shape[1])
+    first, last = np.maximum(rows - BOUNCE // 2, 0), np.minimum(rows + BOUNCE // 2 + 1, len(rows))
     for c in _BOUNCING:
         known = np.isfinite(residual[:, :, c])
-        total = np.concatenate(
-            [np.zeros((len(residual), 1)), np.cumsum(np.where(known, residual[:, :, c], 0.0), axis=1)], axis=1
-        )
-        count = np.concatenate([np.zeros((len(residual), 1)), np.cumsum(known, axis=1)], axis=1)
-        first = np.maximum(np.arange(rows) - BOUNCE // 2, 0)
-        last = np.minimum(np.arange(rows) + BOUNCE // 2 + 1, rows)
+        sums = (np.cumsum(values, axis=1) for values in (np.where(known, residual[:, :, c], 0.0), known))
+        total, count = (np.pad(each, ((0, 0), (1, 0))) for each in sums)
         seen = count[:, last] - count[:, first]
         mean = (total[:, last] - total[:, first]) / np.sqrt(np.maximum(seen, 1.0))
         residual[:, :, c] = np.where(known, mean, np.nan)
@@ -178,17 +175,19 @@ def _take_out_pose(measured: Array, simulated: Array, residual: Array, noise: Ar
     x, y = (np.ascontiguousarray(simulated[:, seen, c]) for c in (_X, _Y))
     x, y = x - x.mean(axis=1, keepdims=True), y - y.mean(axis=1, keepdims=True)
     mx, my = measured[seen, _X] - measured[seen, _X].mean(), measured[seen, _Y] - measured[seen, _Y].mean()
-    yaw = _wrapped(measured[seen, _YAW] - simulated[:, seen, _YAW])
-    yaw = np.ascontiguousarray(np.unwrap(yaw, axis=1))
+    yaw = np.ascontiguousarray(np.unwrap(_wrapped(measured[seen, _YAW] - simulated[:, seen, _YAW]), axis=1))
     turn = yaw.mean(axis=1, keepdims=True)
     path, heading = 1.0 / noise[_X] ** 2, 1.0 / noise[_YAW] ** 2
+
+    def turned() -> tuple[Array, Array]:
+        return np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+
     for _ in range(2):  # Gauss-Newton for one angle; the second pass is already exact to 1e-6
-        tx, ty = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
-        ex, ey, ew = mx - tx, my - ty, yaw - turn
-        slope = path * (ex * -ty + ey * tx).sum(axis=1) + heading * ew.sum(axis=1)
+        tx, ty = turned()
+        slope = path * ((mx - tx) * -ty + (my - ty) * tx).sum(axis=1) + heading * (yaw - turn).sum(axis=1)
         curve = path * (tx * tx + ty * ty).sum(axis=1) + heading * seen.size
         turn = turn + (slope / curve)[:, None]
-    tx, ty = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+    tx, ty = turned()
     ex, ey = mx - tx, my - ty
     # residuals in the window's own axes, along the heading it starts with: numbers that mean the same in every window
     start = measured[seen[0], _YAW]

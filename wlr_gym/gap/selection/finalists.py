@@ -106,14 +106,7 @@ def left_to_fit(hypotheses: Sequence[Hypothesis], finals: Sequence[Finalist]) ->
 def fit_finalists(current: Fit, chosen: Sequence[Hypothesis], bare: Fit, tell: Tell = quiet) -> tuple[list[Finalist], Fit]:
     """Fit hypotheses in full, with responses simulated anew, and compare all with one model without them.
 
-    Args:
-        current: the model so far.
-        chosen: refitted.
-        bare: the best model without a further effect so far.
-        tell: called with progress.
-
-    Returns:
-        The finalists, best first; the best model without a further effect, which may be one that a finalist has led to.
+    Return the finalists, best first, and the best model without a further effect: ``bare``, or one that a finalist has led to.
     """
     wholes: list[Fit] = []
     for hypothesis in chosen:

@@ -33,13 +33,13 @@ from wlr_gym.gap.estimation import (
     Columns,
     Fit,
     Noise,
+    autocorrelation_times,
     bounded_minimum,
     by_channel,
     channel_costs,
     estimate_noise,
     normal_equations,
     run_scatter,
-    series_times,
 )
 from wlr_gym.gap.problem import Array, Candidate, Probe, Setting, Start, blocks
 
@@ -239,17 +239,11 @@ ALTERNATIVE_SHARES = (1.0, 0.85, 0.7, 0.5, 0.3, 0.15, 0.05, 0.0)
 
 
 def rescored(found: Responses, scores: Sequence[Score]) -> tuple[list[Score], list[Score]]:
-    """Score candidates under the alternative.
+    """Score candidates, which :func:`screen` has scored, under the alternative; best first.
 
-    Args:
-        found: responses of the fitted numbers and of the candidates' probes.
-        scores: to first order, under the noise of the model without the candidates.
-
-    Returns:
-        All scores, best first, with gain and values under the alternative; a candidate that explains too little to be
-        scored gains nothing. And for each group of signals the candidate that explains it best if all other signals are
-        left out: where a response has a kink, as where motors reach the voltage of their supply, the first order may speak
-        against the right effect in the other signals, and only a refit can decide.
+    A candidate that explains too little gains nothing. Returned is also, for each group of signals, the candidate that explains
+    it best if all other signals are left out: where a response has a kink, as where motors reach the voltage of their supply,
+    the first order may speak against the right effect in the other signals, and only a refit can decide.
     """
     if not scores:
         return [], []
@@ -423,7 +417,7 @@ class _Alternative:
             residual + steps @ columns[:, :known] + change @ columns[:, used]
             for residual, columns in zip(system.residuals, system.columns, strict=True)
         ]
-        times, scatter = series_times(left), system.fit.noise.scatter
+        times, scatter = autocorrelation_times(left), system.fit.noise.scatter
         noise = Noise(self._mean_squares(x), scatter * times, system.rows, scatter)
         if system.is_whole:
             scatter = min(scatter, self._scatter(noise, x))
@@ -540,11 +534,11 @@ def one_per_label(scores: Sequence[Score]) -> list[Score]:
     return [score for score in scores if best[score.candidate.label] is score]
 
 
-def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Score]:
+def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN, alone: Sequence[Score] = ()) -> list[Score]:
     """Return the best scores, at most :data:`PER_NAME` of one effect, and only those above a share of the threshold.
 
     The improvement predicted to first order may be :data:`LEAST_WORTH` of the actual one. The best of :data:`MORE_NAMES`
-    further effects follow.
+    further effects follow, and the best of those that explain a group of signals well (``alone``, best first).
     """
     chosen: list[Score] = []
     more: dict[str, Score] = {}
@@ -557,14 +551,10 @@ def shortlist(scores: Sequence[Score], threshold: float = LEAST_GAIN) -> list[Sc
             chosen.append(score)
         elif not same:
             more.setdefault(name, score)
-    return [*chosen, *list(more.values())[:MORE_NAMES]]
-
-
-def with_proposals(chosen: Sequence[Score], alone: Sequence[Score]) -> list[Score]:
-    """Return the shortlist with the best of the candidates that explain a group of signals well; ``alone``: best first."""
+    chosen += list(more.values())[:MORE_NAMES]
     had = {score.candidate.label for score in chosen}
-    more = {score.candidate.label: score for score in reversed(alone) if score.gain > PROPOSED * least_gain(len(score.values))}
-    new = sorted((score for label, score in more.items() if label not in had), key=lambda score: -score.gain)
+    well = {score.candidate.label: score for score in reversed(alone) if score.gain > PROPOSED * least_gain(len(score.values))}
+    new = sorted((score for label, score in well.items() if label not in had), key=lambda score: -score.gain)
     return [*chosen, *new[:MOST_PROPOSED]]
 
 

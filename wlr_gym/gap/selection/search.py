@@ -61,7 +61,6 @@ from wlr_gym.gap.selection.screening import (
     responses,
     screen,
     shortlist,
-    with_proposals,
 )
 
 #: Share of :attr:`wlr_gym.gap.problem.Problem.misfit`, in units of sensor noise, above which an error is so much that effects
@@ -167,11 +166,8 @@ def _is_explained(model: FittedModel, candidate: Candidate) -> bool:
 def search_effects(start: Fit, tell: Tell = quiet, given: Columns | None = None, excluded: Container[str] = ()) -> SearchResult:
     """Search for missing effects; no other runs are used than those that are fitted.
 
-    Args:
-        start: the calibrated model.
-        tell: called with progress.
-        given: columns of ``start`` without its calibration, where they are known.
-        excluded: labels of candidates that are not tried.
+    ``start``: the calibrated model. ``given``: columns of it without its calibration, where they are known. ``excluded``:
+    labels of candidates that are not tried.
     """
     problem = start.problem
     if given is None and not problem.thorough:
@@ -191,7 +187,7 @@ def search_effects(start: Fit, tell: Tell = quiet, given: Columns | None = None,
         threshold = max(acceptance_threshold(current.cost, by_chance), BESIDE_FORMULA * max(gains, default=0.0))
         visible = {score.candidate.label for score in first.linear if score.is_visible(threshold)}
         scores = [replace(score, visible=score.candidate.label in visible) for score in first.scores]
-        chosen = scores if problem.thorough else with_proposals(shortlist(scores, threshold), first.alone)
+        chosen = scores if problem.thorough else shortlist(scores, threshold, first.alone)
         tell(f"refitting {len(chosen)} hypotheses")
         hypotheses = refit_thoroughly(current, chosen) if given is None else refit(current, chosen, given)
         bare = _without_more(current, hypotheses)

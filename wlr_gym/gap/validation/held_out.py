@@ -28,7 +28,7 @@ from wlr_gym.gap.estimation import (
     replay,
     two_sided_95,
 )
-from wlr_gym.gap.problem import Array, Problem, blocks
+from wlr_gym.gap.problem import Array, blocks
 from wlr_gym.gap.selection.hypothesis import Hypothesis
 from wlr_gym.gap.selection.screening import LEAST_GAIN
 from wlr_gym.gap.selection.search import SearchResult, without_each
@@ -46,14 +46,9 @@ LEAST_ROOM = 1e-9
 def confirmed(search: SearchResult, held_out: Sequence[int], again: Callable[[Container[str]], SearchResult]) -> SearchResult:
     """Return the search, none of whose effects runs refute that no fit has used.
 
-    Each effect is judged beside the others. Where one of several is refuted, ``again`` searches without it: a wrong effect
-    changes what others seem to gain. A single one, or what :data:`MOST_SEARCHES` more find, is left out: to try names until one
-    passes would wear the test out.
-
-    Args:
-        search: what has been found.
-        held_out: the runs.
-        again: the whole search without effects of these labels.
+    Each effect is judged beside the others. Where one of several is refuted, ``again`` searches without effects of these
+    labels: a wrong effect changes what others seem to gain. A single one, or what :data:`MOST_SEARCHES` more find, is left out:
+    to try names until one passes would wear the test out.
     """
     refuted: list[Hypothesis] = []
     while (worst := _refuted(search, held_out)) is not None:
@@ -109,10 +104,7 @@ def compare_models(
 ) -> tuple[GapFigures, tuple[RunGap, ...], tuple[ChannelGap, ...]]:
     """Compare three models on fitted and held-out runs.
 
-    Args:
-        models: as its file says; calibrated; with the effects.
-        fitted, heldout: runs.
-        floor: level that a perfect model reaches.
+    ``models``: as its file says; calibrated; with the effects. ``floor``: level that a perfect model reaches.
     """
     problem = models[0].problem
     found = replay(models, [*fitted, *heldout])
@@ -135,7 +127,7 @@ def compare_models(
     for k, run in enumerate((*fitted, *heldout)):
         closed = min(reduction(squares[1][k], squares[2][k], floor), 1.0)
         gaps.append(RunGap(problem.runs[run], k >= len(fitted), *(level(s[k]) for s in squares), reduction=closed))
-    worse = worse_channels(problem, heldout, *(one.residuals[outside] for one in found[1:]))
+    worse = worse_channels(*(replace(one, runs=heldout, residuals=one.residuals[outside]) for one in found[1:]))
     levels = np.sqrt([mean_of_runs(s[outside]) for s in squares])
     channels = tuple(
         ChannelGap(signal.name, signal.unit, signal.noise, *levels[:, c].tolist(), group=signal.group, worse=bool(worse[c]))
@@ -182,31 +174,27 @@ LEAST_RISE = 0.02
 CONFIDENCE = 0.99
 
 
-def worse_channels(
-    problem: Problem, runs: Sequence[int], calibrated: Sequence[Array], after: Sequence[Array]
-) -> NDArray[np.bool_]:
-    """Return which channels (signals) the effects make significantly worse in these runs.
+def worse_channels(calibrated: Replayed, after: Replayed) -> NDArray[np.bool_]:
+    """Return which channels (signals) the effects make significantly worse in the held-out runs.
 
     The mean square rises by more than :data:`LEAST_RISE`, and rises in :data:`CONFIDENCE` of the samples of blocks of 2 s,
     drawn with replacement: residuals within a block depend on each other.
-
-    Args:
-        problem: the system.
-        runs: whose residuals these are: the held-out ones.
-        calibrated, after: residuals (rows, signals) per run without and with the effects.
     """
-    before = np.concatenate([_block_squares(problem, r, e) for r, e in zip(runs, calibrated, strict=True)])
-    rise = np.concatenate([_block_squares(problem, r, e) for r, e in zip(runs, after, strict=True)]) - before
+    before = _block_squares(calibrated)
+    rise = _block_squares(after) - before
     picks = np.random.default_rng(0).integers(0, len(rise), (SAMPLES, len(rise)))
     counts = np.stack([np.bincount(pick, minlength=len(rise)) for pick in picks])
     certain = np.quantile(counts @ rise, 1.0 - CONFIDENCE, axis=0) > 0.0
     return certain & (rise.sum(axis=0) > LEAST_RISE * before.sum(axis=0))
 
 
-def _block_squares(problem: Problem, run: int, residual: Array) -> Array:
-    """Sums of squares (blocks, signals) of one run; what is beyond the problem's cap counts as that."""
-    squares = np.nan_to_num(np.minimum(residual**2, problem.cap**2))
-    return np.stack([squares[rows].sum(axis=0) for rows in blocks(problem.times(run))])
+def _block_squares(found: Replayed) -> Array:
+    """Sums of squares (blocks of all runs, signals); what is beyond the problem's cap counts as that."""
+    sums = []
+    for run, residual in zip(found.runs, found.residuals, strict=True):
+        squares = np.nan_to_num(np.minimum(residual**2, found.problem.cap**2))
+        sums += [squares[rows].sum(axis=0) for rows in blocks(found.problem.times(run))]
+    return np.stack(sums)
 
 
 # ---- runs that are replayed worst ------------------------------------------------------------------------------------

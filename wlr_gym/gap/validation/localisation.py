@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from wlr_gym.gap.analysis import HeatMap, Place, Trace
-from wlr_gym.gap.estimation import FittedModel, Noise
+from wlr_gym.gap.estimation import FittedModel, Noise, Replayed
 from wlr_gym.gap.problem import Array, Problem
 
 #: Bins of a feature, by its quantiles.
@@ -25,24 +25,19 @@ LEAST_DEPENDENCE = 0.05
 
 
 def localise(
-    problem: Problem,
-    calibrated: Sequence[Array],
-    expected: Array,
-    noise: Noise,
-    features: Sequence[Mapping[str, Array]],
+    calibrated: Replayed, expected: Array, noise: Noise, features: Sequence[Mapping[str, Array]]
 ) -> tuple[tuple[Place, ...], tuple[HeatMap, ...]]:
     """Return the channels that hold the gap, strongest first, and heat maps of the states it depends on.
 
     Args:
-        problem: the system.
-        calibrated: residuals of the calibrated model without effects, one (rows, signals) per run.
+        calibrated: the model without effects.
         expected: (signals) mean squares that a complete model has: of the final model, or 1; NaN where nothing was measured.
-        noise: of the residuals.
-        features: what residuals may depend on, rows of the same runs.
+        noise: of the final model's residuals.
+        features: what residuals may depend on, (rows,) per run.
     """
-    squares = np.sum([np.nansum(np.minimum(r * r, problem.cap**2), axis=0) for r in calibrated], axis=0) / np.maximum(
-        noise.rows, 1
-    )
+    problem, rows = calibrated.problem, np.concatenate(calibrated.residuals)
+    capped = [np.nansum(np.minimum(r * r, problem.cap**2), axis=0) for r in calibrated.residuals]
+    squares = np.sum(capped, axis=0) / np.maximum(noise.rows, 1)
     floor = np.where(np.isfinite(expected), np.maximum(expected, 1.0), 1.0)
     excess = np.maximum(squares / floor - 1.0, 0.0) * noise.rows / noise.autocorrelation_time
     total = float(excess.sum())
@@ -50,7 +45,6 @@ def localise(
         return (), ()
     order = [int(c) for c in np.argsort(-excess) if excess[c] > LEAST_SHARE * total][:MOST_PLACES]
     pooled = {name: np.concatenate([f[name] for f in features]) for name in (features[0] if features else {})}
-    rows = np.concatenate(list(calibrated))
     places, chosen = [], []
     for c in order:
         text, feature = _dependence(np.clip(rows[:, c], -problem.cap, problem.cap), pooled)
@@ -69,17 +63,13 @@ def _dependence(residual: Array, features: Mapping[str, Array]) -> tuple[str, st
         edges = _edges(values[seen])
         if not edges.size:
             continue
-        bins = np.searchsorted(edges, values[seen], side="right")
+        bins, labels = np.searchsorted(edges, values[seen], side="right"), _labels(edges)
         means = np.array([square[bins == b].mean() if (bins == b).any() else np.nan for b in range(len(edges) + 1)])
         share = float(np.var(means[bins]) / max(np.var(square), 1e-12))
         if share > best_share:
-            top, low = int(np.nanargmax(means)), int(np.nanargmin(means))
-            best, best_share = name, share
-            labels = _labels(edges)
-            text = (
-                f"largest for {name} {labels[top]} ({np.sqrt(means[top]):.1f} noise units), "
-                f"smallest {labels[low]} ({np.sqrt(means[low]):.1f})"
-            )
+            best, best_share, top, low = name, share, int(np.nanargmax(means)), int(np.nanargmin(means))
+            text = f"largest for {name} {labels[top]} ({np.sqrt(means[top]):.1f} noise units), "
+            text += f"smallest {labels[low]} ({np.sqrt(means[low]):.1f})"
     return text, best
 
 
@@ -121,10 +111,7 @@ USUAL = ("gyro_z", "cam_x", "eff_leg_lf", "vel_wheel_lf", "position")
 def informative_traces(models: Sequence[FittedModel], heldout: Sequence[int], places: Sequence[Place]) -> tuple[Trace, ...]:
     """Return measured and replayed traces of held-out runs, channels in the order of their share of the gap.
 
-    Args:
-        models: as its file says; calibrated; with the effects.
-        heldout: runs.
-        places: where the gap is.
+    ``models``: as its file says; calibrated; with the effects.
     """
     problem = models[0].problem
     names = [signal.name for signal in problem.signals]

@@ -23,8 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlr_gym.gap.analysis import Adequacy, Pulled, Statistic, Turning
-from wlr_gym.gap.estimation import Fit, Noise, by_channel, estimate_noise, run_scatter
-from wlr_gym.gap.problem import Array, Problem
+from wlr_gym.gap.estimation import Fit, Noise, Replayed, estimate_noise, run_scatter
+from wlr_gym.gap.problem import Array
+from wlr_gym.gap.selection.screening import Products
 
 #: Sets of runs that the model makes: the least of which the largest is a limit of 5 %.
 REPLICATES = 19
@@ -51,8 +52,8 @@ class _Columns:
     """The columns of a fit and their products, channel by channel: what a set of runs pulls costs next to nothing with them."""
 
     def __init__(self, found: Fit) -> None:
-        self._by_channel = [by_channel(column, len(found.problem.signals)) for column in found.columns]
-        self._products = np.stack([c @ c.transpose(0, 2, 1) for c in self._by_channel])  # (runs, channels, numbers, numbers)
+        products = Products(found, found.columns)
+        self._by_channel, self._products = products.columns, products.by_run
         self._free = ~found.model.on_bounds
         self._tight = found.model.tightness
         self._found = found
@@ -155,18 +156,15 @@ LEAST_CONFIDENCE = 0.9
 LEAST_SHARE = 0.1
 
 
-def turning(problem: Problem, residuals: Sequence[Array], features: Sequence[Mapping[str, Array]]) -> Turning | None:
+def turning(left: Replayed, features: Sequence[Mapping[str, Array]]) -> Turning | None:
     """Return the signal whose residual is most periodic in its joint's angle, or None.
 
-    Args:
-        problem: the system.
-        residuals: of the final model, one (rows, signals) per run.
-        features: simulated angles among them, one mapping of (rows,) per run.
+    ``left``: the final model; ``features``: simulated angles (rows,) among them, per run.
     """
-    names = [signal.name for signal in problem.signals]
+    names = [signal.name for signal in left.problem.signals]
     found = [
-        _best_order(joint, signal, [r[:, names.index(signal)] for r in residuals], [f[angle] for f in features])
-        for joint, (angle, signals) in problem.turning.items()
+        _best_order(joint, signal, [r[:, names.index(signal)] for r in left.residuals], [f[angle] for f in features])
+        for joint, (angle, signals) in left.problem.turning.items()
         for signal in signals
         if signal in names
     ]
