@@ -37,7 +37,7 @@ from wlr_gym.gap.robot.replay import PHYSICS_STEP
 from wlr_gym.gap.robot.windows import RunClock
 from wlr_gym.gap.selection.hypothesis import within_tolerance
 from wlr_gym.gap.validation.held_out import noise_floor
-from wlr_gym.gap.workflow import found_effect
+from wlr_gym.gap.workflow import analyse, found_effect
 from wlr_gym.physics.effects import (
     EFFECTS,
     UNKNOWN_EFFECT,
@@ -60,37 +60,25 @@ RESISTANCE = {"name": "rolling_resistance", "where": list(WHEELS), "parameters":
 # ---- quantities ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "sigma", "unit"),
-    [
-        ("body.mass", 0.03 * 1.0, None),
-        ("wheel.radius[wheel_rr]", 0.005, None),
-        ("servo.kp[leg_lf]", 0.05, None),
-        ("servo.stall_torque[wheel_lr]", 0.05, None),
-    ],
-)
-def test_relative_tolerances(name, sigma, unit):
-    quantity = KNOBS[name].quantity
-    nominal = float(NOMINAL[KNOBS[name].elements[0]][0])
+#: One sigma, relative or in SI units.
+RELATIVE = {"body.mass": 0.03, "wheel.radius[wheel_rr]": 0.005, "servo.kp[leg_lf]": 0.05, "servo.stall_torque[wheel_lr]": 0.05}
+ABSOLUTE = {
+    "servo.viscous_friction[leg_rf]": 0.01,
+    "servo.viscous_friction[wheel_rf]": 0.002,
+    "joint.zero_offset[leg_lr]": math.radians(0.5),
+    "camera.mount_yaw": math.radians(0.5),
+    "ground.slope[pitch]": math.radians(0.2),
+    "body.com_offset[z]": 0.003,
+    "camera.delay": 0.010,
+    "command.delay": 0.005,
+}
+
+
+@pytest.mark.parametrize("name", [*RELATIVE, *ABSOLUTE])
+def test_tolerances_are_those_of_the_file(name):
+    quantity, nominal = KNOBS[name].quantity, float(NOMINAL[KNOBS[name].elements[0]][0])
     assert quantity.nominal == nominal
-    assert quantity.sigma == pytest.approx(sigma * abs(nominal))
-
-
-@pytest.mark.parametrize(
-    ("name", "sigma"),
-    [
-        ("servo.viscous_friction[leg_rf]", 0.01),
-        ("servo.viscous_friction[wheel_rf]", 0.002),
-        ("joint.zero_offset[leg_lr]", math.radians(0.5)),
-        ("camera.mount_yaw", math.radians(0.5)),
-        ("ground.slope[pitch]", math.radians(0.2)),
-        ("body.com_offset[z]", 0.003),
-        ("camera.delay", 0.010),
-        ("command.delay", 0.005),
-    ],
-)
-def test_absolute_tolerances_with_units(name, sigma):
-    assert KNOBS[name].quantity.sigma == pytest.approx(sigma)
+    assert quantity.sigma == pytest.approx(ABSOLUTE[name] if name in ABSOLUTE else RELATIVE[name] * abs(nominal))
 
 
 def test_floor_and_latency_are_one_number_for_all():
@@ -129,7 +117,6 @@ def test_every_tolerance_of_the_file_is_used():
 
 
 def test_ranges_are_a_few_tolerances_within_what_the_simulator_accepts():
-
     for knob in KNOBS.values():
         quantity, spec = knob.quantity, SPECS[knob.elements[0].partition("[")[0]]
         assert spec.low <= quantity.low <= quantity.nominal <= quantity.high <= spec.high
@@ -387,20 +374,15 @@ def test_an_effect_registered_in_one_place_is_all_that_it_takes(monkeypatch, cap
 # ---- formulas --------------------------------------------------------------------------------------------------------
 
 
+def formulas_with_waves():
+    return formula_candidates([np.linspace(0.0, 10.0, 500)], [np.ones((500, len(CHANNELS)))])
+
+
 def test_formulas_parse_and_vanish_with_their_constants():
-    times = np.linspace(0.0, 10.0, 500)
-    probes, candidates = formula_candidates([times], [np.ones((len(times), len(CHANNELS)))])
+    probes, candidates = formulas_with_waves()
     assert {candidate.name for candidate in candidates} == {UNKNOWN_EFFECT}
-    state = {
-        "angle": 0.7,
-        "rate": -1.3,
-        "wind_up": 0.4,
-        "time": 3.7,
-        "abs": abs,
-        "cos": math.cos,
-        "sin": math.sin,
-        "tanh": math.tanh,
-    }
+    state = {"angle": 0.7, "rate": -1.3, "wind_up": 0.4, "time": 3.7}
+    state |= {"abs": abs, "cos": math.cos, "sin": math.sin, "tanh": math.tanh}
     state |= {f"{kind}_torque{which}": 0.4 for kind in ("leg", "wheel") for which in ("", "_opposite")}
     state |= {f"wheel_angle_{side}": 0.3 for side in ("lf", "rf", "lr", "rr")}
     state |= {"velocity_x": 0.4, "velocity_y": -0.1, "yaw_rate": 0.8}
@@ -421,8 +403,7 @@ def test_formulas_parse_and_vanish_with_their_constants():
 
 
 def test_every_formula_that_is_found_can_be_written_and_loaded(tmp_path):
-    times = np.linspace(0.0, 10.0, 500)
-    for k, candidate in enumerate(formula_candidates([times], [np.ones((len(times), len(CHANNELS)))])[1]):
+    for k, candidate in enumerate(formulas_with_waves()[1]):
         values = candidate.effect([0.1] * len(candidate.unknowns)).parameters
         fitted = {u.name: ParameterEstimate(values[u.name], 0.0, 0.2, u.unit) for u in candidate.unknowns}
         done = replace(EFFECT_FOUND, effects=(found_effect(candidate, fitted, 1.0, 50.0),))
@@ -492,6 +473,9 @@ def test_short_run_is_left_out(tmp_path, good):
     assert kinds(findings) == {("run_02", "short")}
 
 
+TURN = 2 * np.pi
+
+
 def mirrored(joint):
     def turn(table):
         angle = table[f"pos_{joint}"]
@@ -508,12 +492,7 @@ def mirrored(joint):
         ("mirrored", "pos_wheel_rf", mirrored("wheel_rf"), "check the sign"),
         ("mirrored", "eff_leg_rr", lambda table: table.assign(eff_leg_rr=-table["eff_leg_rr"]), "turn the sign"),
         ("mirrored", "acc_z", lambda table: table.assign(acc_z=-table["acc_z"]), "check its mounting"),
-        (
-            "wrap",
-            "pos_wheel_rf",
-            lambda table: table.assign(pos_wheel_rf=(table["pos_wheel_rf"] + 3.0) % (2 * np.pi)),
-            "numpy.unwrap",
-        ),
+        ("wrap", "pos_wheel_rf", lambda table: table.assign(pos_wheel_rf=(table["pos_wheel_rf"] + 3.0) % TURN), "numpy.unwrap"),
         ("missing", "cmd", lambda table: table.assign(**dict.fromkeys(COMMANDS, np.nan)), "nothing to replay"),
     ],
 )
@@ -731,9 +710,6 @@ def test_features_are_rows_of_the_run(good):
 
 @pytest.mark.slow
 def test_rolling_resistance_is_found_in_four_runs(tmp_path):
-    from wlr_gym.data.excitations import excite
-    from wlr_gym.gap.workflow import analyse
-
     for k, kind in enumerate(("straight", "turns", "stop_and_go", "s_curve")):
         motion = excite(kind, k, seconds=6.0)
         meta = META.model_copy(update={"profile": motion.profile})

@@ -62,6 +62,13 @@ def hypothesis(one, base, gain=1.0, predicted=1.0):
     return Hypothesis(one.model, RUNS, one.residuals, base, gain, np.ones(5), predicted)
 
 
+def beside_drag(problem):
+    """The model without an effect and with drag on the right, both fitted."""
+    bare = fit(nominal_model(problem), RUNS)
+    whole = fit(bare.model.with_effect(candidate(problem, "drag", ["right"]), (0.5,)), RUNS)
+    return bare, whole
+
+
 def labels(found):
     return [found.label for found, _ in found.fit.model.effects]
 
@@ -370,9 +377,7 @@ def test_converging_effect_searches_a_grid_of_places(monkeypatch):
 @pytest.mark.parametrize(("converged", "fits"), [(True, 1), (False, 2)])
 def test_what_has_converged_is_not_fitted_from_there_again(monkeypatch, converged, fits):
     problem = Toy({}, [sized("drag", 0.8, "right")], rows=400)
-    own = candidate(problem, "drag", ["right"])
-    base = fit(nominal_model(problem), RUNS)
-    whole = fit(nominal_model(problem).with_effect(own, (0.5,)), RUNS)
+    base, whole = beside_drag(problem)
     found = hypothesis(whole, base)
     starts = []
     monkeypatch.setattr(finalists, "fit", lambda *args, **options: starts.append(options["steps"]) or fit(*args, **options))
@@ -458,9 +463,7 @@ def test_effect_of_one_run_fails_cross_validation(seen_in, passes):
     problem = Toy(rows=400)
     for run in seen_in:
         problem._measured[run] = problem._measured[run] + 1.5 * problem.shape("drag right")[run] * NOISE
-    own = candidate(problem, "drag", ["right"])
-    bare = fit(nominal_model(problem), RUNS)
-    whole = fit(bare.model.with_effect(own, (0.5,)), RUNS)
+    bare, whole = beside_drag(problem)
     autocorrelation_time = whole.noise.autocorrelation_time
     gain = bare.cost_under(autocorrelation_time) - whole.cost
     assert gain > LEAST_GAIN
@@ -490,9 +493,7 @@ def test_what_tolerances_nearly_do_is_no_effect(monkeypatch, quantities, falls_s
 def test_one_run_may_hold_most_of_what_an_effect_explains(monkeypatch):
     """Each run alone shows the effect: a share of what the fit improves by is not asked then."""
     problem = Toy({}, [sized("drag", 1.0, "right")], rows=400)
-    own = candidate(problem, "drag", ["right"])
-    bare = fit(nominal_model(problem), RUNS)
-    whole = fit(bare.model.with_effect(own, (0.5,)), RUNS)
+    bare, whole = beside_drag(problem)
     tau = whole.noise.autocorrelation_time
     monkeypatch.setattr(finalists, "LEAST_VALIDATED", 1e3)  # no share is enough
     assert cross_validated(bare, whole, tau)
@@ -554,9 +555,7 @@ def test_of_nearly_equal_effects_that_with_fewer_unknowns_is_accepted(monkeypatc
 def test_one_run_of_five_may_be_thrown_off(monkeypatch, thrown_off, passes):
     """A rough cost, as of play: next to the fit, one run is far from the data."""
     problem = Toy({}, [sized("drag", 1.0, "right")], rows=400)
-    own = candidate(problem, "drag", ["right"])
-    bare = fit(nominal_model(problem), RUNS)
-    whole = fit(bare.model.with_effect(own, (0.5,)), RUNS)
+    bare, whole = beside_drag(problem)
     true = problem.residuals
 
     def rough(settings, runs):

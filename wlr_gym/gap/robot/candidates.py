@@ -16,6 +16,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -300,18 +301,7 @@ def wave_order(joint: str, measured: Sequence[Array], residuals: Sequence[Array]
 # ---- formulas --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Term:
-    """One constant of a formula: its name, unit, the size it is probed with, and its plausible range (either sign)."""
-
-    name: str
-    unit: str
-    probe: float
-    bound: float
-
-
-@dataclass(frozen=True)
-class Law:
+class Law(NamedTuple):
     """A formula and where it may act.
 
     Attributes:
@@ -321,9 +311,14 @@ class Law:
     """
 
     formula: str
-    terms: tuple[Term, ...]
+    terms: tuple[Unknown, ...]
     where: tuple[str, ...]
     fixed: tuple[tuple[str, str, float], ...] = ()
+
+
+def term(name: str, unit: str, probe: float, bound: float) -> Unknown:
+    """One constant of a formula, the size it is probed with, and its plausible range (either sign)."""
+    return Unknown(name, unit, 0.0, -bound, bound, 0.5 * probe)
 
 
 def _other(name: str) -> str:
@@ -342,18 +337,18 @@ def _driven(torque: str, places: tuple[str, ...], bound: float, slope: float) ->
     An explicit force must be soft: bound x torque x slope x step / inertia below 2. Wheels have 3e-4 kg m2 and up to 0.1 N m,
     their legs up to 1.3.
     """
-    return Law(f"-r * abs({torque}) * tanh(s * rate)", (Term("r", "-", 0.1 * bound, bound),), places, (("s", "s/rad", slope),))
+    return Law(f"-r * abs({torque}) * tanh(s * rate)", (term("r", "-", 0.1 * bound, bound),), places, (("s", "s/rad", slope),))
 
 
 _LAWS: tuple[Law, ...] = (
-    *(Law("c - k * angle", (Term("c", "N m", 0.1, 3.0), Term("k", "N m/rad", 0.2, 5.0)), (leg,)) for leg in LEGS),
-    *(Law("c - f * wind_up", (Term("c", "N m", 0.1, 3.0), Term("f", "N m", 0.1, 2.0)), (leg,)) for leg in LEGS),
-    *(Law("a * cos(angle) + b * sin(angle)", (Term("a", "N m", 0.1, 3.0), Term("b", "N m", 0.1, 3.0)), (leg,)) for leg in LEGS),
-    *(Law("-d * rate * abs(rate)", (Term("d", "N m s2/rad2", 0.1, 3.0),), (leg,)) for leg in LEGS),
-    *(Law("c", (Term("c", "N m", 0.02, 0.5),), (wheel,)) for wheel in WHEELS),
-    *(Law("-d * rate * abs(rate)", (Term("d", "N m s2/rad2", 0.002, 0.1),), (wheel,)) for wheel in WHEELS),
-    *(Law(f"-k * leg_rate_{_other(leg)[4:]}", (Term("k", "N m s/rad", 0.05, 3.0),), (leg,)) for leg in LEGS),
-    *(Law(f"-k * wheel_rate_{_other(wheel)[6:]}", (Term("k", "N m s/rad", 0.004, 0.2),), (wheel,)) for wheel in WHEELS),
+    *(Law("c - k * angle", (term("c", "N m", 0.1, 3.0), term("k", "N m/rad", 0.2, 5.0)), (leg,)) for leg in LEGS),
+    *(Law("c - f * wind_up", (term("c", "N m", 0.1, 3.0), term("f", "N m", 0.1, 2.0)), (leg,)) for leg in LEGS),
+    *(Law("a * cos(angle) + b * sin(angle)", (term("a", "N m", 0.1, 3.0), term("b", "N m", 0.1, 3.0)), (leg,)) for leg in LEGS),
+    *(Law("-d * rate * abs(rate)", (term("d", "N m s2/rad2", 0.1, 3.0),), (leg,)) for leg in LEGS),
+    *(Law("c", (term("c", "N m", 0.02, 0.5),), (wheel,)) for wheel in WHEELS),
+    *(Law("-d * rate * abs(rate)", (term("d", "N m s2/rad2", 0.002, 0.1),), (wheel,)) for wheel in WHEELS),
+    *(Law(f"-k * leg_rate_{_other(leg)[4:]}", (term("k", "N m s/rad", 0.05, 3.0),), (leg,)) for leg in LEGS),
+    *(Law(f"-k * wheel_rate_{_other(wheel)[6:]}", (term("k", "N m s/rad", 0.004, 0.2),), (wheel,)) for wheel in WHEELS),
     *(_driven("leg_torque_opposite", places, 1.0, 20.0) for places in _coupled(LEGS)),
     *(_driven("wheel_torque_opposite", places, 0.8, 6.0) for places in _coupled(WHEELS)),
     *(_driven("wheel_torque", (leg,), 1.0, 20.0) for leg in LEGS),
@@ -361,28 +356,28 @@ _LAWS: tuple[Law, ...] = (
     *(
         Law(
             f"a * sin(wheel_angle_{corner}) + b * cos(wheel_angle_{corner})",
-            (Term("a", "N m", 0.3, 20.0), Term("b", "N m", 0.3, 20.0)),
+            (term("a", "N m", 0.3, 20.0), term("b", "N m", 0.3, 20.0)),
             (f"body_torque_{axis}",),
         )
         for corner in CORNERS
         for axis in ("roll", "pitch")
     ),
-    Law("-d * velocity_x", (Term("d", "N s/m", 2.0, 50.0),), ("body_force_x",)),
-    Law("-d * velocity_x * abs(velocity_x)", (Term("d", "N s2/m2", 10.0, 200.0),), ("body_force_x",)),
-    Law("-d * yaw_rate", (Term("d", "N s/rad", 0.5, 20.0),), ("body_force_x",)),
-    Law("-d * velocity_y", (Term("d", "N s/m", 4.0, 100.0),), ("body_force_y",)),
-    Law("-d * velocity_x", (Term("d", "N s/m", 2.0, 50.0),), ("body_force_y",)),
-    Law("-d * yaw_rate", (Term("d", "N s/rad", 0.5, 20.0),), ("body_force_y",)),
-    Law("-d * yaw_rate", (Term("d", "N m s/rad", 0.2, 5.0),), ("body_torque_yaw",)),
-    Law("-d * yaw_rate * abs(yaw_rate)", (Term("d", "N m s2/rad2", 0.4, 10.0),), ("body_torque_yaw",)),
-    Law("-d * velocity_x", (Term("d", "N s", 0.4, 10.0),), ("body_torque_yaw",)),
-    Law("-d * velocity_y", (Term("d", "N s", 0.8, 20.0),), ("body_torque_yaw",)),
+    Law("-d * velocity_x", (term("d", "N s/m", 2.0, 50.0),), ("body_force_x",)),
+    Law("-d * velocity_x * abs(velocity_x)", (term("d", "N s2/m2", 10.0, 200.0),), ("body_force_x",)),
+    Law("-d * yaw_rate", (term("d", "N s/rad", 0.5, 20.0),), ("body_force_x",)),
+    Law("-d * velocity_y", (term("d", "N s/m", 4.0, 100.0),), ("body_force_y",)),
+    Law("-d * velocity_x", (term("d", "N s/m", 2.0, 50.0),), ("body_force_y",)),
+    Law("-d * yaw_rate", (term("d", "N s/rad", 0.5, 20.0),), ("body_force_y",)),
+    Law("-d * yaw_rate", (term("d", "N m s/rad", 0.2, 5.0),), ("body_torque_yaw",)),
+    Law("-d * yaw_rate * abs(yaw_rate)", (term("d", "N m s2/rad2", 0.4, 10.0),), ("body_torque_yaw",)),
+    Law("-d * velocity_x", (term("d", "N s", 0.4, 10.0),), ("body_torque_yaw",)),
+    Law("-d * velocity_y", (term("d", "N s", 0.8, 20.0),), ("body_torque_yaw",)),
 )
 
 
 def _wave(place: str, unit: str, size: float, bound: float) -> Law:
     """A push or twist that comes and goes with time."""
-    return Law("a * sin(w * time) + b * cos(w * time)", (Term("a", unit, size, bound), Term("b", unit, size, bound)), (place,))
+    return Law("a * sin(w * time) + b * cos(w * time)", (term("a", unit, size, bound), term("b", unit, size, bound)), (place,))
 
 
 _WAVES = (
@@ -419,22 +414,22 @@ def formula_candidates(times: Sequence[Array] = (), residuals: Sequence[Array] =
 
 def _offered(law: Law, shape: tuple[Unknown, ...] = ()) -> tuple[list[Probe], Candidate]:
     """A law's probes and candidate; ``shape``: unknowns in which it is not linear, probed where they begin."""
-    units = {term.name: term.unit for term in law.terms} | {name: unit for name, unit, _ in law.fixed}
-    units |= {unknown.name: unknown.unit for unknown in shape}
+    unknowns = (*law.terms, *shape)
+    units = {one.name: one.unit for one in unknowns} | {name: unit for name, unit, _ in law.fixed}
     fixed = {name: value for name, _, value in law.fixed}
-    begin = {unknown.name: unknown.neutral for unknown in shape}
+    neutral = {one.name: one.neutral for one in unknowns}
+    sizes = {one.name: 2.0 * one.step for one in law.terms}  # of the probes
     probes = []
-    for term in law.terms:
-        values = {other.name: term.probe * (other is term) for other in law.terms}
-        effect = PatchEffect(UNKNOWN_EFFECT, law.where, values | fixed | begin, law.formula, units)
-        probes.append(Probe(" ".join([UNKNOWN_EFFECT, *law.where, law.formula, term.name]), (effect,)))
-    sizes = tuple(Unknown(t.name, t.unit, 0.0, -t.bound, t.bound, 0.5 * t.probe) for t in law.terms)
+    for name, size in sizes.items():
+        effect = PatchEffect(UNKNOWN_EFFECT, law.where, neutral | fixed | {name: size}, law.formula, units)
+        probes.append(Probe(" ".join([UNKNOWN_EFFECT, *law.where, law.formula, name]), (effect,)))
 
     def values(amplitude: Array) -> tuple[float, ...]:
-        return (*(float(term.probe * a) for term, a in zip(law.terms, amplitude, strict=True)), *begin.values())
+        found = [float(size * a) for size, a in zip(sizes.values(), amplitude, strict=True)]
+        return (*found, *(one.neutral for one in shape))
 
     start = Start(tuple((probe.key,) for probe in probes), values)
-    return probes, Candidate(UNKNOWN_EFFECT, law.where, (*sizes, *shape), (start,), law.formula, units, fixed)
+    return probes, Candidate(UNKNOWN_EFFECT, law.where, unknowns, (start,), law.formula, units, fixed)
 
 
 @cache

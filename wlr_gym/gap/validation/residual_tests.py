@@ -18,12 +18,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from wlr_gym.gap.analysis import Adequacy, Pulled, Statistic, Turning
-from wlr_gym.gap.estimation import Fit, Noise, Replayed, estimate_noise, run_scatter
+from wlr_gym.gap.estimation import Fit, Replayed, estimate_noise, run_scatter
 from wlr_gym.gap.problem import Array
 from wlr_gym.gap.selection.screening import Products
 
@@ -31,21 +30,6 @@ from wlr_gym.gap.selection.screening import Products
 REPLICATES = 19
 #: Curvature of the likelihood, scaled numbers, above which the data are informative about a number.
 INFORMATIVE = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Left:
-    """What a model leaves in one set of runs.
-
-    Attributes:
-        noise: of the residuals, without scatter; NaN in channels that were not measured.
-        scatter: of the runs' estimates of the numbers over what their rows predict; NaN = the data are informative about none.
-        pulls: (runs, numbers) by how many standard errors each run pulls each number away from the others.
-    """
-
-    noise: Noise
-    scatter: float
-    pulls: Array
 
 
 class _Columns:
@@ -64,16 +48,21 @@ class _Columns:
         step = -np.linalg.solve(self._found.hessian, pull).astype(np.float32)
         return [residual + (step @ column).T for residual, column in zip(residuals, self._by_channel, strict=True)]
 
-    def left(self, residuals: Sequence[Array]) -> _Left:
-        """Take the statistics of residuals (rows, channels), one array per run."""
+    def left(self, residuals: Sequence[Array]) -> tuple[Array, Array, float, Array]:
+        """Return statistics of residuals (rows, channels), one array per run; NaN in channels that were not measured.
+
+        Level (channels), autocorrelation time (channels), scatter of the runs' estimates of the numbers over what their rows
+        predict (NaN = the data are informative about none), and by how many standard errors each run pulls each number away
+        from the others (runs, numbers).
+        """
         noise = estimate_noise(residuals)
         matrices = np.einsum("c,rcmn->rmn", noise.weight, self._products)[:, self._free][:, :, self._free]
         vectors = np.einsum("c,rcn->rn", noise.weight, self._vectors(residuals))[:, self._free]
         scatter = run_scatter(matrices, vectors)
         pulls = np.zeros((len(residuals), len(self._free)))
         pulls[:, self._free] = _pulls(matrices, vectors, self._tight[self._free])
-        times, squares = (np.where(noise.rows > 0, v, np.nan) for v in (noise.autocorrelation_time, noise.square))
-        return _Left(Noise(squares, times, noise.rows), math.nan if scatter is None else scatter, pulls)
+        level, time = (np.where(noise.rows > 0, v, np.nan) for v in (np.sqrt(noise.square), noise.autocorrelation_time))
+        return level, time, math.nan if scatter is None else scatter, pulls
 
     def _vectors(self, residuals: Sequence[Array]) -> Array:
         """Products (runs, channels, numbers) of columns and residuals."""
@@ -97,26 +86,24 @@ def adequacy_of(found: Fit) -> Adequacy | None:
     """
     problem, columns = found.problem, _Columns(found)
     made = problem.remade(found.model.setting, found.runs, REPLICATES)
-    seen = columns.left(found.residuals)
-    every = [seen, *(columns.left(columns.refitted(residuals)) for residuals in made)]
+    every = [columns.left(found.residuals), *(columns.left(columns.refitted(residuals)) for residuals in made)]
     if len(every) == 1:
         return None
-    levels = np.sqrt([one.noise.square for one in every])
-    times = np.stack([one.noise.autocorrelation_time for one in every])
-    run, which = np.unravel_index(int(np.argmax(seen.pulls)), seen.pulls.shape)
+    levels, times, scatters, pulls = (np.stack(values) for values in zip(*every, strict=True))
+    run, which = np.unravel_index(int(np.argmax(pulls[0])), pulls[0].shape)
     names = [quantity.name for quantity in problem.quantities]
     names += [f"{candidate.label} {one.name}" for candidate, _ in found.model.effects for one in candidate.unknowns]
-    pulled = compared(np.array([one.pulls.max() for one in every]))
+    pulled = compared(pulls.max(axis=(1, 2)))
     return Adequacy(
         REPLICATES,
         compared(np.sqrt(np.nanmean(levels**2, axis=1))),
         compared(np.exp(np.nanmean(np.log(times), axis=1))),
-        compared(np.array([one.scatter for one in every])),
+        compared(scatters),
         Pulled(names[int(which)], problem.runs[found.runs[int(run)]], pulled),
         {
             signal.name: (compared(levels[:, c]), compared(times[:, c]))
             for c, signal in enumerate(problem.signals)
-            if seen.noise.rows[c] > 0
+            if np.isfinite(levels[0, c])
         },
     )
 
