@@ -35,7 +35,7 @@ from wlr_gym.gap.robot.candidates import (
 from wlr_gym.gap.robot.problem import LEAST_RUNS, LOST, WORTH_APART, RobotProblem, open_robot
 from wlr_gym.gap.robot.replay import PHYSICS_STEP
 from wlr_gym.gap.robot.windows import RunClock
-from wlr_gym.gap.selection.hypothesis import within_tolerance
+from wlr_gym.gap.selection.hypotheses import within_tolerance
 from wlr_gym.gap.validation.held_out import noise_floor
 from wlr_gym.gap.workflow import analyse, found_effect
 from wlr_gym.physics.effects import (

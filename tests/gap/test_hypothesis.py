@@ -8,7 +8,7 @@ from toy_problem import Toy, candidate, sized
 
 from wlr_gym.gap.estimation import Replayed, fit, nominal_model
 from wlr_gym.gap.problem import Start
-from wlr_gym.gap.selection.hypothesis import Hypothesis, credible_names, occam, probabilities
+from wlr_gym.gap.selection.hypotheses import Hypothesis, credible_names, occam, probabilities
 from wlr_gym.gap.selection.screening import Score
 from wlr_gym.gap.selection.search import search_effects
 

@@ -24,8 +24,7 @@ from wlr_gym.gap.selection.finalists import (
     without_each_run,
     worth_a_fit,
 )
-from wlr_gym.gap.selection.hypothesis import EQUIVALENT, INSISTENT, Hypothesis, equivalents
-from wlr_gym.gap.selection.refit import refit
+from wlr_gym.gap.selection.hypotheses import EQUIVALENT, INSISTENT, Hypothesis, equivalents, refit
 from wlr_gym.gap.selection.screening import (
     LEAST_GAIN,
     MORE_NAMES,

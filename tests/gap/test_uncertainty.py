@@ -18,7 +18,7 @@ from wlr_gym.gap.estimation import (
     widened,
 )
 from wlr_gym.gap.problem import Candidate, Start, Tolerance, Unknown
-from wlr_gym.gap.selection.hypothesis import Hypothesis, selection_frequency
+from wlr_gym.gap.selection.hypotheses import Hypothesis, selection_frequency
 from wlr_gym.gap.selection.screening import LEAST_GAIN, Score, detectable, least_gain, responses, screen
 from wlr_gym.gap.selection.search import search_effects
 

@@ -347,7 +347,7 @@ class Threshold:
     """By how much an effect with one unknown had to improve the fit in a round of the search, and what chance alone gives.
 
     ``by_chance``: 98 % of draws of chance have no larger improvement (:mod:`wlr_gym.gap.selection.screening`); NaN = not drawn.
-    ``none``: probability that none of the refitted candidates is missing (:mod:`wlr_gym.gap.selection.hypothesis`).
+    ``none``: probability that none of the refitted candidates is missing (:mod:`wlr_gym.gap.selection.hypotheses`).
     """
 
     round: int

@@ -45,7 +45,7 @@ from wlr_gym.gap.estimation import (
 )
 from wlr_gym.gap.problem import Candidate, Problem
 from wlr_gym.gap.report.recommendation import recommend, relations, separating_run
-from wlr_gym.gap.selection.hypothesis import INSISTENT, equivalents, selection_frequency
+from wlr_gym.gap.selection.hypotheses import INSISTENT, equivalents, selection_frequency
 from wlr_gym.gap.selection.screening import Score, chance, detectable
 from wlr_gym.gap.selection.search import SearchResult, evidence_of, refuted_evidence, search_effects
 from wlr_gym.gap.validation.data_split import informative_split, named_split

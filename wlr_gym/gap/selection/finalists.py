@@ -27,7 +27,7 @@ from wlr_gym.gap.estimation import (
     replay,
 )
 from wlr_gym.gap.problem import Array, Candidate
-from wlr_gym.gap.selection.hypothesis import Hypothesis, fall_by_run, within_tolerance
+from wlr_gym.gap.selection.hypotheses import Hypothesis, fall_by_run, within_tolerance
 from wlr_gym.gap.selection.screening import LEAST_GAIN, asked_of, least_gain
 
 #: The best of every name that improves the fit by at least this share of what the best does is fitted in full.

@@ -46,8 +46,7 @@ from wlr_gym.gap.selection.finalists import (
     shown_by_some_runs_only,
     worth_a_fit,
 )
-from wlr_gym.gap.selection.hypothesis import Hypothesis, credible_names, equivalents, probabilities
-from wlr_gym.gap.selection.refit import refit, refit_thoroughly
+from wlr_gym.gap.selection.hypotheses import Hypothesis, credible_names, equivalents, probabilities, refit, refit_thoroughly
 from wlr_gym.gap.selection.screening import (
     LEAST_GAIN,
     Responses,

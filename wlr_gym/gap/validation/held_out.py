@@ -29,7 +29,7 @@ from wlr_gym.gap.estimation import (
     two_sided_95,
 )
 from wlr_gym.gap.problem import Array, blocks
-from wlr_gym.gap.selection.hypothesis import Hypothesis
+from wlr_gym.gap.selection.hypotheses import Hypothesis
 from wlr_gym.gap.selection.screening import LEAST_GAIN
 from wlr_gym.gap.selection.search import SearchResult, without_each
 
