@@ -275,8 +275,8 @@ class _Session:
         changed = max(one.stat().st_mtime_ns for one in (*files, self.data / META_FILE) if one.exists())
         is_current = path.is_file() and path.stat().st_mtime_ns >= changed
         if last is None or last.runs != runs or not is_current:
-            asked = {"known": self.known, "robot": self.robot, "backend": self.backend, "threads": self.threads}
-            analyse(self.data, folder, **asked, tell=self.tell)
+            known, robot, backend = self.known, self.robot, self.backend
+            analyse(self.data, folder, known=known, robot=robot, backend=backend, threads=self.threads, tell=self.tell)
         result = read_result(path)
         left = explanations(result)
         now = now.model_copy(update={"verdict": result.verdict, "names": {one.name: one.probability for one in left}})

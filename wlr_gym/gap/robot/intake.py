@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple, TypeAlias
 
@@ -33,21 +32,11 @@ class Sound(Enum):
     UNDECIDED = "the run does not excite the channel enough to tell"
 
 
-@dataclass(frozen=True)
-class ChannelFault:
-    """What is wrong with one channel of one run.
-
-    Attributes:
-        row: first row that shows it; None = the whole run.
-        text: what was seen.
-        expected: what would be right.
-        remedy: what to do.
-    """
+class ChannelFault(NamedTuple):
+    """What is wrong with one channel of one run: the first row that shows it, None = the whole run, and what was seen."""
 
     row: int | None
     text: str
-    expected: str
-    remedy: str
 
 
 Outcome = ChannelFault | Sound
@@ -63,11 +52,14 @@ class IntakeCheck(NamedTuple):
         kind: of the findings.
         channels: that are looked at, one by one; of :data:`WHOLE` the run as a whole.
         look: (run, channel, robot) -> fault, or sound. It gets channels that the run has, with finite values.
+        expected, remedy: what would be right, and what to do.
     """
 
     kind: str
     channels: tuple[str, ...]
     look: Callable[[Run, str, Robot], Outcome]
+    expected: str
+    remedy: str
 
 
 _Outcomes: TypeAlias = dict[tuple[IntakeCheck, str], Outcome]
@@ -90,20 +82,18 @@ def findings_of(runs: Sequence[Run], checks: Sequence[IntakeCheck], robot: Robot
             if channel not in told and isinstance(fault, ChannelFault):
                 told.add(channel)
                 time = None if fault.row is None else float(run["t"][fault.row] - run["t"][0])
-                where = run.name, channel, check.kind
-                found.append(IntakeFinding(*where, fault.text, True, time, fault.expected, fault.remedy))
+                said = fault.text, True, time, check.expected, check.remedy
+                found.append(IntakeFinding(run.name, channel, check.kind, *said))
     return found
 
 
 def _shared(runs: Sequence[Run], outcomes: Sequence[_Outcomes], check: IntakeCheck, channel: str) -> ChannelFault | None:
     """The fault that a run which does not show it has like the others; None where one shows that the channel is right."""
     seen = [(run.name, outcome.get((check, channel))) for run, outcome in zip(runs, outcomes, strict=True)]
-    faults = [(name, one) for name, one in seen if isinstance(one, ChannelFault)]
+    faults = [name for name, one in seen if isinstance(one, ChannelFault)]
     if not faults or any(one is Sound.YES for _, one in seen):
         return None
-    name, first = faults[0]
-    text = f"the run does not show whether it is right, and it is {check.kind} in {name}"
-    return ChannelFault(None, text, first.expected, first.remedy)
+    return ChannelFault(None, f"the run does not show whether it is right, and it is {check.kind} in {faults[0]}")
 
 
 def _of_one(run: Run, checks: Sequence[IntakeCheck], robot: Robot) -> _Outcomes:
@@ -176,8 +166,7 @@ def too_short(run: Run, channel: str, robot: Robot) -> Outcome:
     seconds = float(run["t"][-1] - run["t"][0])
     if seconds >= LEAST_SECONDS:
         return Sound.YES
-    expected = f"at least {LEAST_SECONDS:g} s, better 15 to 25 s"
-    return ChannelFault(None, f"the run is {seconds:.2f} s long", expected, "record a longer run")
+    return ChannelFault(None, f"the run is {seconds:.2f} s long")
 
 
 def clock_jumps(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -200,12 +189,7 @@ def clock_jumps(run: Run, channel: str, robot: Robot) -> Outcome:
     row = int(np.argmax(wrong))
     seen = f"in which the joints moved as in {1e3 * passed[row]:.0f} ms" if late[row] else "nothing between them"
     times = f" ({wrong.sum()} times in the run)" if wrong.sum() > 1 else ""
-    return ChannelFault(
-        row,
-        f"{steps[row]:.3g} s from row {row} to the next, {seen}{times}",
-        "a monotonic clock, rows 20 ms apart; single lost rows do no harm",
-        "split the run there into two files, or record it again with a monotonic clock",
-    )
+    return ChannelFault(row, f"{steps[row]:.3g} s from row {row} to the next, {seen}{times}")
 
 
 def clock_rate(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -220,8 +204,7 @@ def clock_rate(run: Run, channel: str, robot: Robot) -> Outcome:
     rate = float(np.median(slopes))
     if not abs(rate - 1.0) > CLOCK_RATE:
         return Sound.YES
-    text = f"by the servos' rates {rate:.2f} times as much time passes between rows as the clock says"
-    return ChannelFault(0, text, "seconds", "write the time at which each row was read, in s")
+    return ChannelFault(0, f"by the servos' rates {rate:.2f} times as much time passes between rows as the clock says")
 
 
 def _turned(run: Run, angle: str, rate: str) -> tuple[Array, Array]:
@@ -234,8 +217,7 @@ def motors_off(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether no motor was on in the whole run."""
     if np.isfinite(np.stack([run[name] for name in COMMANDS])).any():
         return Sound.YES
-    text = "no motor was on in the whole run: nothing to replay"
-    return ChannelFault(None, text, "setpoints in the columns cmd_*", "record the setpoints; NaN is for motors that are off")
+    return ChannelFault(None, "no motor was on in the whole run: nothing to replay")
 
 
 def stands_still(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -244,8 +226,7 @@ def stands_still(run: Run, channel: str, robot: Robot) -> Outcome:
         if np.ptp(run[f"pos_{joint}"]) > (LEG_STANDS if joint in LEGS else WHEEL_STANDS):
             return Sound.YES
     text = f"no leg moves by more than {LEG_STANDS:g} rad and no wheel by more than {WHEEL_STANDS:g} rad in the whole run"
-    expected = "a robot that drives or moves its legs"
-    return ChannelFault(None, text, expected, "switch the motors on and record motions made for it: wlr record --list")
+    return ChannelFault(None, text)
 
 
 # ---- joints ----------------------------------------------------------------------------------------------------------
@@ -294,7 +275,7 @@ def wrapped(run: Run, channel: str, robot: Robot) -> Outcome:
         return Sound.YES
     row = int(jumps[0]) + 1
     text = f"jumps {len(jumps)} times, first by {run[channel][row] - run[channel][row - 1]:.3g} rad in row {row}"
-    return ChannelFault(row, text, "angles that go on past a turn", "numpy.unwrap mends it")
+    return ChannelFault(row, text)
 
 
 def dead(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -305,10 +286,7 @@ def dead(run: Run, channel: str, robot: Robot) -> Outcome:
         return Sound.YES if np.ptp(run[channel]) > 0.0 else Sound.UNDECIDED
     if shown >= SHOWN * asked or _sees(run, joint, robot, slice(None)):
         return Sound.YES
-    return ChannelFault(_first_asked(run, joint), f"commanded to move by {asked:.2g} rad and shows {shown:.2g} rad", *_FOLLOWS)
-
-
-_FOLLOWS = "an encoder that follows", "dead encoder, or the motor is not on: check its cable and its torque switch"
+    return ChannelFault(_first_asked(run, joint), f"commanded to move by {asked:.2g} rad and shows {shown:.2g} rad")
 
 
 def stuck(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -331,7 +309,7 @@ def stuck(run: Run, channel: str, robot: Robot) -> Outcome:
         return Sound.YES
     rows, meanwhile = faults[0]
     reads = f"reads {run[channel][rows.start]:.4g} rad for {t[rows][-1] - t[rows.start]:.2f} s"
-    return ChannelFault(rows.start, f"{reads} {meanwhile}", *_FOLLOWS)
+    return ChannelFault(rows.start, f"{reads} {meanwhile}")
 
 
 def _unseen_lag(run: Run, joint: str, robot: Robot, rows: slice) -> float:
@@ -354,8 +332,7 @@ def mirrored(run: Run, channel: str, robot: Robot) -> Outcome:
     slope = float(asked @ shown / max(float(asked @ asked), 1e-12))
     if slope >= MIRRORED:
         return Sound.YES
-    text = f"moves against its command (ratio {slope:.2f})"
-    return ChannelFault(_first_asked(run, joint), text, "a ratio near 1", "check the sign in the hardware file")
+    return ChannelFault(_first_asked(run, joint), f"moves against its command (ratio {slope:.2f})")
 
 
 def rate_against_angle(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -369,7 +346,7 @@ def rate_against_angle(run: Run, channel: str, robot: Robot) -> Outcome:
     if together > OPPOSITE:
         return Sound.YES
     text = f"turns against {angle} (correlation {together:.2f}): one of the two has the wrong sign"
-    return ChannelFault(_largest(run, channel), text, "a correlation near 1", "check the sign in the hardware file")
+    return ChannelFault(_largest(run, channel), text)
 
 
 def _largest(run: Run, channel: str) -> int:
@@ -386,8 +363,7 @@ def without_signal(run: Run, channel: str, robot: Robot) -> Outcome:
     if np.ptp(run[channel][on]) > 0.0:
         return Sound.YES
     text = f"reads {run[channel][on][0]:g} throughout while the joint turns by {np.ptp(run[f'pos_{joint}'][on]):.2g} rad"
-    remedy = "leave the column out, or record it again"
-    return ChannelFault(int(np.argmax(on)), text, "readings that change with the motion", remedy)
+    return ChannelFault(int(np.argmax(on)), text)
 
 
 def leg_effort_against(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -400,9 +376,8 @@ def leg_effort_against(run: Run, channel: str, robot: Robot) -> Outcome:
     together = float(lag[rows] @ effort[rows]) / size
     if together >= PUSHES_AWAY:
         return Sound.YES if together > -PUSHES_AWAY else Sound.UNDECIDED
-    text = f"pushes away from its goal (correlation with the lag {together:.2f})"
     row = int(np.argmax(np.abs(np.where(rows, effort, 0.0))))
-    return ChannelFault(row, text, "a sign that goes with the leg's angle", "turn the sign of the column")
+    return ChannelFault(row, f"pushes away from its goal (correlation with the lag {together:.2f})")
 
 
 def wheel_effort_against(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -425,7 +400,7 @@ def wheel_effort_against(run: Run, channel: str, robot: Robot) -> Outcome:
         return Sound.YES
     text = f"is against the voltage that the wheel's controller asks for (correlation {together:.2f})"
     row = int(np.flatnonzero(rows)[np.argmax(np.abs(beside[1]))])
-    return ChannelFault(row, text, "positive where the motor drives the wheel forward", "turn the sign of the column")
+    return ChannelFault(row, text)
 
 
 # ---- what the servo asks for -----------------------------------------------------------------------------------------
@@ -558,7 +533,7 @@ def in_degrees(run: Run, channel: str, robot: Robot) -> Outcome:
         if not NOISE_IN_DEGREES[0] < noise < NOISE_IN_DEGREES[1]:
             return Sound.YES if 0.0 < noise < IN_DEGREES else Sound.UNDECIDED
         row, seen = 0, f"its noise at rest is {noise:.0f} times the robot file's"
-    return ChannelFault(row, f"{seen}: degrees per second?", "rad/s", "multiply by pi/180 = 0.017453")
+    return ChannelFault(row, f"{seen}: degrees per second?")
 
 
 def _turning(run: Run, channel: str, angle: Array) -> tuple[float, float, float]:
@@ -599,25 +574,20 @@ def _averaged(run: Run, channel: str) -> Array:
 
 def gyro_against(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether the gyroscope turns against the camera, or where that shows nothing against wheels or gravity."""
-    remedy = "check the mounting in the hardware file, and the camera's axes"
     for name, angle in _references(run, channel, robot):
         turned, measured, together = _turning(run, channel, angle)
         if min(turned, measured) < LEAST_TURN or abs(together) < TOGETHER:
             continue
         if together > OPPOSITE:
             return Sound.YES
-        text = f"turns against {name} (correlation {together:.2f})"
-        return ChannelFault(_largest(run, channel), text, "a correlation near 1", remedy)
+        return ChannelFault(_largest(run, channel), f"turns against {name} (correlation {together:.2f})")
     return Sound.UNDECIDED
 
 
 def upside_down(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether the accelerometer shows gravity itself, or its z axis points down."""
     middle = float(np.nanmedian(run[channel]))
-    if middle > UPSIDE_DOWN:
-        return Sound.YES
-    expected = "+9.8 at rest, the push of the floor"
-    return ChannelFault(None, f"reads {middle:.1f} m/s2 (median)", expected, "check its mounting in the hardware file")
+    return Sound.YES if middle > UPSIDE_DOWN else ChannelFault(None, f"reads {middle:.1f} m/s2 (median)")
 
 
 def imu_saturated(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -628,10 +598,8 @@ def imu_saturated(run: Run, channel: str, robot: Robot) -> Outcome:
         return Sound.YES
     for end, inside in ((0, slice(1, 6)), (-1, slice(-6, -1))):
         if counts[end] >= AT_END and counts[end] > PILED_UP * float(np.mean(counts[inside])):
-            text = f"{counts[end]} rows at its extreme of {levels[end]:.4g}, bit for bit"
             row = int(np.argmax(rows & (run[channel] == levels[end])))
-            remedy = "set a wider range of the sensor and record again"
-            return ChannelFault(row, text, "a range that the motion does not reach", remedy)
+            return ChannelFault(row, f"{counts[end]} rows at its extreme of {levels[end]:.4g}, bit for bit")
     return Sound.YES
 
 
@@ -651,33 +619,51 @@ def imu_without_signal(run: Run, channel: str, robot: Robot) -> Outcome:
     seconds = float(run["t"][rows.stop - 1] - run["t"][rows.start])
     if seconds < IMU_STUCK or not moves[rows].any() or np.isnan(reading[rows.start]):
         return Sound.YES
-    text = f"reads {reading[rows.start]:.4g} for {seconds:.2f} s while the robot moves"
-    remedy = "leave the column out, or record it again: check the sensor's cable"
-    return ChannelFault(rows.start, text, "noise at least", remedy)
+    return ChannelFault(rows.start, f"reads {reading[rows.start]:.4g} for {seconds:.2f} s while the robot moves")
 
 
 # ---- all checks ------------------------------------------------------------------------------------------------------
 
 _POS, _VEL, _EFF = (tuple(f"{kind}_{joint}" for joint in JOINTS) for kind in ("pos", "vel", "eff"))
 _GYRO = ("gyro_z", "gyro_y", "gyro_x")
+_DEAD = "an encoder that follows", "dead encoder, or the motor is not on: check its cable and its torque switch"
+_CLOCK = "split the run there into two files, or record it again with a monotonic clock"
+_MOVE = "switch the motors on and record motions made for it: wlr record --list"
+_SIGN, _TURN = "check the sign in the hardware file", "turn the sign of the column"
+_MOUNTED = "check the mounting in the hardware file, and the camera's axes"
+_LEAVE_OUT = "leave the column out, or record it again"
 #: In the order in which they are made: what a check compares with has been checked before.
 CHECKS: tuple[IntakeCheck, ...] = (
-    IntakeCheck("short", ("t",), too_short),
-    IntakeCheck("missing", ("cmd",), motors_off),
-    IntakeCheck("still", ("pos",), stands_still),
-    IntakeCheck("wrap", _POS, wrapped),
-    IntakeCheck("clock", ("t",), clock_rate),
-    IntakeCheck("clock", ("t",), clock_jumps),
-    IntakeCheck("dead", _POS, dead),
-    IntakeCheck("mirrored", _POS, mirrored),
-    IntakeCheck("dead", _POS, stuck),
-    IntakeCheck("mirrored", _VEL, rate_against_angle),
-    IntakeCheck("dead", (*_VEL, *_EFF), without_signal),
-    IntakeCheck("mirrored", tuple(f"eff_{leg}" for leg in LEGS), leg_effort_against),
-    IntakeCheck("mirrored", tuple(f"eff_{wheel}" for wheel in WHEELS), wheel_effort_against),
-    IntakeCheck("saturated", IMU, imu_saturated),
-    IntakeCheck("dead", IMU, imu_without_signal),
-    IntakeCheck("mirrored", ("acc_z",), upside_down),
-    IntakeCheck("units", _GYRO, in_degrees),
-    IntakeCheck("mirrored", _GYRO, gyro_against),
+    IntakeCheck("short", ("t",), too_short, f"at least {LEAST_SECONDS:g} s, better 15 to 25 s", "record a longer run"),
+    IntakeCheck(
+        "missing",
+        ("cmd",),
+        motors_off,
+        "setpoints in the columns cmd_*",
+        "record the setpoints; NaN is for motors that are off",
+    ),
+    IntakeCheck("still", ("pos",), stands_still, "a robot that drives or moves its legs", _MOVE),
+    IntakeCheck("wrap", _POS, wrapped, "angles that go on past a turn", "numpy.unwrap mends it"),
+    IntakeCheck("clock", ("t",), clock_rate, "seconds", "write the time at which each row was read, in s"),
+    IntakeCheck("clock", ("t",), clock_jumps, "a monotonic clock, rows 20 ms apart; single lost rows do no harm", _CLOCK),
+    IntakeCheck("dead", _POS, dead, *_DEAD),
+    IntakeCheck("mirrored", _POS, mirrored, "a ratio near 1", _SIGN),
+    IntakeCheck("dead", _POS, stuck, *_DEAD),
+    IntakeCheck("mirrored", _VEL, rate_against_angle, "a correlation near 1", _SIGN),
+    IntakeCheck("dead", (*_VEL, *_EFF), without_signal, "readings that change with the motion", _LEAVE_OUT),
+    IntakeCheck("mirrored", _EFF[:4], leg_effort_against, "a sign that goes with the leg's angle", _TURN),
+    IntakeCheck("mirrored", _EFF[4:], wheel_effort_against, "positive where the motor drives the wheel forward", _TURN),
+    IntakeCheck(
+        "saturated",
+        IMU,
+        imu_saturated,
+        "a range that the motion does not reach",
+        "set a wider range of the sensor and record again",
+    ),
+    IntakeCheck("dead", IMU, imu_without_signal, "noise at least", f"{_LEAVE_OUT}: check the sensor's cable"),
+    IntakeCheck(
+        "mirrored", ("acc_z",), upside_down, "+9.8 at rest, the push of the floor", "check its mounting in the hardware file"
+    ),
+    IntakeCheck("units", _GYRO, in_degrees, "rad/s", "multiply by pi/180 = 0.017453"),
+    IntakeCheck("mirrored", _GYRO, gyro_against, "a correlation near 1", _MOUNTED),
 )
