@@ -13,8 +13,7 @@ import numpy as np
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import git_commit
-from wlr_gym.gap.estimation import fit
-from wlr_gym.gap.estimation import FittedModel, nominal_model
+from wlr_gym.gap.estimation import FittedModel, fit, nominal_model
 from wlr_gym.gap.rig.pendulum import ENCODER_NOISE, JOINT, RIG_EFFECTS, PendulumProblem
 from wlr_gym.gap.rig.pendulum_recordings import read_recordings
 from wlr_gym.gap.rig.problem import law_candidates

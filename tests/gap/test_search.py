@@ -68,6 +68,30 @@ def beside_drag(problem):
     return bare, whole
 
 
+def offering(problem, change):
+    """The problem with ``change`` of the candidates that it has."""
+    ordinary = problem.candidates
+
+    def candidates(setting, residuals, runs):
+        probes, found = ordinary(setting, residuals, runs)
+        return probes, change(found)
+
+    problem.candidates = candidates
+    return problem
+
+
+def formula(place="body"):
+    same = candidate(Toy(), "twin")
+    return Candidate("twin", (place,), same.unknowns, same.starts, "k * rate")
+
+
+def refuting(effects, there=()):
+    """Six runs with effects, of which the two to hold out have only those that are ``there``."""
+    problem, truth = (Toy({}, own, rows=400, runs=6) for own in (effects, there))
+    problem._measured[4:] = truth._measured[4:]
+    return problem
+
+
 def labels(found):
     return [found.label for found, _ in found.fit.model.effects]
 
@@ -100,13 +124,7 @@ def test_right_name_place_and_size(effect, label):
 @pytest.mark.parametrize(("surcharge", "found"), [(0.0, ["decoy_2 body"]), (1e4, [])])
 def test_of_what_resembles_a_common_thing_more_is_asked(surcharge, found):
     problem = Toy({}, [sized("decoy_2", 0.8)])
-    ordinary = problem.candidates
-
-    def asked(setting, residuals, runs):
-        probes, candidates = ordinary(setting, residuals, runs)
-        return probes, [replace(c, surcharge=surcharge if c.name == "decoy_2" else 0.0) for c in candidates]
-
-    problem.candidates = asked
+    offering(problem, lambda own: [replace(c, surcharge=surcharge if c.name == "decoy_2" else 0.0) for c in own])
     assert labels(named(problem)) == found
 
 
@@ -581,8 +599,7 @@ def test_what_one_run_alone_shows_is_reported_and_not_selected():
 
 
 def test_what_some_runs_show_weakly_is_told_of_where_the_error_is_hardly_more_than_noise(monkeypatch):
-    problem = Toy({}, [sized("drag", 0.15, "right")], rows=400, runs=6)
-    problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
+    problem = refuting([sized("drag", 0.15, "right")])
     analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
     (alone,) = [one for one in analysis.evidence if one.outcome == "fails cross-validation"]
     assert LEAST_GAIN < alone.gain < INSISTENT
@@ -598,10 +615,8 @@ def test_what_some_runs_show_weakly_is_told_of_where_the_error_is_hardly_more_th
 
 @pytest.mark.parametrize("everywhere", [True, False])
 def test_effect_that_the_held_out_runs_refute_is_reported_and_not_selected(everywhere):
-    problem = Toy({}, [sized("drag", 0.6, "right")], rows=400, runs=6)
-    if not everywhere:
-        without = Toy({}, [], rows=400, runs=6)
-        problem._measured[4:] = without._measured[4:]
+    drag = [sized("drag", 0.6, "right")]
+    problem = refuting(drag, drag if everywhere else ())
     analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
     assert analysis.verdict == (EFFECT_FOUND if everywhere else NOT_EXCITED)
     assert [effect.name for effect in analysis.effects] == (["drag"] if everywhere else [])
@@ -615,8 +630,7 @@ def test_effect_that_the_held_out_runs_refute_is_reported_and_not_selected(every
 def test_held_out_runs_refute_one_effect_and_not_the_one_beside_it(right, wrong):
     """What is left is that of a search without the refuted one: gain, confidence, and what further runs are for."""
     both = [sized("drag", right, "right"), sized("decoy_1", wrong)]
-    problem, truth = (Toy({}, effects, rows=400, runs=6) for effects in (both, both[:1]))
-    problem._measured[4:] = truth._measured[4:]
+    problem = refuting(both, both[:1])
     analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
     refuted = [one for one in analysis.evidence if one.outcome == "fails cross-validation"]
     assert [(one.name, one.reason) for one in refuted] == [("decoy_1", REFUTED)]
@@ -634,8 +648,7 @@ def test_held_out_runs_refute_one_effect_and_not_the_one_beside_it(right, wrong)
 
 
 def test_an_effect_that_is_refuted_after_it_made_an_earlier_one_redundant_leaves_a_verdict_that_says_so(monkeypatch):
-    problem = Toy({}, [sized("decoy_1", 1.5), sized("drag", 0.8, "right")], rows=400, runs=6)
-    problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
+    problem = refuting([sized("decoy_1", 1.5), sized("drag", 0.8, "right")])
 
     def only_the_last(current, tell):
         while len(current.model.effects) > 1:
@@ -650,8 +663,7 @@ def test_an_effect_that_is_refuted_after_it_made_an_earlier_one_redundant_leaves
 
 
 def test_names_are_not_tried_until_one_passes():
-    problem = Toy({}, [sized(name, 1.5) for name in DECOYS], rows=400, runs=6)
-    problem._measured[4:] = Toy({}, [], rows=400, runs=6)._measured[4:]
+    problem = refuting([sized(name, 1.5) for name in DECOYS])
     analysis = analyse_problem(problem, "toy", heldout=("run_5", "run_6"))
     assert (analysis.verdict, analysis.effects) == (NOT_EXCITED, ())
     assert MOST_SEARCHES == 2
@@ -756,36 +768,16 @@ def test_gain_after_refit_is_the_fall_of_the_cost():
 
 
 def test_formula_wins_only_over_worse_names():
-    toy = Toy({}, [sized("drag", 0.8, "left")])
-    ordinary = toy.candidates
-
-    def with_formula(setting, residuals, runs):
-        probes, candidates = ordinary(setting, residuals, runs)
-        same = candidate(Toy(), "twin")
-        kept = [c for c in candidates if c.name not in ("twin", "drag")] if hidden else candidates
-        kept = [c for c in kept if c.name != "twin"]
-        formula = Candidate("twin", ("body",), same.unknowns, same.starts, "k * rate")
-        return probes, [formula, *kept]
-
-    toy.candidates = with_formula
-    hidden = False
-    assert labels(named(toy)) == ["drag left"]
-    hidden = True
-    assert labels(named(toy)) == ["twin body k * rate"]
+    for hidden, expected in ((("twin",), "drag left"), (("twin", "drag"), "twin body k * rate")):
+        toy = Toy({}, [sized("drag", 0.8, "left")])
+        offering(toy, lambda own, hidden=hidden: [formula(), *(c for c in own if c.name not in hidden)])
+        assert labels(named(toy)) == [expected]
 
 
 @pytest.mark.parametrize("place", ["body", "elsewhere"])
 def test_no_name_is_looked_for_where_an_unknown_law_acts(monkeypatch, place):
     toy = Toy({}, [sized("drag", 2.0, "left"), sized("decoy_1", 0.8)])  # the decoy acts on the body
-    ordinary = toy.candidates
-
-    def with_formula(setting, residuals, runs):
-        probes, candidates = ordinary(setting, residuals, runs)
-        same = candidate(Toy(), "twin")
-        formula = Candidate("twin", (place,), same.unknowns, same.starts, "k * rate")
-        return probes, [formula, next(c for c in candidates if c.name == "decoy_1")]
-
-    toy.candidates = with_formula
+    offering(toy, lambda own: [formula(place), next(c for c in own if c.name == "decoy_1")])
     found = labels(named(toy))
     assert found[0] == f"twin {place} k * rate"
     assert found[1:] == (["decoy_1 body"] if place == "elsewhere" else [])

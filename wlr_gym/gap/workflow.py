@@ -108,7 +108,9 @@ def analyse(
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
-    known, problem, findings = open_problem(data, known, rig, backend, threads, robot)
+    load, open_runs = system_of(rig, backend, threads, robot)
+    known = load(known)
+    problem, findings = open_runs(data, known)
     first = {finding.run: finding for finding in reversed(findings) if finding.fatal and finding.run}
     for finding in (one for one in findings if first.get(one.run) is one):
         tell(f"left out {finding.place}: {finding.said}", STAGES["reading"])
@@ -308,25 +310,30 @@ RIGS = ("pendulum",)
 OWN_RIG = ".py"
 
 
-def open_problem(
-    data: str | Path, known: Source, rig: str | Path | None, backend: str, threads: int, robot: str | Path | None
-) -> tuple[Patch, Problem | None, list[IntakeFinding]]:
-    """Return what is known already, the problem (None where the data are too bad to go on), and what was noticed.
+def system_of(
+    rig: str | Path | None, backend: str = "gibbs_appell", threads: int = 1, robot: str | Path | None = None
+) -> tuple[Callable[[Source], Patch], Callable[[str | Path, Patch], tuple[Problem | None, list[IntakeFinding]]]]:
+    """Return what loads known effects in the vocabulary of the robot or of a rig, and what opens a folder of its runs.
 
-    For the arguments and errors see :func:`wlr_gym.gap.workflow.analyse`.
+    The latter takes the known effects too, and returns the problem, None where the data are too bad to go on, and what was
+    noticed. For the arguments see :func:`analyse`.
     """
-    patch = known_patch(known, rig)
     if rig is None:
         from wlr_gym.gap.robot.problem import open_robot
 
-        return patch, *open_robot(data, patch, backend, threads, robot)
-    if rig in RIGS:
-        from wlr_gym.gap.rig.pendulum import open_pendulum
+        return load_patch, lambda data, known: open_robot(data, known, backend, threads, robot)
+    from wlr_gym.gap.rig.problem import rig_patch
 
-        return patch, *open_pendulum(data, patch)
+    if rig in RIGS:
+        from wlr_gym.gap.rig.pendulum import JOINT, RIG_EFFECTS, open_pendulum
+
+        return lambda known: rig_patch(known, RIG_EFFECTS, JOINT), open_pendulum
+    if Path(rig).suffix != OWN_RIG:
+        raise unknown_name("rig", str(rig), RIGS)
     from wlr_gym.gap.rig.own import load_rig, open_own_rig
 
-    return patch, *open_own_rig(data, load_rig(rig), patch.effects)
+    own = load_rig(rig)
+    return lambda known: rig_patch(known, own.laws, own.name), lambda data, known: open_own_rig(data, own, known.effects)
 
 
 def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | None) -> str | None:
@@ -339,25 +346,3 @@ def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | No
     if named is None:
         return None
     return str(Path(data) / named) if names_file(named) else shipped_robots()[named].stem
-
-
-def known_patch(known: Source, rig: str | Path | None) -> Patch:
-    """Return the effects given as known, in the vocabulary of the robot or of the rig.
-
-    Raises:
-        InputError: an effect that it does not have, or a rig that does not exist.
-    """
-    if rig is None:
-        return load_patch(known)
-    from wlr_gym.gap.rig.problem import rig_patch
-
-    if rig in RIGS:
-        from wlr_gym.gap.rig.pendulum import JOINT, RIG_EFFECTS
-
-        return rig_patch(known, RIG_EFFECTS, JOINT)
-    if Path(rig).suffix != OWN_RIG:
-        raise unknown_name("rig", str(rig), RIGS)
-    from wlr_gym.gap.rig.own import load_rig
-
-    own = load_rig(rig)
-    return rig_patch(known, own.laws, own.name)
