@@ -28,16 +28,30 @@ def measured(run):
     return np.stack([run[name] for name in CHANNELS], axis=1)
 
 
-def worst(run, replays, kinds=None, clock=None):
+def columns(kind, joints):
+    return [CHANNELS.index(f"{kind}_{joint}") for joint in joints]
+
+
+def errors(run, values, clock=None):
+    """Residuals (rows, channels) of the first setting, and their RMS (channels), in noise units."""
+    found = anchored_residuals(run["t"], measured(run), values, NOISE, (clock or RunClock(run)).windows)[0]
+    return found, np.sqrt(np.nanmean(found**2, axis=0))
+
+
+def worst(run, replays, kinds=""):
     """Largest RMS residual of a channel, in noise units."""
-    clock = clock or RunClock(run)
-    found = anchored_residuals(run["t"], measured(run), replays.values, NOISE, clock.windows)[0]
-    rms = np.sqrt(np.nanmean(found**2, axis=0))
-    return max(rms[k] for k, name in enumerate(CHANNELS) if kinds is None or name.startswith(kinds))
+    _, rms = errors(run, replays.values)
+    return max(rms[k] for k, name in enumerate(CHANNELS) if name.startswith(kinds))
 
 
-def replayed(run, parameters=None, **options):
-    return replay_batch(ROBOT, [RunClock(run)], nominal() if parameters is None else parameters, **options)[0]
+def replayed(run, parameters=None, clock=None, **options):
+    return replay_batch(ROBOT, [clock or RunClock(run)], nominal() if parameters is None else parameters, **options)[0]
+
+
+def same(one, other):
+    """Whether two replays agree to the bit."""
+    alike = one.truth is other.truth is None or np.array_equal(one.truth, other.truth)
+    return np.array_equal(one.values, other.values) and alike
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +80,7 @@ def test_own_run_comes_back_exactly(run):
 
 def test_own_run_comes_back_to_sensor_noise():
     noisy = record(posture_and_turns, spaced(4.0), noise=5, tick=0.001)
-    found = anchored_residuals(noisy["t"], measured(noisy), replayed(noisy).values, NOISE, RunClock(noisy).windows)[0]
-    rms = np.sqrt(np.nanmean(found**2, axis=0))
+    _, rms = errors(noisy, replayed(noisy).values)
     assert np.sqrt(np.mean(rms**2)) < 1.25
     assert rms.max() < 2.5
 
@@ -132,11 +145,8 @@ def test_the_compiled_loop_does_what_steps_from_python_do(run, other, monkeypatc
     compiled = replay_batch(ROBOT, clocks, table, with_truth=True)
     monkeypatch.setattr(simulate, "GibbsAppellPlant", type(None))
     stepped = replay_batch(ROBOT, clocks, table, with_truth=True)
-    for one, same in zip(compiled, stepped, strict=True):
-        assert np.array_equal(one.values, same.values)
-        assert one.truth is not None
-        assert same.truth is not None
-        assert np.array_equal(one.truth, same.truth)
+    assert all(map(same, compiled, stepped))
+    assert compiled[0].truth is not None
 
 
 def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
@@ -145,12 +155,8 @@ def test_chunks_and_threads_do_not_change_a_bit(other, monkeypatch):
     monkeypatch.setattr(simulate, "LEAST_ROBOTS", 2)
     threaded = replay_batch(ROBOT, [clock], table, threads=2)[0]
     monkeypatch.setattr(simulate, "MOST_ROBOTS", 3)
-    chunked = replay_batch(ROBOT, [clock], table, with_truth=True)[0]
     assert np.array_equal(whole.values, threaded.values)
-    assert np.array_equal(whole.values, chunked.values)
-    assert whole.truth is not None
-    assert chunked.truth is not None
-    assert np.array_equal(whole.truth, chunked.truth)
+    assert same(whole, replay_batch(ROBOT, [clock], table, with_truth=True)[0])
 
 
 def test_threads_share_the_runs_where_there_are_few_settings(run, other, monkeypatch):
@@ -159,9 +165,7 @@ def test_threads_share_the_runs_where_there_are_few_settings(run, other, monkeyp
     monkeypatch.setattr(simulate, "LEAST_ROBOTS", 2)
     monkeypatch.setattr(simulate, "TILE", 3)
     assert simulate.shared_out(3, 2, 2) == [(slice(0, 3), slice(0, 1)), (slice(0, 3), slice(1, 2))]
-    shared = replay_batch(ROBOT, clocks, table, threads=2)
-    for one, same in zip(whole, shared, strict=True):
-        assert np.array_equal(one.values, same.values)
+    assert all(map(same, whole, replay_batch(ROBOT, clocks, table, threads=2)))
 
 
 def test_channels_begin_as_the_sensors_do():
@@ -179,18 +183,15 @@ def test_runs_of_different_length_are_each_as_alone(threads):
     table = Parameters(np.tile(several(4).values, (35, 1)))
     together = replay_batch(ROBOT, clocks, table, with_truth=True, threads=threads)
     for clock, replays in zip(clocks, together, strict=True):
-        alone = replay_batch(ROBOT, [clock], Parameters(table.values[-20:]), with_truth=True)[0]
-        assert np.array_equal(replays.values[-20:], alone.values)
         assert replays.truth is not None
-        assert alone.truth is not None
-        assert np.array_equal(replays.truth[-20:], alone.truth)
+        last = simulate.Replays(replays.values[-20:], replays.truth[-20:])
+        assert same(last, replay_batch(ROBOT, [clock], Parameters(table.values[-20:]), with_truth=True)[0])
 
 
 def test_truth_comes_on_the_rows(run):
     replays = replayed(run, with_truth=True)
-    columns = sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH)
     assert replays.truth is not None
-    assert replays.truth.shape == (1, len(run["t"]), columns)
+    assert replays.truth.shape == (1, len(run["t"]), sum(len(TRUTH_LAYOUT.channels[name].elements) for name in TRUTH))
     speed = replays.truth[0][:, 8 + 4]  # joint_velocity[wheel_lf]
     assert speed == pytest.approx(run["vel_wheel_lf"], abs=0.1)
 
@@ -200,8 +201,7 @@ def test_goals_off_the_grid_act_at_their_own_time(offset):
     """Rows between two ticks, the run from a clock of 0.25 ms. Within a physics step a ramp may begin early, no more."""
     fine = record(abrupt, spaced(0.8, offset=offset), tick=0.00025)
     ahead = (replayed(fine).values[0] - measured(fine))[24:38] / META.profile.wheel_acceleration
-    for joint in JOINTS[4:]:
-        assert abs(ahead[:, CHANNELS.index(f"vel_{joint}")].mean()) < 0.65 * simulate.PHYSICS_STEP
+    assert np.abs(ahead[:, columns("vel", JOINTS[4:])].mean(axis=0)).max() < 0.65 * simulate.PHYSICS_STEP
 
 
 def test_goal_of_a_row_does_not_show_in_its_own_reading():
@@ -253,10 +253,8 @@ def test_standing_legs_are_put_back_within_half_a_count():
     """In a model whose legs give way."""
     stood, soft = record(abrupt, spaced(6.0)), nominal()
     soft["servo.kp"][:, :4] *= 0.3
-    clock = RunClock(stood)
-    legs = [CHANNELS.index(f"pos_{leg}") for leg in JOINTS[:4]]
-    off = np.abs(replay_batch(ROBOT, [clock], soft)[0].values[0] - measured(stood))[:, legs]
-    for window in clock.windows[1:]:
+    off = np.abs(replayed(stood, soft).values[0] - measured(stood))[:, columns("pos", JOINTS[:4])]
+    for window in RunClock(stood).windows[1:]:
         assert off[window.start - 1].min() > 0.005
         assert off[window.start].max() < 0.51 * ROBOT.sensors.encoder.position
 
@@ -266,13 +264,11 @@ def test_a_window_begins_with_the_loads_that_were_measured(window):
     """Standing legs truly stand within a count (1.5 mrad) of their encoders; wheels are driven by jolts, which tell no load."""
     exact, noisy = record(abrupt, spaced(6.0)), record(abrupt, spaced(6.0), noise=5)
     clock = RunClock(noisy, window=window)
-    values = replay_batch(ROBOT, [clock], nominal())[0].values
-    legs = [CHANNELS.index(f"pos_{leg}") for leg in JOINTS[:4]]
-    assert np.abs(values[0][:, legs] - measured(exact)[:, legs]).max() < 5e-4
-    found = anchored_residuals(noisy["t"], measured(noisy), values, NOISE, clock.windows)[0]
-    rms = np.sqrt(np.nanmean(found**2, axis=0))
-    assert rms[[CHANNELS.index(f"eff_{leg}") for leg in JOINTS[:4]]].max() < 1.3
-    assert rms[[CHANNELS.index(f"pos_{wheel}") for wheel in JOINTS[4:]]].max() < 1.2
+    values = replayed(noisy, clock=clock).values
+    assert np.abs(values[0] - measured(exact))[:, columns("pos", JOINTS[:4])].max() < 5e-4
+    _, rms = errors(noisy, values, clock)
+    assert rms[columns("eff", JOINTS[:4])].max() < 1.3
+    assert rms[columns("pos", JOINTS[4:])].max() < 1.2
 
 
 @pytest.mark.parametrize("period", [0.02, 0.1])
@@ -289,8 +285,7 @@ def test_a_window_begins_with_the_springs_that_the_efforts_before_it_showed():
     for wheel, push in zip(JOINTS[4:], (0.15, -0.15, -0.15, 0.15), strict=True):
         table.loc[table["t"] <= 0.2, f"eff_{wheel}"] += push
     clock = RunClock(replace(true, table=table))
-    efforts = [CHANNELS.index(f"eff_{wheel}") for wheel in JOINTS[4:]]
-    error = (replay_batch(ROBOT, [clock], nominal())[0].values[0] - measured(true))[:, efforts]
+    error = (replayed(true, clock=clock).values[0] - measured(true))[:, columns("eff", JOINTS[4:])]
     first = clock.windows[1].start
     before, after = (np.abs(error[rows].mean(axis=0)) for rows in (slice(first - 10, first), slice(first, first + 10)))
     assert before.min() > 0.08
@@ -307,7 +302,7 @@ def test_a_run_that_begins_in_motion_is_compared_once_motors_and_imu_read():
         assert first["eff_leg_lf"] is first["gyro_z"] is first["volt"] is is_known
         assert first["pos_leg_lf"]
         assert first["vel_wheel_lf"]
-        speeds = found[0, :, [CHANNELS.index(f"vel_{wheel}") for wheel in JOINTS[4:]]]
+        speeds = found[0, :, columns("vel", JOINTS[4:])]
         assert np.nanmax(np.abs(speeds)) < (1.0 if is_known else 20.0)  # 340 without the back-EMF in the controllers' springs
 
 
@@ -317,9 +312,7 @@ def test_a_window_does_not_show_the_drift_before_it():
     drifting = record(posture_and_turns, spaced(6.0), [radius], camera__delay=0.05)
     clock, table = RunClock(drifting), nominal()
     table["camera.delay"] = 0.05
-    found = anchored_residuals(
-        drifting["t"], measured(drifting), replay_batch(ROBOT, [clock], table)[0].values, NOISE, clock.windows
-    )[0]
+    found, _ = errors(drifting, replayed(drifting, table).values)
     for name in ("cam_x", "cam_yaw"):
         size = np.abs(found[:, CHANNELS.index(name)])
         for window in clock.windows[1:]:
@@ -329,10 +322,8 @@ def test_a_window_does_not_show_the_drift_before_it():
 
 def test_wheels_count_on_after_a_window(run):
     values = replayed(run).values[0]
-    for joint in JOINTS[4:]:
-        column = CHANNELS.index(f"pos_{joint}")
-        jumps = np.diff(values[:, column]) - 0.02 * values[1:, CHANNELS.index(f"vel_{joint}")]
-        assert np.abs(jumps).max() < 0.05
+    jumps = np.diff(values[:, columns("pos", JOINTS[4:])], axis=0) - 0.02 * values[1:, columns("vel", JOINTS[4:])]
+    assert np.abs(jumps).max() < 0.05
 
 
 def test_other_simulator_replays_too():
