@@ -1,5 +1,4 @@
-"""Fit, likelihood and intervals against closed forms: weighted least squares with priors, AR(1) residuals, Monte Carlo, jackknife;
-confidence; what would have been seen."""
+"""Fit, likelihood and intervals against closed forms: least squares with priors, AR(1) residuals, Monte Carlo, jackknife."""
 
 from dataclasses import replace
 
