@@ -31,15 +31,12 @@ from wlr_gym.gap.analysis import (
     Threshold,
 )
 from wlr_gym.gap.estimation import (
-    Columns,
-    Fit,
     estimates,
     fit,
     half_widths,
     mean_of_runs,
     mean_squares,
     nominal_model,
-    quiet,
     replay,
     widened,
 )
@@ -154,16 +151,17 @@ def analyse_problem(
     # columns: of the runs to fit, where they had to be simulated for the choice
     fitted, held_out, columns = (*named_split(problem.runs, heldout), None) if heldout else informative_split(problem)
     clock.start("calibrating")
-    start = calibrated_fit(problem, fitted, columns, clock.detail)
+    start, scatter = nominal_model(problem), SCATTER * problem.tempering
+    calibrated = widened(fit(start, fitted, scatter=scatter, columns=columns, tell=clock.detail))
     clock.start("naming")
 
     def find(excluded: Container[str] = ()) -> SearchResult:
-        return search_effects(start, clock.detail, columns, excluded)
+        return search_effects(calibrated, clock.detail, columns, excluded)
 
     search = confirmed(find(), held_out, find)
     base, final, rounds = search.calibrated, search.fit, search.rounds
     clock.start("proving")
-    models = (nominal_model(problem), base.model, final.model)
+    models = (start, base.model, final.model)
     floor = noise_floor(final.model, held_out)
     gap, run_gaps, channel_gaps = compare_models(models, fitted, held_out, floor)
     error, worst = most_left(gap.fit_after, run_gaps)
@@ -224,14 +222,6 @@ def analyse_problem(
         seconds=clock.seconds,
         provenance=provenance(),
     )
-
-
-def calibrated_fit(
-    problem: Problem, fitted: Sequence[int], columns: Columns | None = None, tell: Callable[[str], None] = quiet
-) -> Fit:
-    """Fit the model without effects to runs, from its file's numbers; ``columns``: there, where they are known."""
-    scatter, own = SCATTER * problem.tempering, None if columns is None else list(columns)
-    return widened(fit(nominal_model(problem), fitted, scatter=scatter, columns=own, tell=tell))
 
 
 class _Clock:

@@ -194,14 +194,6 @@ class RobotProblem(Problem):
             found = [residual[0] for residual in twin.residuals([setting], range(len(made)))]
             yield from (found[k * len(runs) : (k + 1) * len(runs)] for k in range(sets))
 
-    def recorded(self, setting: Setting, seed: int) -> list[Run]:
-        """Return the runs as they would be if the robot were this model: same commands, other readings.
-
-        Nothing where its simulation breaks down; ``seed``: of the sensors' noise.
-        """
-        values = self._whole(setting, range(len(self.clocks)))
-        return [self._read(r, one, generator(seed, "gap", "recorded", r)) for r, one in enumerate(values)]
-
     def _whole(self, setting: Setting, runs: Sequence[int]) -> list[Array]:
         """What sensors would read (rows, signals) per run without anything that leads back to what was measured.
 

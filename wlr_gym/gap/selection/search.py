@@ -124,32 +124,19 @@ class SearchResult:
         return [(look, one) for look in self.rounds if (one := look.selected) is not None and one.candidate.label in labels]
 
 
-@dataclass(frozen=True, eq=False)
-class Screened:
-    """What screening says of the candidates of one round.
+def _screened(current: Fit, excluded: Container[str], tell: Tell) -> tuple[Responses, list[Score], list[Score], list[Score]]:
+    """Score all candidates beyond a fitted model, but those with ``excluded`` labels.
 
-    Attributes:
-        scores: under the noise that each candidate would leave, best first.
-        alone: the best of each group of signals, best first.
-        linear: to first order under the noise of the model without them, best first.
-        found: responses of the model's numbers and the candidates' probes.
+    Returned are the responses, the scores to first order and those under the noise that each candidate would leave, and the
+    best of each group of signals; best first.
     """
-
-    scores: list[Score]
-    alone: list[Score]
-    linear: list[Score]
-    found: Responses
-
-
-def screened(current: Fit, tell: Tell = quiet, excluded: Container[str] = ()) -> Screened:
-    """Score all candidates beyond a fitted model, but those with ``excluded`` labels."""
     probes, candidates = current.problem.candidates(current.model.setting, current.residuals, current.runs)
     candidates = [one for one in candidates if one.label not in excluded and not _is_explained(current.model, one)]
     tell(f"screening {len(candidates)} candidates")
     found = responses(current, probes)
     linear = screen(candidates, found)
     scores, alone = rescored(found, linear)
-    return Screened(one_per_label(scores), alone, linear, found)
+    return found, linear, one_per_label(scores), alone
 
 
 def _is_explained(model: FittedModel, candidate: Candidate) -> bool:
@@ -179,14 +166,14 @@ def search_effects(start: Fit, tell: Tell = quiet, given: Columns | None = None,
         return current is again or not _deeper(current, bare)
 
     while True:
-        first = screened(current, tell, excluded)
-        by_chance = np.zeros(0) if problem.thorough else largest_by_chance(first.found, first.scores)
+        found, linear, scores, alone = _screened(current, excluded, tell)
+        by_chance = np.zeros(0) if problem.thorough else largest_by_chance(found, scores)
         formulas = {candidate.label for candidate, _ in current.model.effects if candidate.formula}
         gains = [one.gain for look in rounds if (one := look.selected) is not None and one.candidate.label in formulas]
         threshold = max(acceptance_threshold(current.cost, by_chance), BESIDE_FORMULA * max(gains, default=0.0))
-        visible = {score.candidate.label for score in first.linear if score.is_visible(threshold)}
-        scores = [replace(score, visible=score.candidate.label in visible) for score in first.scores]
-        chosen = scores if problem.thorough else shortlist(scores, threshold, first.alone)
+        visible = {score.candidate.label for score in linear if score.is_visible(threshold)}
+        scores = [replace(score, visible=score.candidate.label in visible) for score in scores]
+        chosen = scores if problem.thorough else shortlist(scores, threshold, alone)
         tell(f"refitting {len(chosen)} hypotheses")
         hypotheses = refit_thoroughly(current, chosen) if given is None else refit(current, chosen, given)
         bare = _without_more(current, hypotheses)
