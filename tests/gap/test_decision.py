@@ -143,8 +143,9 @@ def test_a_motion_that_loads_what_is_in_question_promises_more(data):
     drive = excite("straight", robot=ROBOT, seconds=3.0)
     stand = decision.Motion("stand", np.repeat(drive.setpoints[:1], 150, axis=0), drive.period)
     # standing cannot promise more
-    (promised,) = decision.promises(found, explanations(found), [stand, drive], ROBOT, driven)
-    (alone,) = decision.promises(found, explanations(found), [stand], ROBOT, driven)
+    problem = decision.RobotProblem(driven, ROBOT)
+    (promised,) = decision.promises(found, explanations(found), [stand, drive], problem)
+    (alone,) = decision.promises(found, explanations(found), [stand], problem)
     assert (promised.motion.name, alone.motion.name) == ("straight", "stand")
     assert promised.most > decision.TELLS > alone.most
     assert {"coulomb_friction", "viscous_friction"} & set(promised.pair)
@@ -173,7 +174,8 @@ def test_motions_that_cannot_promise_more_are_not_worked_out(data, monkeypatch, 
     monkeypatch.setattr(decision, "_Foresight", lambda *_: seen)
     drive = excite("straight", robot=ROBOT, seconds=1.0)
     motions = [decision.Motion(name, drive.setpoints, drive.period) for name in bounds]
-    found = decision.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, ROBOT, [])
+    problem = SimpleNamespace(robot=ROBOT, known=None, backend="gibbs_appell", threads=1)
+    found = decision.promises(result(*UNDECIDED), explanations(result(*UNDECIDED)), motions, problem)
     assert (done, found[0].motion.name) == (worked_out, best)
 
 
@@ -224,11 +226,9 @@ def answers(monkeypatch):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "result.json").write_text(given["results"].pop(0).model_dump_json())
 
-    def promises(found, left, motions, robot, runs, **options):
-        names = (left[0].name, left[1].name)
-        return [
-            decision.Promise(motion, given["telling"], given["telling"], names) for motion in motions if motion.name == "turns"
-        ]
+    def promises(found, left, motions, problem):
+        telling, names = given["telling"], (left[0].name, left[1].name)
+        return [decision.Promise(motion, telling, telling, names) for motion in motions if motion.name == "turns"]
 
     monkeypatch.setattr(decision, "analyse", analyse)
     monkeypatch.setattr(decision, "promises", promises)

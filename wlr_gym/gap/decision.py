@@ -313,7 +313,8 @@ class _Session:
             return "", shows_most
         self.tell("choosing the next run", 1.0)
         there = [runs[name] for name in now.runs]
-        found = promises(result, left, motions, own, there, known=self.known, backend=self.backend, threads=self.threads)
+        problem = RobotProblem(there, own, self.known, self.backend, threads=self.threads)
+        found = promises(result, left, motions, problem)
         sure = left[0].probability >= DECIDED and left[0].name in {NOTHING, *(effect.name for effect in result.effects)}
         if max(one.most for one in found) >= (TELLS_OTHERWISE if sure else TELLS):
             best = found[0]
@@ -400,33 +401,23 @@ def most_shown(motions: Sequence[Motion], driven: Sequence[str]) -> Motion:
 
 
 def promises(
-    result: Result,
-    explanations: Sequence[Explanation],
-    motions: Sequence[Motion],
-    robot: Robot,
-    runs: Sequence[Run],
-    *,
-    known: Source = None,
-    backend: str = "gibbs_appell",
-    threads: int = 1,
+    result: Result, explanations: Sequence[Explanation], motions: Sequence[Motion], problem: RobotProblem
 ) -> list[Promise]:
     """Return what motions promise, most per second first; the first is the best of all.
 
     What numbers take up costs most to know, and only lowers a promise: motions that promise less even without it, and would
     tell no more, are left out.
 
-    ``result`` and what follows ``motions`` are of the last analysis; ``explanations`` are those in play, two or more.
+    ``result`` and ``problem`` are those of the last analysis; ``explanations`` are those in play, two or more.
     """
-
-    def foresight(runs: Sequence[Run]) -> _Foresight:
-        return _Foresight(RobotProblem(runs, robot, known, backend, threads=threads), result, explanations)
-
-    free = foresight(runs).own_uncertainty()
+    robot, known, backend, threads = problem.robot, problem.known, problem.backend, problem.threads
+    free = _Foresight(problem, result, explanations).own_uncertainty()
     with tempfile.TemporaryDirectory() as folder:
         bounds = []
         for motion in motions:
             path = record_simulation(Path(folder) / f"run_{motion.name}.parquet", motion, robot, "gibbs_appell")
-            seen = foresight([read_run(path)])
+            driven = RobotProblem([read_run(path)], robot, known, backend, threads=threads)
+            seen = _Foresight(driven, result, explanations)
             bounds.append((seen.promise(motion), seen))
         found: list[Promise] = []
         for bound, seen in sorted(bounds, key=lambda pair: -pair[0].per_second):
