@@ -143,7 +143,7 @@ def test_the_compiled_loop_does_what_steps_from_python_do(run, other, monkeypatc
     """Two runs of different length and with other windows, motors that are off for a while, the truth."""
     clocks, table = [RunClock(run, window=0.3), RunClock(other)], several(3)
     compiled = replay_batch(ROBOT, clocks, table, with_truth=True)
-    monkeypatch.setattr(simulate, "GibbsAppellPlant", type(None))
+    monkeypatch.setattr(simulate, "follower", lambda plant, _, *reading: simulate.stepper(plant, *reading))
     stepped = replay_batch(ROBOT, clocks, table, with_truth=True)
     assert all(map(same, compiled, stepped))
     assert compiled[0].truth is not None

@@ -632,20 +632,25 @@ def follower(plant: Plant, schedule: Schedule, recorder: Recorder, readings: Sen
     ``plant`` follows the setpoints of ``schedule`` and overwrites ``readings``.
     """
     if not isinstance(plant, GibbsAppellPlant):
-        idle = np.zeros((plant.count, 8))
-
-        def step(first: int, last: int, torque_on: NDArray[np.bool_] | None) -> None:
-            for tick in range(first, last):
-                recorder.see(tick, readings, plant.truth())
-                plant.step(idle, torque_on)
-
-        return step
+        return stepper(plant, recorder, readings)
     loop = _loop(*plant.compiled_tick(), schedule, recorder.tape)
 
     def go(first: int, last: int, torque_on: NDArray[np.bool_] | None) -> None:
         function, batch = plant.compiled_tick()  # fewer robots, where runs are over
         batch.torque_on[...] = 1.0 if torque_on is None else torque_on
         loop(function, batch, schedule, recorder.tape, first, last)
+
+    return go
+
+
+def stepper(plant: Plant, recorder: Recorder, readings: Sensors) -> Follow:
+    """Return the same for any plant, step by step from Python."""
+    idle = np.zeros((plant.count, 8))
+
+    def go(first: int, last: int, torque_on: NDArray[np.bool_] | None) -> None:
+        for tick in range(first, last):
+            recorder.see(tick, readings, plant.truth())
+            plant.step(idle, torque_on)
 
     return go
 
