@@ -151,7 +151,7 @@ def _checked(options: GapOptions) -> Patch:
     """Refuse what cannot be analysed; return the effects given as known, in the vocabulary of the robot or of the rig."""
     from wlr_gym.data.runs import run_files
     from wlr_gym.gap.rig.own import load_rig
-    from wlr_gym.gap.workflow import OWN_RIG, RIGS, system_of
+    from wlr_gym.gap.workflow import OWN_RIG, RIGS, known_patch
     from wlr_gym.physics.plants import check_simulator
 
     check_folder(options.data, of="runs")
@@ -174,7 +174,7 @@ def _checked(options: GapOptions) -> Patch:
         if Path(name).resolve().parent == options.out.resolve() and Path(name).is_file():
             raise InputError(f"--effects {name}: the results would replace it: give another --out")
     try:
-        return system_of(options.rig)[0](list(options.effects))
+        return known_patch(list(options.effects), options.rig)
     except InputError as error:
         raise InputError(f"--effects: {error}") from None
 

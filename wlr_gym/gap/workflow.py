@@ -326,6 +326,11 @@ def system_of(
     return lambda known: rig_patch(known, own.laws, own.name), lambda data, known: open_own_rig(data, own, known.effects)
 
 
+def known_patch(known: Source, rig: str | Path | None) -> Patch:
+    """Return the effects given as known, in the vocabulary of the robot or of the rig; see :func:`system_of`."""
+    return system_of(rig)[0](known)
+
+
 def named_robot(data: str | Path, rig: str | Path | None, robot: str | Path | None) -> str | None:
     """Return what ``--robot`` takes for the robot that is analysed; None = nothing names it, or it is a rig."""
     from wlr_gym.data.runs import names_file, read_meta, shipped_robots
