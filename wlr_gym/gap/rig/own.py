@@ -7,6 +7,7 @@ columns.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import itertools
 import keyword
@@ -64,7 +65,7 @@ _KINDS: Mapping[str, tuple[type, Any, str]] = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rig:
     """A system: how it moves, how well its numbers are known, what may be missing, what is measured.
 
@@ -273,46 +274,37 @@ def simulate(p, t, inputs, starts, begun, step, out):
 """
 
 
-class CompiledRig:
-    """A rig's equations, compiled when they are first used."""
+def simulate(
+    rig: Rig, values: dict[str, float], t: Array, inputs: Array, starts: NDArray[np.int64], begun: Array
+) -> tuple[Array, Array]:
+    """Return what the columns would read (rows, columns), and the states (rows, states).
 
-    def __init__(self, rig: Rig) -> None:
-        self.rig = rig
-        self.numbers: Any = namedtuple("p", list(rig.numbers))
-        self._simulate: Callable[..., None] = _compiled(rig)
+    Args:
+        rig: its equations; they are compiled when they are first used.
+        values: all numbers by name.
+        t: (rows,) s.
+        inputs: (rows, inputs).
+        starts: (rows,) row of ``begun`` to begin from, or -1; the first must not be -1.
+        begun: (k, states).
 
-    def simulate(
-        self,
-        values: dict[str, float],
-        t: Array,
-        inputs: Array,
-        starts: NDArray[np.int64],
-        begun: Array,
-        with_states: bool = False,
-    ) -> Array:
-        """Return what the columns would read (rows, columns); ``with_states``: and the states, after them.
-
-        Args:
-            values: all numbers by name.
-            t: (rows,) s.
-            inputs: (rows, inputs).
-            starts: (rows,) row of ``begun`` to begin from, or -1; the first must not be -1.
-            begun: (k, states).
-
-        Raises:
-            InputError: equations that cannot be compiled, with numba's reason.
-        """
-        out = np.empty((len(t), len(self.rig.columns) + len(self.rig.states)))
-        try:
-            self._simulate(self.numbers(**values), t, inputs, starts, begun, self.rig.step, out)
-        except NumbaError as error:
-            reason = " ".join(re.sub(COLOURS, "", str(error)).split())
-            sizes = f"change ({len(self.rig.states)} rates) or readings ({len(self.rig.columns)} columns)"
-            raise InputError(f"rig '{self.rig.name}': {sizes} cannot be compiled: {reason}") from error
-        return out if with_states else out[:, : len(self.rig.columns)]
+    Raises:
+        InputError: equations that cannot be compiled, with numba's reason.
+    """
+    count = len(rig.columns)
+    out = np.empty((len(t), count + len(rig.states)))
+    numbers, compiled = _compiled(rig)
+    try:
+        compiled(numbers(**values), t, inputs, starts, begun, rig.step, out)
+    except NumbaError as error:
+        reason = " ".join(re.sub(COLOURS, "", str(error)).split())
+        sizes = f"change ({len(rig.states)} rates) or readings ({count} columns)"
+        raise InputError(f"rig '{rig.name}': {sizes} cannot be compiled: {reason}") from error
+    return out[:, :count], out[:, count:]
 
 
-def _compiled(rig: Rig) -> Callable[..., None]:
+@functools.cache
+def _compiled(rig: Rig) -> tuple[Callable[..., Any], Callable[..., None]]:
+    """Return the named tuple of a rig's numbers, and its driver."""
     size, read = range(len(rig.states)), range(len(rig.columns))
 
     def listed(text: str, numbers: range = size, between: str = ", ") -> str:
@@ -338,8 +330,7 @@ def _compiled(rig: Rig) -> Callable[..., None]:
         "readings": njit(rig.readings),
     }
     exec(compile(source, f"<rig {rig.name}>", "exec"), scope)  # the driver above, and names that were checked
-    simulate: Any = njit(scope["simulate"])
-    return simulate
+    return namedtuple("p", list(rig.numbers)), njit(scope["simulate"])
 
 
 # ---- the problem -----------------------------------------------------------------------------------------------------
@@ -355,7 +346,7 @@ def open_own_rig(
     """
     runs = read_rig_runs(data, rig)
     too_few = few_runs(f"{len(runs)} runs", len(runs))
-    return (None, too_few) if too_few else (OwnRigProblem(runs, CompiledRig(rig), known), [])
+    return (None, too_few) if too_few else (OwnRigProblem(runs, rig, known), [])
 
 
 class OwnRigProblem(RigProblem):
@@ -366,14 +357,13 @@ class OwnRigProblem(RigProblem):
 
     Args:
         runs: of one system.
-        compiled: its equations.
+        rig: its equations.
         known: laws that are in the model from the start.
     """
 
     cap = CAP
 
-    def __init__(self, runs: Sequence[RigRun], compiled: CompiledRig, known: Sequence[PatchEffect] = ()) -> None:
-        rig = compiled.rig
+    def __init__(self, runs: Sequence[RigRun], rig: Rig, known: Sequence[PatchEffect] = ()) -> None:
         super().__init__(rig.name, runs, rig.columns, rig.parameters, rig.laws, rig.windows, known)
         self.rig: Rig = rig
         self.disagreement: float = rig.disagreement
@@ -383,13 +373,13 @@ class OwnRigProblem(RigProblem):
             f"windows of {lengths}"
         )
         self._noise = np.array([column.noise for column in rig.columns])
-        self._runs, self._compiled = tuple(runs), compiled
+        self._runs = tuple(runs)
         self._begun = [np.stack([_state(run, rig, name) for name in rig.states], axis=1) for run in runs]
         self._first_states = [self._window_bases(run) for run in range(len(runs))]
 
     def replayed(self, settings: Sequence[Setting], run: int, length: float) -> Array:
         """Return what the columns would have read (settings, rows, columns), begun anew after every ``length`` s."""
-        return np.stack([self._simulated(self._values(setting), run, length) for setting in settings])
+        return np.stack([self._simulated(self._values(setting), run, length)[0] for setting in settings])
 
     def _values(self, setting: Setting) -> dict[str, float]:
         values = self.rig.numbers
@@ -399,16 +389,13 @@ class OwnRigProblem(RigProblem):
             values |= {name: float(value) for name, value in effect.parameters.items()}
         return values
 
-    def _simulated(
-        self, values: dict[str, float], run: int, length: float, with_states: bool = False, shift: Array | None = None
-    ) -> Array:
-        """One replay (rows, columns) that begins anew after every ``length`` s, with states (states) shifted there."""
-        one, begun = self._runs[run], self._begun[run]
+    def _simulated(self, values: dict[str, float], run: int, length: float, shift: Array | float = 0.0) -> tuple[Array, Array]:
+        """One replay that begins anew after every ``length`` s, with states (states) shifted there; see :func:`simulate`."""
+        one = self._runs[run]
         starts = np.full(len(one.t), -1)
         first = [window.start for window in _windows(one.t, length)]
         starts[first] = first
-        begun = begun if shift is None else begun + shift
-        return self._compiled.simulate(values, one.t, one.inputs, starts, begun, with_states)
+        return simulate(self.rig, values, one.t, one.inputs, starts, self._begun[run] + shift)
 
     def _window_bases(self, run: int) -> list[tuple[slice, slice, Array]]:
         """Windows of a run, their signals, and an orthonormal basis (rows x signals, states) of what its first state changes.
@@ -419,8 +406,8 @@ class OwnRigProblem(RigProblem):
         steps = STATE_STEP * self._begun[run].std(axis=0) + LEAST_STATE_STEP
         missing, found, count = np.isnan(self._runs[run].measured), [], len(self._noise)
         for k, length in enumerate(self.windows):
-            plain = self._simulated(values, run, length)
-            moved = [self._simulated(values, run, length, shift=step) for step in np.diag(steps)]
+            plain = self._simulated(values, run, length)[0]
+            moved = [self._simulated(values, run, length, step)[0] for step in np.diag(steps)]
             changes = np.stack([(one - plain) / self._noise for one in moved], axis=2)
             changes = np.where(missing[:, :, None] | ~np.isfinite(changes), 0.0, changes)
             for rows in _windows(self._runs[run].t, length):
@@ -444,7 +431,7 @@ class OwnRigProblem(RigProblem):
         where it began, and replayed from what noise makes of that.
         """
         values = self._values(setting)
-        clean = [self._simulated(values, run, math.inf) for run in runs]
+        clean = [self._simulated(values, run, math.inf)[0] for run in runs]
         stays = True
         for run, simulated in zip(runs, clean, strict=True):
             measured = self._runs[run].measured
@@ -459,7 +446,7 @@ class OwnRigProblem(RigProblem):
                 continue
             read = zip(runs, clean, drawn, strict=True)
             made = [replace(self._runs[run], measured=one + own) for run, one, own in read]
-            twin = OwnRigProblem(made, self._compiled, self.known)
+            twin = OwnRigProblem(made, self.rig, self.known)
             yield [residual[0] for residual in twin.residuals([setting], range(len(made)))]
 
     def _remade_windows(self, values: dict[str, float], run: int, drawn: Array) -> Array:
@@ -467,8 +454,8 @@ class OwnRigProblem(RigProblem):
         noisy = replace(self._runs[run], measured=drawn)
         shift = np.stack([_state(noisy, self.rig, name) for name in self.rig.states], axis=1)
         made, replayed = (
-            np.concatenate([self._simulated(values, run, length, shift=own) for length in self.windows], axis=1)
-            for own in (None, shift)
+            np.concatenate([self._simulated(values, run, length, own)[0] for length in self.windows], axis=1)
+            for own in (0.0, shift)
         )
         count = len(self.windows)
         found = (made + np.tile(drawn, count) - replayed) / np.tile(self._noise, count)
@@ -480,7 +467,7 @@ class OwnRigProblem(RigProblem):
         values, found = self._values(setting), []
         for run in runs:
             one = self._runs[run]
-            states = self._simulated(values, run, max(self.windows), with_states=True)[:, len(self.rig.columns) :]
+            _, states = self._simulated(values, run, max(self.windows))
             columns = dict(zip(self.rig.states, states.T, strict=True)) | dict(zip(self.rig.inputs, one.inputs.T, strict=True))
             rates = [name for name, source in self.rig.states.items() if source.startswith(RATE_OF)]
             columns |= {f"time since reversal of {name} [s]": since_reversal(one.t, columns[name]) for name in rates}
