@@ -131,19 +131,6 @@ class LinkTree:
     joints: tuple[LinkJoint, ...]
     numbers: Mapping[str, float | list[float]] = field(default_factory=dict)
 
-    def root(self) -> RigidLink:
-        """Return the link that is nobody's child.
-
-        Raises:
-            InputError: none, or several.
-        """
-        children = {joint.child for joint in self.joints}
-        roots = [link for name, link in self.links.items() if name not in children]
-        if len(roots) != 1:
-            names = ", ".join(link.name for link in roots) or "none"
-            raise InputError(f"{self.source}: expected one link that is no joint's child, found {len(roots)}: {names}")
-        return roots[0]
-
 
 def fuse_fixed(tree: LinkTree) -> LinkTree:
     """Return the tree with every link on a fixed joint made a part of its parent.
@@ -234,15 +221,17 @@ class Assembly:
 
 
 def find_assemblies(tree: LinkTree) -> tuple[RigidLink, list[Assembly]]:
-    """Return the body link and its legs with their wheels, in the order lf, rf, lr, rr.
-
-    Args:
-        tree: without fixed joints (:func:`wlr_gym.robot.interchange.recognition.fuse_fixed`).
+    """Return the body link and its legs with their wheels, in the order lf, rf, lr, rr, of a tree without fixed joints.
 
     Raises:
         InputError: another robot; the message names the joint, link or axis that differs.
     """
-    where, body = tree.source, tree.root()
+    where, children = tree.source, {joint.child for joint in tree.joints}
+    roots = [link for name, link in tree.links.items() if name not in children]
+    if len(roots) != 1:
+        names = ", ".join(link.name for link in roots) or "none"
+        raise InputError(f"{where}: expected one link that is no joint's child, found {len(roots)}: {names}")
+    (body,) = roots
     for joint in tree.joints:
         if joint.kind != "hinge":
             raise InputError(f"{where}: joint '{joint.name}' is a {joint.kind}: {EXPECTED}")
