@@ -243,7 +243,15 @@ def find_assemblies(tree: LinkTree) -> tuple[RigidLink, list[Assembly]]:
         names = ", ".join(f"'{joint.name}'" for joint in hips) or "none"
         raise InputError(f"{where}: {len(hips)} joints on body '{body.name}' ({names}), {len(tree.joints)} in all: {EXPECTED}")
     assemblies = [_assembly(tree, joint, below) for joint in hips]
-    return body, _in_corner_order(assemblies, where)
+    places = np.array([[one.leg_frame.position[0], one.wheel_centre[1]] for one in assemblies])
+    found: dict[str, Assembly] = {}
+    for one, (x, y) in zip(assemblies, places - places.mean(axis=0), strict=True):
+        corner = ("l" if y > 0 else "r") + ("f" if x > 0 else "r")
+        if corner in found:
+            both = f"joints '{found[corner].leg_joint.name}' and '{one.leg_joint.name}' are both at the {CORNER_NAMES[corner]}"
+            raise InputError(f"{where}: {both}: expected one leg at each corner, with x forward and y to the left (REP-103)")
+        found[corner] = one
+    return body, [found[corner] for corner in CORNERS]
 
 
 def _assembly(tree: LinkTree, hip: LinkJoint, below: dict[str, list[LinkJoint]]) -> Assembly:
@@ -274,22 +282,6 @@ def _assembly(tree: LinkTree, hip: LinkJoint, below: dict[str, list[LinkJoint]])
     turns = round((signs[0] * middle + angle - math.pi / 2) / (2.0 * math.pi))
     leg, wheel, angle = tree.links[hip.child], tree.links[axle.child], angle - 2.0 * math.pi * turns
     return Assembly(hip, axle, leg, wheel, leg_frame, wheel_frame, signs[0], signs[1], math.hypot(x, z), angle)
-
-
-def _in_corner_order(assemblies: list[Assembly], where: str) -> list[Assembly]:
-    """Sort by the hips' places about their middle."""
-    hips = np.array([[one.leg_frame.position[0], one.wheel_centre[1]] for one in assemblies])
-    middle = hips.mean(axis=0)
-    found: dict[str, Assembly] = {}
-    for one, place in zip(assemblies, hips - middle, strict=True):
-        corner = ("l" if place[1] > 0 else "r") + ("f" if place[0] > 0 else "r")
-        if corner in found:
-            raise InputError(
-                f"{where}: joints '{found[corner].leg_joint.name}' and '{one.leg_joint.name}' are both at the "
-                f"{CORNER_NAMES[corner]}: expected one leg at each corner, with x forward and y to the left (REP-103)"
-            )
-        found[corner] = one
-    return [found[corner] for corner in CORNERS]
 
 
 # ---- numbers ---------------------------------------------------------------------------------------------------------
