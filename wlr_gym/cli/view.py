@@ -46,27 +46,22 @@ def run(options: ViewOptions) -> int:
     """Serve the page until Ctrl-C."""
     import time
 
+    from wlr_gym.data.runs import read_runs
     from wlr_gym.data.watch import open_recordings
     from wlr_gym.render.web.player import Player
 
     require_simulator(options.backend, "a ghost needs a simulator; a real robot repeats a run with wlr replay")
     if not options.segment > 0.0:
         raise InputError(f"--segment {options.segment:g}: expected more than 0 s")
-    runs = _read(options.runs)
+    if not options.runs:
+        raise InputError("expected runs (CSV or Parquet), or folders of runs; wlr import makes runs of other programs' logs")
+    runs = [one for path in options.runs for one in read_runs(path)]
     backend = options.backend if options.ghost else None
     opened = open_recordings(runs, options.robot, backend, options.patch(), options.segment)
     player = Player(_names(runs), opened, FIRST, host=options.host, port=options.port)
     end = float("inf") if options.seconds is None else time.monotonic() + options.seconds
     player.run(lambda: time.monotonic() >= end)
     return OK
-
-
-def _read(paths: Sequence[Path]) -> list[Run]:
-    from wlr_gym.data.runs import read_runs
-
-    if not paths:
-        raise InputError("expected runs (CSV or Parquet), or folders of runs; wlr import makes runs of other programs' logs")
-    return [run for path in paths for run in read_runs(path)]
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
