@@ -220,7 +220,7 @@ def write_targets(options: TargetsOptions) -> int:
 
     body, floor = load_target(options.markers), load_target(options.floor)
     sheets = {f"{target.name}_markers": target_pages(target) for target in (body, floor)}
-    sheets["calibration_board"] = [board_page(Board())]
+    sheets["calibration_board"] = {"calibration_board": board_page(Board())}
     for name in sheets:
         refuse_existing(options.out / f"{name}.pdf", options.force)
     make_output_folder(options.out)

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.learning.evaluation.film import Driver
     from wlr_gym.render.viewer import KeyCallback, Viewer
-    from wlr_gym.render.web.live import WebViewer
+    from wlr_gym.render.web.player import WebViewer
 
     NewViewer = Callable[["PlayOptions", Robot, KeyCallback | None], Viewer | WebViewer]
 
@@ -230,7 +230,7 @@ def _window_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | Non
 
 
 def _web_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> WebViewer:
-    from wlr_gym.render.web.live import HELP, WebViewer
+    from wlr_gym.render.web.player import HELP, WebViewer
 
     viewer = WebViewer(robot, _view(options), on_key, options.host, options.port)
     if on_key is not None:

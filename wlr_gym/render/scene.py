@@ -7,7 +7,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -93,9 +92,7 @@ class Scene:
         Raises:
             InputError: no OpenGL on this machine; the message says what to install or set.
         """
-        if self._stage is None:
-            self._stage = Stage(self.robot, parameters, row, self.view.size)
-        stage = self._stage
+        self._stage = stage = self._stage or Stage(self.robot, parameters, row, self.view.size)
         stage.pose(truth, parameters, row)
         if self._canvas is None or self._scene is None:
             self._canvas = Canvas(stage.model, self.view.size)
@@ -117,9 +114,8 @@ class Scene:
         if not self.view.text:
             return picture
         lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip) + [result] * bool(result)
-        return annotate(
-            picture, lines, legend(parameters, row, self.view), self.view.friction, self._labels(floor, truth.position[row])
-        )
+        notes = self._labels(floor, truth.position[row])
+        return annotate(picture, lines, legend(parameters, row, self.view), self.view.friction, notes)
 
     def pixels(self, points: object) -> NDArray[np.float64]:
         """Return where points (..., 3) of the floor frame are in the last picture: (..., 2) column and row, NaN if behind."""
@@ -148,7 +144,7 @@ class Scene:
             text = (places[:, 0] < 0.48 * width) & ((places[:, 1] < 0.27 * height) | (places[:, 1] > 0.76 * height))
             good = inside & ~text & (np.linalg.norm(places - robot, axis=1) > clear)
             if good.any():
-                notes.append(Note(f"µ {area.mu:.2g}", pair(places[np.argmax(good)])))
+                notes.append((f"µ {area.mu:.2g}", pair(places[np.argmax(good)])))
         return notes
 
 
@@ -227,12 +223,8 @@ BAR_RANGE = (0.0, 1.0)
 MARGIN = 8
 
 
-@dataclass(frozen=True)
-class Note:
-    """A short text at a place of the picture (column, row)."""
-
-    text: str
-    place: tuple[float, float]
+#: A short text, and its place in the picture (column, row).
+Note = tuple[str, tuple[float, float]]
 
 
 @functools.cache
@@ -250,13 +242,38 @@ def annotate(
     image = Image.fromarray(picture)
     draw = ImageDraw.Draw(image, "RGBA")
     size = max(9, round(picture.shape[0] / 34))  # pixels; height of the letters
-    for note in notes:
-        _note(draw, note, image.size, size)
+    step, letters, (width, height) = round(1.35 * size), font(size), image.size
+    for text, (column, row) in notes:
+        half = 0.5 * letters.getlength(text)
+        if half <= column <= width - half and size <= row <= height - size:
+            around = {"stroke_width": 2, "stroke_fill": (255, 255, 255, 200)}
+            draw.text((column, row), text, font=letters, fill=INK, anchor="mm", **around)
     if lines:
-        _box(draw, lines, size)
+        wide = max(letters.getlength(line) for line in lines)
+        draw.rounded_rectangle((MARGIN, MARGIN, wide + 3 * MARGIN, step * len(lines) + 2 * MARGIN), 4, fill=PAPER)
+        for index, line in enumerate(lines):
+            draw.text((2 * MARGIN, 1.5 * MARGIN + step * index), line, font=letters, fill=INK)
     if bar or legend:
-        _legend(draw, legend, bar, image.size, size)
+        wide = max([letters.getlength(line) for line in legend] + [BAR + letters.getlength("µ 0  1") + MARGIN] * bar)
+        top = height - 1.5 * MARGIN - step * (len(legend) + bar)
+        draw.rounded_rectangle((MARGIN, top - MARGIN / 2, 3 * MARGIN + wide, height - MARGIN), 4, fill=PAPER)
+        if bar:
+            _draw_bar(draw, top, size)
+        for index, line in enumerate(legend, start=int(bar)):
+            draw.text((2 * MARGIN, top + step * index), line, font=letters, fill=INK)
     return np.asarray(image)
+
+
+def _draw_bar(draw: ImageDraw.ImageDraw, top: float, size: int) -> None:
+    """Draw which colour stands for which friction, with letters of ``size``."""
+    low, high = BAR_RANGE
+    start = 2 * MARGIN + font(size).getlength(f"µ {low:g} ")
+    draw.text((2 * MARGIN, top), f"µ {low:g}", font=font(size), fill=INK)
+    for column in range(BAR):
+        red, green, blue = friction_colour(low + (high - low) * column / (BAR - 1))
+        colour = (round(255 * red), round(255 * green), round(255 * blue), 255)
+        draw.line((start + column, top + 2, start + column, top + size), fill=colour)
+    draw.text((start + BAR + MARGIN / 2, top), f"{high:g}", font=font(size), fill=INK)
 
 
 def banner(width: int, text: str, height: int) -> Picture:
@@ -269,46 +286,6 @@ def banner(width: int, text: str, height: int) -> Picture:
     return np.asarray(image)
 
 
-def _box(draw: ImageDraw.ImageDraw, lines: Sequence[str], size: int) -> None:
-    step = round(1.35 * size)
-    wide = max(font(size).getlength(line) for line in lines)
-    draw.rounded_rectangle((MARGIN, MARGIN, wide + 3 * MARGIN, step * len(lines) + 2 * MARGIN), 4, fill=PAPER)
-    for index, line in enumerate(lines):
-        draw.text((2 * MARGIN, 1.5 * MARGIN + step * index), line, font=font(size), fill=INK)
-
-
-def _legend(draw: ImageDraw.ImageDraw, lines: Sequence[str], bar: bool, size: tuple[int, int], height: int) -> None:
-    step, letters = round(1.35 * height), font(height)
-    wide = max([letters.getlength(line) for line in lines] + [BAR + letters.getlength("µ 0  1") + MARGIN] * bar)
-    row = size[1] - 1.5 * MARGIN - step * (len(lines) + bar)
-    draw.rounded_rectangle((MARGIN, row - MARGIN / 2, 3 * MARGIN + wide, size[1] - MARGIN), 4, fill=PAPER)
-    if bar:
-        _bar(draw, row, letters, height)
-    for index, line in enumerate(lines, start=int(bar)):
-        draw.text((2 * MARGIN, row + step * index), line, font=letters, fill=INK)
-
-
-def _bar(draw: ImageDraw.ImageDraw, row: float, letters: ImageFont.FreeTypeFont, height: int) -> None:
-    low, high = BAR_RANGE
-    start = 2 * MARGIN + letters.getlength(f"µ {low:g} ")
-    draw.text((2 * MARGIN, row), f"µ {low:g}", font=letters, fill=INK)
-    for column in range(BAR):
-        red, green, blue = friction_colour(low + (high - low) * column / (BAR - 1))
-        colour = (round(255 * red), round(255 * green), round(255 * blue), 255)
-        draw.line((start + column, row + 2, start + column, row + height), fill=colour)
-    draw.text((start + BAR + MARGIN / 2, row), f"{high:g}", font=letters, fill=INK)
-
-
-def _note(draw: ImageDraw.ImageDraw, note: Note, size: tuple[int, int], height: int) -> None:
-    column, row = note.place
-    half = 0.5 * font(height).getlength(note.text)
-    if not (half <= column <= size[0] - half and height <= row <= size[1] - height):
-        return
-    draw.text(
-        (column, row), note.text, font=font(height), fill=INK, anchor="mm", stroke_width=2, stroke_fill=(255, 255, 255, 200)
-    )
-
-
 # ---- the portrait ----------------------------------------------------------------------------------------------------
 
 
@@ -317,17 +294,12 @@ SIZE = (640, 480)
 
 
 def draw_portrait(path: Path, robot: Robot) -> None:
-    """Write the picture (.png, .jpg, ...).
-
-    Args:
-        path: of the file.
-        robot: what stands in it.
+    """Write a picture (.png, .jpg, ...) of a robot at home from two sides, and with its legs at both limits.
 
     Raises:
         InputError: no OpenGL on this machine, or the file cannot be written.
     """
-    low, high = robot.leg_limits
-    home = robot.home.leg_angle
+    parameters, home, (low, high) = Parameters.nominal(robot), robot.home.leg_angle, robot.leg_limits
     x, y, z = robot.body.size
     sizes = [
         f"{robot.name}: {robot.total_mass:.3g} kg",
@@ -335,21 +307,17 @@ def draw_portrait(path: Path, robot: Robot) -> None:
         f"legs {robot.leg.length:g} m, wheels of radius {robot.wheel.radius:g} m",
         "squares 0.2 m",
     ]
-    panels = (
-        _view(robot, "follow", home, sizes),
-        _view(robot, "side", home, [f"home: legs at {home:.3g} rad"]),
-        _view(robot, "side", low, [f"lower limit: legs at {low:.3g} rad"]),
-        _view(robot, "side", high, [f"upper limit: legs at {high:.3g} rad"]),
-    )
+    panels = []
+    for camera, angle, lines in (
+        ("follow", home, sizes),
+        ("side", home, [f"home: legs at {home:.3g} rad"]),
+        ("side", low, [f"lower limit: legs at {low:.3g} rad"]),
+        ("side", high, [f"upper limit: legs at {high:.3g} rad"]),
+    ):
+        state, truth = standing_state(robot, parameters, angle), Truth(np.zeros((1, TRUTH_LAYOUT.width)))
+        for name in ("position", "quaternion", "joint_position"):
+            truth[name][:] = getattr(state, name)
+        with closing(Scene(robot, View(size=SIZE, camera=camera, friction=False, slip=False, text=False))) as scene:
+            panels.append(annotate(scene.draw(truth, parameters), lines, bar=False))
     picture = np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])])
     replace_file(path, lambda temporary: Image.fromarray(picture).save(temporary))
-
-
-def _view(robot: Robot, camera: str, leg_angle: float, lines: list[str]) -> Picture:
-    parameters = Parameters.nominal(robot)
-    state = standing_state(robot, parameters, leg_angle)
-    truth = Truth(np.zeros((1, TRUTH_LAYOUT.width)))
-    for name in ("position", "quaternion", "joint_position"):
-        truth[name][:] = getattr(state, name)
-    with closing(Scene(robot, View(size=SIZE, camera=camera, friction=False, slip=False, text=False))) as scene:
-        return annotate(scene.draw(truth, parameters), lines, bar=False)

@@ -8,15 +8,14 @@ marks: areas of other friction, paths, arrows of slip and force. Nothing here ne
 # (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, assert_never
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
@@ -52,7 +51,7 @@ class Stage:
 
     def __init__(self, robot: Robot, parameters: Parameters, row: int = 0, size: tuple[int, int] = (640, 480)) -> None:
         self.robot = robot
-        self._extend = functools.partial(_dress, robot=robot, size=size)
+        self._size = size
         self.shape: bytes = self._shape_of(parameters, row)
         self.model: Any = self._build(parameters, row)
         self.data: Any = mujoco.MjData(self.model)
@@ -96,25 +95,32 @@ class Stage:
         shape = Parameters.nominal(self.robot)  # masses may be such that MuJoCo takes no model of them; they are not seen
         for name in SHAPING:
             shape[name] = parameters[name][row]
-        model = build_model(self.robot, shape, contacts=False, wheel_shape="capsule", extend=self._extend)
-        colour = friction_colour(float(np.mean([parameters[f"ground.mu_{axis}"][row] for axis in "xy"])))
-        model.geom("floor").rgba = (*colour, 1.0)
+        model = build_model(self.robot, shape, contacts=False, wheel_shape="capsule", extend=self._dress)
+        model.geom("floor").rgba = (*floor_colour(parameters, row), 1.0)
         payload = model.geom("payload")
         payload.size = 0.5 * np.cbrt(parameters["payload.mass"][row] / PAYLOAD_DENSITY)
         payload.rgba[3] = float(parameters["payload.mass"][row] > 0)
         return model
 
+    def _dress(self, spec: mujoco.MjSpec) -> None:
+        _light_and_floor(spec, self._size)
+        _dress_platform(spec.body("body"), self.robot)
+        for leg, wheel in zip(LEGS, WHEELS, strict=True):
+            _geom(spec.body(leg), "CYLINDER", size=[0.022, 0.016, 0], quat=_AXLE, rgba=DARK)
+            _geom(spec.body(leg), "CYLINDER", size=[0.009, 0.018, 0], quat=_AXLE, rgba=METAL)
+            _dress_wheel(spec.body(wheel), self.robot)
+
+
+def floor_colour(parameters: Parameters, row: int) -> Colour:
+    """Return the colour of the bare floor, by its mean friction."""
+    return friction_colour(float(np.mean([parameters[f"ground.mu_{axis}"][row] for axis in "xy"])))
+
 
 # --- dressing ---------------------------------------------------------------------------------------------------------
 
 
-def _dress(spec: mujoco.MjSpec, robot: Robot, size: tuple[int, int]) -> None:
-    _light_and_floor(spec, size)
-    body = spec.body("body")
-    _dress_platform(body, robot)
-    for leg, wheel in zip(LEGS, WHEELS, strict=True):
-        _dress_leg(spec.body(leg))
-        _dress_wheel(spec.body(wheel), robot)
+#: Turns a cylinder, whose own axis is z, to y.
+_AXLE = [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
 
 
 def _light_and_floor(spec: mujoco.MjSpec, size: tuple[int, int]) -> None:
@@ -135,30 +141,18 @@ def _light_and_floor(spec: mujoco.MjSpec, size: tuple[int, int]) -> None:
         name="sky", type=texture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, width=256, height=1536,
         rgb1=[0.62, 0.74, 0.90], rgb2=[0.90, 0.93, 0.97],
     )  # fmt: skip
-    shades = _shades()
-    spec.add_texture(
-        name="squares",
-        type=texture.mjTEXTURE_2D,
-        width=shades.shape[1],
-        height=shades.shape[0],
-        nchannel=4,
-        data=shades.ravel(),
-    )
-    squares = spec.add_material(name="squares", texuniform=True, texrepeat=[1 / SQUARE] * 2, reflectance=0.0, specular=0.0)
-    squares.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "squares"
-    spec.add_material(name="floor", reflectance=0.0, specular=0.0)
-    plane = spec.geom("floor")
-    plane.size, plane.material = [0.0, 0.0, 0.05], "floor"  # without end
-
-
-def _shades() -> NDArray[np.uint8]:
-    """Return two by two squares as a shade (red, green, blue, opacity) to be laid over floors of any colour."""
+    # Two by two squares as a shade (red, green, blue, opacity) to be laid over floors of any colour.
     shades = np.zeros((256, 256, 4), np.uint8)
     # What shines through twice: MuJoCo draws once for the light that casts shadows, once for all others.
     dark, line = (round(255 * (1.0 - np.sqrt(share))) for share in (0.90, 0.62))
     shades[:128, :128, 3] = shades[128:, 128:, 3] = dark
     shades[[0, -1], :, 3] = shades[:, [0, -1], 3] = line
-    return shades
+    spec.add_texture(name="squares", type=texture.mjTEXTURE_2D, width=256, height=256, nchannel=4, data=shades.ravel())
+    squares = spec.add_material(name="squares", texuniform=True, texrepeat=[1 / SQUARE] * 2, reflectance=0.0, specular=0.0)
+    squares.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "squares"
+    spec.add_material(name="floor", reflectance=0.0, specular=0.0)
+    plane = spec.geom("floor")
+    plane.size, plane.material = [0.0, 0.0, 0.05], "floor"  # without end
 
 
 def _dress_platform(body: mujoco.MjsBody, robot: Robot) -> None:
@@ -183,21 +177,14 @@ def _dress_platform(body: mujoco.MjsBody, robot: Robot) -> None:
     _geom(payload, "BOX", name="payload", size=[0.02, 0.02, 0.02], rgba=[0.55, 0.35, 0.15, 1.0])
 
 
-def _dress_leg(leg: mujoco.MjsBody) -> None:
-    axle = [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]  # a cylinder's own axis is z
-    _geom(leg, "CYLINDER", size=[0.022, 0.016, 0], quat=axle, rgba=DARK)
-    _geom(leg, "CYLINDER", size=[0.009, 0.018, 0], quat=axle, rgba=METAL)
-
-
 def _dress_wheel(wheel: mujoco.MjsBody, robot: Robot) -> None:
     """Spokes on both faces, and one orange mark: turning is seen, and how far."""
     radius, half_width = robot.wheel.radius, robot.wheel.width / 2
-    axle = [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
     for index in range(SPOKES):
         half = 0.5 * np.pi * index / SPOKES
         turn = [np.cos(half), 0.0, np.sin(half), 0.0]
         _geom(wheel, "BOX", size=[0.80 * radius, half_width + 0.0008, 0.0028], quat=turn, rgba=METAL)
-    _geom(wheel, "CYLINDER", size=[0.30 * radius, half_width + 0.0016, 0], quat=axle, rgba=METAL)
+    _geom(wheel, "CYLINDER", size=[0.30 * radius, half_width + 0.0016, 0], quat=_AXLE, rgba=METAL)
     _geom(wheel, "BOX", size=[0.10 * radius, half_width + 0.002, 0.005], pos=[0.72 * radius, 0, 0], rgba=ACCENT)
     _geom(wheel, "BOX", size=[0.02 * radius, half_width + 0.0003, 0.004], pos=[0.99 * radius, 0, 0], rgba=ACCENT)
 
@@ -262,11 +249,12 @@ class Area:
 
 @dataclass(frozen=True)
 class Arrow:
-    """An arrow in the floor frame, m."""
+    """An arrow in the floor frame, m; of a path, a piece without a head."""
 
     start: Array
     end: Array
     colour: Colour
+    has_head: bool = True
 
 
 @dataclass(frozen=True)
@@ -276,15 +264,6 @@ class Trail:
     points: Array
     colour: Colour
     dashed: bool = False
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A straight piece of a trail, m."""
-
-    start: Array
-    end: Array
-    colour: Colour
 
 
 @dataclass(frozen=True)
@@ -303,7 +282,7 @@ class Squares:
     material: int
 
 
-Mark = Squares | Area | Spot | Arrow | Piece
+Mark = Squares | Area | Spot | Arrow
 
 
 def squares(stage: Stage, around: Array) -> Squares:
@@ -346,18 +325,15 @@ def spots(stage: Stage, parameters: Parameters, row: int) -> list[Spot]:
     return [Spot(point, float(value)) for point, value in zip(points, mu, strict=True)]
 
 
-def pieces(trail: Trail) -> list[Piece]:
+def pieces(trail: Trail) -> list[Arrow]:
     """Return a trail as straight pieces of at least :data:`PIECE`."""
-    corners = [trail.points[:1]]
+    corners = list(trail.points[:1])
     for point in trail.points[1:]:
-        if np.hypot(*(point - corners[-1][0])) >= PIECE:
-            corners.append(point[None])
-    if len(trail.points) > 1:
-        corners.append(trail.points[-1:])
-    heights = np.full((len(corners), 1), 2.0 * LINE)
-    places = np.hstack([np.concatenate(corners), heights]) if corners else np.zeros((0, 3))
-    every = 2 if trail.dashed else 1
-    return [Piece(a, b, trail.colour) for a, b in list(pairwise(places))[::every] if np.hypot(*(b - a)[:2]) > 1e-6]
+        if np.hypot(*(point - corners[-1])) >= PIECE:
+            corners.append(point)
+    places = [np.append(point, 2.0 * LINE) for point in (*corners, *trail.points[1:][-1:])]
+    parts = list(pairwise(places))[:: 2 if trail.dashed else 1]
+    return [Arrow(a, b, trail.colour, has_head=False) for a, b in parts if np.hypot(*(b - a)[:2]) > 1e-6]
 
 
 def slip_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
@@ -379,24 +355,21 @@ def load_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) ->
     load = truth.contact_force[row].reshape(4, 3)[:, 2]
     points, _, left = stage.contact_frames(parameters, row)
     starts = points + FORCE_BESIDE * OUTWARDS * left
-    length = np.minimum(FORCE_SCALE * load, LONGEST_ARROW)
-    ends = starts + length[:, None] * [0.0, 0.0, 1.0]
-    return [Arrow(starts[wheel], ends[wheel], LOAD) for wheel in range(4) if load[wheel] >= FORCE_FLOOR]
+    ends = starts + np.minimum(FORCE_SCALE * load, LONGEST_ARROW)[:, None] * [0.0, 0.0, 1.0]
+    return [Arrow(starts[wheel], ends[wheel], LOAD) for wheel in np.flatnonzero(load >= FORCE_FLOOR)]
 
 
 def _arrows(
     stage: Stage, parameters: Parameters, row: int, vectors: Array, shortest: float, beside: float, colours: list[Colour]
 ) -> list[Arrow]:
+    """Return an arrow in the floor per wheel with a vector (4, 2) along heading and left, m, that is not too short."""
     points, heading, left = stage.contact_frames(parameters, row)
     starts = points + beside * OUTWARDS * left + [0.0, 0.0, SHAFT + LAYER * 5]
     length = np.hypot(vectors[:, 0], vectors[:, 1])
     scale = np.minimum(1.0, LONGEST_ARROW / np.maximum(length, 1e-12))[:, None]
     ends = starts + scale * (vectors[:, :1] * heading + vectors[:, 1:] * left)
-    return [
-        Arrow(starts[wheel], ends[wheel], colours[wheel])
-        for wheel in range(4)
-        if length[wheel] >= shortest and np.isfinite(length[wheel])
-    ]
+    drawn = np.flatnonzero((length >= shortest) & np.isfinite(length))
+    return [Arrow(starts[wheel], ends[wheel], colours[wheel]) for wheel in drawn]
 
 
 # --- into MuJoCo's scene ----------------------------------------------------------------------------------------------
@@ -413,9 +386,6 @@ def add_marks(scene: mujoco.MjvScene, marks: Iterable[Mark]) -> None:
 
 def _draw(geom: mujoco.MjvGeom, mark: Mark) -> None:
     match mark:
-        case Piece(start, end, colour):
-            _start(geom, "CAPSULE", [LINE, LINE, LINE], start, colour)
-            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, LINE, start, end)
         case Area():
             low, high = np.array(mark.low), np.array(mark.high)
             size, middle = [*(0.5 * (high - low)), mark.height], [*(0.5 * (low + high)), 0.0]
@@ -426,18 +396,16 @@ def _draw(geom: mujoco.MjvGeom, mark: Mark) -> None:
             geom.rgba[3] = 0.99  # only what is not quite opaque is blended with what lies below
         case Spot(centre, mu):
             _start(geom, "CYLINDER", [0.06, LAYER * 5, 0.0], centre * [1.0, 1.0, 0.0], friction_colour(mu))
-        case Arrow(start, end, colour):
-            _start(geom, "ARROW", [SHAFT, SHAFT, SHAFT], start, colour)
-            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, SHAFT, start, end)
-            geom.emission = 0.5
+        case Arrow(start, end, colour, has_head):
+            kind, width = ("ARROW", SHAFT) if has_head else ("CAPSULE", LINE)
+            _start(geom, kind, [width] * 3, start, colour)
+            mujoco.mjv_connector(geom, getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), width, start, end)
+            geom.emission = 0.5 if has_head else geom.emission
         case _:
             assert_never(mark)
 
 
-def _start(geom: mujoco.MjvGeom, kind: str, size: Iterable[float], position: Iterable[float], colour: Colour) -> None:
-    shape = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")
-    place = np.fromiter(position, np.float64)
-    mujoco.mjv_initGeom(
-        geom, shape, np.fromiter(size, np.float64), place, np.eye(3).ravel(), np.array([*colour, 1.0], np.float32)
-    )
+def _start(geom: mujoco.MjvGeom, kind: str, size: Sequence[float], position: ArrayLike, colour: Colour) -> None:
+    shape, turn, paint = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), np.eye(3).ravel(), np.array([*colour, 1.0], np.float32)
+    mujoco.mjv_initGeom(geom, shape, np.array(size, np.float64), np.array(position, np.float64), turn, paint)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value

@@ -84,11 +84,7 @@ class _Film(Image.Image):
         self.seek(0)
 
     def seek(self, frame: int) -> None:
-        """Go to the next frame (going back does nothing: Pillow only rewinds after the last one).
-
-        Raises:
-            EOFError: there are no more.
-        """
+        """Go to the next frame (going back does nothing: Pillow only rewinds after the last one); EOFError after the last."""
         if frame <= self._at:
             return
         picture = next(self._pictures, None)
@@ -103,11 +99,11 @@ class _Film(Image.Image):
 
 
 def _write_webp(path: Path, pictures: Iterator[Picture], fps: float, count: int) -> None:
-    _save(path, pictures, count, format="WEBP", duration=1000.0 / fps, quality=75, method=2, loop=0)
+    _save(path, _Film(pictures, count), count, format="WEBP", duration=1000.0 / fps, quality=75, method=2)
 
 
 def _write_gif(path: Path, pictures: Iterator[Picture], fps: float, count: int) -> None:
-    _save(path, pictures, count, format="GIF", duration=round(100.0 / fps) * 10, loop=0, optimize=False)
+    _save(path, _Film(pictures, count), count, format="GIF", duration=round(100.0 / fps) * 10, optimize=False)
 
 
 def _write_png(path: Path, pictures: Iterator[Picture], fps: float, count: int) -> None:
@@ -118,9 +114,9 @@ def _write_png(path: Path, pictures: Iterator[Picture], fps: float, count: int) 
     first.save(path, format="PNG", save_all=True, append_images=others, duration=round(1000.0 / fps), loop=0)
 
 
-def _save(path: Path, pictures: Iterator[Picture], count: int, **settings: Any) -> None:
+def _save(path: Path, film: _Film, count: int, **settings: Any) -> None:
     try:
-        _Film(pictures, count).save(path, save_all=True, **settings)
+        film.save(path, save_all=True, loop=0, **settings)
     except EOFError as error:
         raise InputError(f"{count} pictures were announced, but there are fewer: {error}") from None
 
@@ -157,25 +153,18 @@ def side_by_side(left: Iterable[Picture], right: Iterable[Picture], titles: tupl
     Raises:
         InputError: pictures of different heights, or an empty film.
     """
+    from wlr_gym.render.scene import banner  # loads MuJoCo; to check a film's name takes none
+
     last: list[Picture | None] = [None, None]
     for pair in zip_longest(left, right):
         last = [new if new is not None else old for new, old in zip(pair, last, strict=True)]
-        yield _join(last, titles)
-
-
-def _join(pictures: list[Picture | None], titles: tuple[str, str]) -> Picture:
-    from wlr_gym.render.scene import banner  # loads MuJoCo; to check a film's name takes none
-
-    one, two = pictures
-    if one is None or two is None:
-        raise InputError(f"film '{titles[0 if one is None else 1]}' has no pictures")
-    if one.shape[0] != two.shape[0]:
-        raise InputError(f"pictures are {one.shape[0]} and {two.shape[0]} pixels high, expected one height for both films")
-    height = one.shape[0]
-    parts = [one, np.full((height, GAP, 3), 255, np.uint8), two]
-    if any(titles):
-        strip = max(18, height // 16)
-        labels = [banner(picture.shape[1], title, strip) for picture, title in zip((one, two), titles, strict=True)]
-        top = np.hstack([labels[0], np.full((strip, GAP, 3), 255, np.uint8), labels[1]])
-        return np.vstack([top, np.hstack(parts)])
-    return np.hstack(parts)
+        shown = [picture for picture in last if picture is not None]
+        if len(shown) < 2:
+            raise InputError(f"film '{titles[0 if last[0] is None else 1]}' has no pictures")
+        height, other = (picture.shape[0] for picture in shown)
+        if height != other:
+            raise InputError(f"pictures are {height} and {other} pixels high, expected one height for both films")
+        if any(titles):
+            labels = [banner(one.shape[1], title, max(18, height // 16)) for one, title in zip(shown, titles, strict=True)]
+            shown = [np.vstack(pair) for pair in zip(labels, shown, strict=True)]
+        yield np.hstack([shown[0], np.full((shown[0].shape[0], GAP, 3), 255, np.uint8), shown[1]])

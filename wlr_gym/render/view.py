@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name
 
 if TYPE_CHECKING:
     import mujoco
@@ -51,8 +51,7 @@ class View:
     text: bool = True
 
     def __post_init__(self) -> None:
-        if self.camera not in CAMERAS:
-            raise unknown_name("camera", str(self.camera), CAMERAS, "view")
+        check_name("camera", self.camera, CAMERAS, "view")
         size = self.size
         if not (isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and fits(int(n)) for n in size)):
             raise InputError(f"view: size = {size!r}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
@@ -75,10 +74,8 @@ def read_view(given: View | Mapping[str, Any] | None) -> View:
     """
     if isinstance(given, View):
         return given
-    valid = [field.name for field in fields(View)]
     for key in given or {}:
-        if key not in valid:
-            raise unknown_name("key", str(key), valid, "view")
+        check_name("key", key, [field.name for field in fields(View)], "view")
     return View(**(given or {}))
 
 
@@ -97,8 +94,7 @@ class FollowCamera:
 
     Attributes:
         azimuth: rad, horizontal direction of view from the floor's x axis (or the robot's heading) to the left.
-        elevation: rad, negative looks down.
-        distance: m from the robot.
+        elevation: rad, negative looks down. distance: m from the robot.
         turns: the azimuth counts from the robot's heading; else the camera keeps its direction.
     """
 
@@ -142,15 +138,20 @@ def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, 
         up: (3,) unit vector against gravity in the floor frame.
         scale: factor on distance and height; see :func:`magnification`.
     """
-    azimuth = camera.azimuth + (yaw if camera.turns else 0.0)
-    flat, rise = math.cos(camera.elevation), math.sin(camera.elevation)
-    forward = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), rise])
-    above = np.array([-rise * math.cos(azimuth), -rise * math.sin(azimuth), flat])
-    tilt = _rotation_from_z_to(up)
+    skew = np.array([[0.0, 0.0, up[0]], [0.0, 0.0, up[1]], [-up[0], -up[1], 0.0]])
+    tilt = np.eye(3) + skew + skew @ skew / (1.0 + up[2])  # the smallest rotation that takes z to ``up``
+    forward, above = (tilt @ direction for direction in directions(camera, yaw))
     target = np.array([place[0], place[1], scale * LOOK_HEIGHT])
     for eye in scene.camera:
-        eye.forward, eye.up = tilt @ forward, tilt @ above
-        eye.pos = target - scale * camera.distance * (tilt @ forward)
+        eye.forward, eye.up = forward, above
+        eye.pos = target - scale * camera.distance * forward
+
+
+def directions(camera: FollowCamera, yaw: float = 0.0) -> tuple[Array, Array]:
+    """Return where a camera looks and what is up in its picture, both (3,), for a robot that heads along ``yaw`` (rad)."""
+    azimuth = camera.azimuth + (yaw if camera.turns else 0.0)
+    flat, rise, c, s = math.cos(camera.elevation), math.sin(camera.elevation), math.cos(azimuth), math.sin(azimuth)
+    return np.array([flat * c, flat * s, rise]), np.array([-rise * c, -rise * s, flat])
 
 
 def project(scene: mujoco.MjvScene, points: ArrayLike, size: tuple[int, int]) -> Array:
@@ -165,13 +166,6 @@ def project(scene: mujoco.MjvScene, points: ArrayLike, size: tuple[int, int]) ->
     return np.stack([column, 0.5 * size[1] - scale * (seen @ up) / depth], axis=-1)
 
 
-def _rotation_from_z_to(up: Array) -> Array:
-    """Return the smallest rotation (3, 3) that takes z to ``up``."""
-    x, y, z = up
-    skew = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
-    return np.eye(3) + skew + skew @ skew / (1.0 + z)
-
-
 # ---- whether a window can be opened here -----------------------------------------------------------------------------
 
 
@@ -181,11 +175,7 @@ def has_display() -> bool:
 
 
 def require_display() -> None:
-    """Raise where no window can be opened.
-
-    Raises:
-        InputError: no display; the message says what to do instead.
-    """
+    """Raise :class:`InputError` where no window can be opened; the message says what to do instead."""
     if not has_display():
         raise InputError(
             "no display here (neither DISPLAY nor WAYLAND_DISPLAY is set), so no window: make a video instead "

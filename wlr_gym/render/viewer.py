@@ -11,8 +11,7 @@ import importlib
 import platform
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -28,24 +27,8 @@ from wlr_gym.robot.parameters import Parameters
 KeyCallback = Callable[[int], None]
 
 
-class Window(Protocol):
-    """What is used of ``mujoco.viewer``'s handle."""
-
-    cam: Any
-    user_scn: Any
-
-    def is_running(self) -> bool: ...
-    def lock(self) -> AbstractContextManager[Any]: ...
-    def sync(self) -> None: ...
-    def set_texts(self, texts: Any) -> None: ...
-    def close(self) -> None: ...
-
-
-OpenWindow = Callable[[mujoco.MjModel, mujoco.MjData, KeyCallback | None], Window]
-
-
-def open_window(model: mujoco.MjModel, data: mujoco.MjData, on_key: KeyCallback | None) -> Window:
-    """Open MuJoCo's viewer without its side panels.
+def open_window(model: mujoco.MjModel, data: mujoco.MjData, on_key: KeyCallback | None) -> Any:
+    """Open MuJoCo's viewer without its side panels, and return its handle.
 
     Raises:
         InputError: no display, or a Python that cannot have one.
@@ -60,11 +43,7 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData, on_key: KeyCallback 
 
 
 class Pace:
-    """Waits for the next tick, in real time.
-
-    Args:
-        clock, sleep: what time it is, and how to wait (tests).
-    """
+    """Waits for the next tick, in real time; ``clock`` and ``sleep`` are what time it is, and how to wait (tests)."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
         self._clock, self._sleep = clock, sleep
@@ -99,14 +78,14 @@ class Viewer:
         robot: Robot,
         view: View | None = None,
         on_key: KeyCallback | None = None,
-        open: OpenWindow = open_window,
+        open: Callable[..., Any] = open_window,
         pace: Pace | None = None,
     ) -> None:
         self.robot = robot
         self.view: View = view or View()
         self._on_key, self._open, self._pace = on_key, open, pace or Pace()
         self._stage: Stage | None = None
-        self._window: Window | None = None
+        self._window: Any = None
 
     @property
     def is_open(self) -> bool:
@@ -136,9 +115,7 @@ class Viewer:
         Raises:
             InputError: no display.
         """
-        if self._stage is None:
-            self._stage = Stage(self.robot, parameters, row, self.view.size)
-        stage = self._stage
+        self._stage = stage = self._stage or Stage(self.robot, parameters, row, self.view.size)
         stage.pose(truth, parameters, row)
         if self._window is None:
             self._window = self._open(stage.model, stage.data, self._on_key)

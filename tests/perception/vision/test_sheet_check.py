@@ -25,7 +25,7 @@ def changed(target, factors=(1.0, 1.0), codes=None):
 
 def test_right_sheets_are_right(studio, photo):
     body, floor = check_sheets(photo, studio.camera, [studio.body, studio.floor])
-    assert body.warnings == floor.warnings == ()
+    assert body.warnings == floor.warnings == []
     assert body.stretch is not None
     assert abs(body.stretch[0] - body.stretch[1]) < max(0.001, 3 * body.difference_std)
     assert floor.stretch is None  # four prints
@@ -51,7 +51,7 @@ def test_a_layout_beyond_its_tolerance_is_named(studio, photo):
     laid = changed(studio.floor, (1.008, 0.994))
     loose, strict = check_sheets(photo, studio.camera, [laid, laid.model_copy(update={"tolerance": 5e-4})])
     assert loose.misfit > 2e-3
-    assert loose.warnings == ()
+    assert loose.warnings == []
     assert "measure the layout anew" in strict.warnings[0]
 
 

@@ -10,9 +10,8 @@ from wlr_gym.render.stage import Arrow, Stage
 from wlr_gym.render.teleop import UP
 from wlr_gym.render.view import View
 from wlr_gym.render.web.figure import Figure, PageFloor
-from wlr_gym.render.web.live import KEYS, Past, WebViewer, curves_of
 from wlr_gym.render.web.page import NOTHING, Curve, close_server, open_server
-from wlr_gym.render.web.player import Moment, Player
+from wlr_gym.render.web.player import KEYS, Moment, Player, WebViewer
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -96,42 +95,44 @@ def test_the_floor_has_areas_and_pads_of_other_friction(server, parameters):
     assert "/floor/area_0" not in server.scene._handle_from_node_name
 
 
-def test_a_page_of_a_running_plant_shows_it_and_hands_its_keys_on(parameters):
+@pytest.fixture
+def live():
+    """A page of a running plant, the keys that it has handed on, and its pace."""
     pressed, pace = [], NoPace()
     viewer = WebViewer(ROBOT, View(forces=True), pressed.append, port=PORT + 100, pace=pace)
-    try:
-        truth = truth_of(parameters, position=[[0.3, 0.0, 0.17]], contact_force=[[0, 0, 8.0] * 4])
-        for k in range(3):
-            assert viewer.show(truth, parameters, period=0.02, time=0.02 * k, command={"yaw_rate": 0.3}, title="me")
-        assert pace.periods == [0.02] * 3
-        assert np.allclose(node(viewer.server, "/floor").position, [-0.3, 0.0, 0.0])
-        assert "me<br>t 0.00 s" in viewer._text.content
-        arrows = node(viewer.server, "/floor/robot/arrows").points
-        lengths = np.linalg.norm(np.diff(arrows[:4], axis=1), axis=-1)
-        assert np.allclose(lengths, 8.0 * 0.025)
-        commands = {one.label: one for one in viewer.server.gui._command_handle_from_uuid.values()}
-        assert {one.hotkey for one in commands.values()} == set(KEYS)
-        for call in commands["faster"]._impl.trigger_cb:
-            call(None)
-        assert pressed == [UP]
-    finally:
-        viewer.close()
+    yield viewer, pressed, pace
+    viewer.close()
 
 
-def test_plots_of_a_running_plant_hold_the_last_seconds(parameters):
-    past, truth = Past(), truth_of(parameters)
+def test_a_page_of_a_running_plant_shows_it_and_hands_its_keys_on(live, parameters):
+    viewer, pressed, pace = live
+    truth = truth_of(parameters, position=[[0.3, 0.0, 0.17]], contact_force=[[0, 0, 8.0] * 4])
+    for k in range(3):
+        assert viewer.show(truth, parameters, period=0.02, time=0.02 * k, command={"yaw_rate": 0.3}, title="me")
+    assert pace.periods == [0.02] * 3
+    assert np.allclose(node(viewer.server, "/floor").position, [-0.3, 0.0, 0.0])
+    assert "me<br>t 0.00 s" in viewer._text.content
+    arrows = node(viewer.server, "/floor/robot/arrows").points
+    assert np.allclose(np.linalg.norm(np.diff(arrows[:4], axis=1), axis=-1), 8.0 * 0.025)
+    commands = {one.label: one for one in viewer.server.gui._command_handle_from_uuid.values()}
+    assert {one.hotkey for one in commands.values()} == set(KEYS)
+    for call in commands["faster"]._impl.trigger_cb:
+        call(None)
+    assert pressed == [UP]
+
+
+def test_plots_of_a_running_plant_hold_the_last_seconds(live, parameters):
+    viewer, truth = live[0], truth_of(parameters)
     for k in range(3000):
         truth["contact_force"][0, 2] = k
-        past.note(truth, 0, 0.02 * k)
-    t, values = past.arrays()
-    assert t[0] == pytest.approx(39.98)
-    assert t[-1] == pytest.approx(59.98)
-    curves = curves_of("contact_force", t, values)
+        viewer._note(truth, 0, 0.02 * k)
+    curves = viewer.curves("contact_force")
+    assert curves[0].t[[0, -1]] == pytest.approx([39.98, 59.98])
     assert curves[2].label == "contact_force[wheel_lf,z]"
     assert curves[2].values[-1] == 2999
     assert len(curves) == 12
-    past.note(truth, 0, 0.0)
-    assert len(past.arrays()[0]) == 1
+    viewer._note(truth, 0, 0.0)
+    assert len(viewer.curves("contact_force")[0].t) == 1
 
 
 class Line:

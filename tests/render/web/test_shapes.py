@@ -9,7 +9,7 @@ pytest.importorskip("viser", minversion="1.1", reason="needs the extra web")
 from wlr_gym.base.errors import InputError
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, up_direction
-from wlr_gym.render.web.figure import bodies, joined
+from wlr_gym.render.web.figure import bodies
 from wlr_gym.render.web.page import Address, Curve, aligned, eye, floor_pose, open_server, thinned
 from wlr_gym.robot import WHEELS, load_robot
 from wlr_gym.robot.parameters import Parameters
@@ -27,7 +27,7 @@ def test_bodies_fill_the_boxes_that_mujoco_has_around_their_geoms(stage):
     model, found = stage.model, {body.name: body for body in bodies(stage)}
     assert set(found) == {"body", *(f"{kind}_{corner}" for kind in ("leg", "wheel") for corner in ("lf", "rf", "lr", "rr"))}
     for body in found.values():
-        whole = joined(body, (0.0, 0.0, 0.0))
+        whole = body.whole
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for geom in range(model.body_geomadr[body.index], model.body_geomadr[body.index] + model.body_geomnum[body.index]):
             if model.geom_group[geom] == 3:
@@ -40,15 +40,13 @@ def test_bodies_fill_the_boxes_that_mujoco_has_around_their_geoms(stage):
         assert (whole.vertices <= high + 1e-6).all()
         # spokes stand askew in their boxes, and what is round has 32 sides
         assert np.allclose([whole.vertices.min(axis=0), whole.vertices.max(axis=0)], [low, high], atol=2e-3)
-        assert sum(len(one.faces) for one in body.surfaces) == len(whole.faces)
+        assert sum(len(mesh.faces) for mesh, _ in body.surfaces) == len(whole.faces)
 
 
 def test_a_wheel_is_as_wide_and_round_as_its_parameters_say():
     parameters = Parameters.nominal(ROBOT)
     parameters["wheel.radius"][0, 0] = 0.05
-    radii = {
-        body.name: np.hypot(*joined(body, (0, 0, 0)).vertices[:, [0, 2]].T).max() for body in bodies(Stage(ROBOT, parameters))
-    }
+    radii = {body.name: np.hypot(*body.whole.vertices[:, [0, 2]].T).max() for body in bodies(Stage(ROBOT, parameters))}
     assert radii[WHEELS[0]] == pytest.approx(0.05, abs=2e-3)
     assert radii[WHEELS[1]] == pytest.approx(ROBOT.wheel.radius, abs=2e-3)
 
@@ -56,8 +54,7 @@ def test_a_wheel_is_as_wide_and_round_as_its_parameters_say():
 def test_faces_look_outwards(stage):
     """The volume that closed surfaces enclose is positive when faces go round against the clock."""
     for body in bodies(stage):
-        whole = joined(body, (0.0, 0.0, 0.0))
-        a, b, c = (whole.vertices[whole.faces[:, k]] for k in range(3))
+        a, b, c = (body.whole.vertices[body.whole.faces[:, k]] for k in range(3))
         assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0.0
 
 
@@ -107,14 +104,16 @@ def test_curves_of_different_times_share_one_axis_and_have_no_holes():
     assert now.max() > 10.0
 
 
-def test_the_way_through_ssh_is_printed_as_the_login_tells_it():
+def test_the_way_through_ssh_is_printed_as_the_login_tells_it(monkeypatch):
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.5 5555 192.168.7.2 2222")
     address = Address("localhost", 8081)
-    here, there = address.lines({"SSH_CONNECTION": "10.0.0.5 5555 192.168.7.2 2222"})
+    here, there = address.lines()
     assert "http://localhost:8081" in here
     assert "ssh -p 2222 -N -L 8081:localhost:8081 " in there
     assert "@192.168.7.2" in there
     assert Address("0.0.0.0", 80).url == "http://localhost:80"
-    assert "-p" not in address.lines({"SSH_CONNECTION": "10.0.0.5 5555 192.168.7.2 22"})[1]
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.5 5555 192.168.7.2 22")
+    assert "-p" not in address.lines()[1]
 
 
 def test_an_address_of_another_machine_and_a_port_that_is_none_are_refused():

@@ -1,7 +1,7 @@
 """Sheets to print at 100 %, and their check from one photograph.
 
-The robot's markers, one page per floor marker, the calibration board: SVG and PDF, to scale. A page is a list of shapes in
-millimetres, x right, y down from its upper left corner. Every page has a ruler of 100 mm: a printer that scales shows there.
+The robot's markers, one page per floor marker, the calibration board: SVG and PDF, to scale. Every page has a ruler of 100 mm:
+a printer that scales shows there.
 
 The camera's calibration makes tilt and distance known, so four markers in a plane leave two things that a photograph shows: how
 much more the print is stretched along x than along y, and how far the layout is out of square. Its scale needs a caliper.
@@ -10,7 +10,7 @@ much more the print is stretched along x than along y, and how far the layout is
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,186 +23,139 @@ from wlr_gym.perception.markers.calibration import Board
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection, Image, detect
 from wlr_gym.perception.markers.pose import FLOOR_TOLERANCE, find_laid_target, sheet_fault
-from wlr_gym.perception.markers.targets import QUIET_ZONE, Marker, Target, ring_radii
+from wlr_gym.perception.markers.targets import QUIET_ZONE, Target, ring_radii
 from wlr_gym.perception.vision.adjustment import TargetView, adjust
 from wlr_gym.perception.vision.tracking import check_size, seen_at
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
 
 # Landscape, mm.
 A4 = (297.0, 210.0)
 A3 = (420.0, 297.0)
-# Shade: 0 black to 1 white.
-_BLACK = 0.0
-_GREY = 0.6
 _MARGIN = 8.0  # mm that printers leave white
 _INCH = 25.4  # mm
 
 
-@dataclass(frozen=True)
-class Disc:
-    """A filled circle: centre and radius (mm), shade 0 black to 1 white."""
-
-    x: float
-    y: float
-    radius: float
-    shade: float = _BLACK
-
-
-@dataclass(frozen=True)
-class Box:
-    """A filled rectangle: upper left corner and size (mm)."""
-
-    x: float
-    y: float
-    width: float
-    height: float
-    shade: float = _BLACK
-
-
-@dataclass(frozen=True)
-class Text:
-    """A line of text that starts at (x, y), height in mm."""
-
-    x: float
-    y: float
-    height: float
-    words: str
+def target_pages(target: Target) -> dict[str, Figure]:
+    """Name -> page: all markers on one when they fit on A3, else one A4 page per marker."""
+    positions, codes = 1000 * target.positions[:, :2], target.codes.tolist()
+    if _is_one_print(target):
+        page, axes = _new_page(A3, f"{target.name} markers", 0.32 * A3[0])
+        middle = 0.5 * (positions.max(axis=0) + positions.min(axis=0))
+        x, y = A3[0] / 2 - middle[0], A3[1] / 2 + middle[1]  # of the target's origin
+        for radius, code, place in zip(target.radii, codes, positions, strict=True):
+            _draw_marker(axes, x + place[0], y - place[1], radius, code)
+        _draw_box(axes, x - 15, y - 0.1, 30, 0.2, 0.6)
+        _draw_box(axes, x - 0.1, y - 15, 0.2, 30, 0.6)
+        _write(axes, x + 18, y + 2, 6, "x, front \u2192")
+        _write(axes, x + 2, y - 17, 4, f"origin of the {target.name}")
+        return {f"{target.name}_markers": page}
+    pages = {}
+    for marker, code in zip(target.markers, codes, strict=True):
+        place = ", ".join(f"{value:g}" for value in marker.position[:2])
+        page, axes = _new_page(A4, f"{target.name} marker '{marker.name}', centre at ({place}) m")
+        x, y, reach = A4[0] / 2, A4[1] / 2 - 8, 1000 * QUIET_ZONE * marker.radius + 4
+        _draw_marker(axes, x, y, marker.radius, code)
+        for side in (-1, 1):  # ticks to align the sheet by
+            _draw_box(axes, x + side * reach - 4, y - 0.1, 8, 0.2)
+            _draw_box(axes, x - 0.1, y + side * reach - 4, 0.2, 8)
+        pages[f"{target.name}_marker_{marker.name}"] = page
+    return pages
 
 
-Shape = Disc | Box | Text
-
-
-@dataclass(frozen=True)
-class Page:
-    """A page: name, size (mm), shapes, drawn in order."""
-
-    name: str
-    size: tuple[float, float]
-    shapes: tuple[Shape, ...]
-
-
-def target_pages(target: Target) -> list[Page]:
-    """All markers on one page when they fit on A3, else one A4 page per marker."""
-    positions, reach = 1000 * target.positions[:, :2], 1000 * QUIET_ZONE * target.radii.max()
-    if np.all(np.ptp(positions, axis=0) + 2 * reach < np.array(A3) - _MARGIN):
-        return [_together(target, positions)]
-    return [_alone(target, marker) for marker in target.markers]
-
-
-def board_page(board: Board) -> Page:
+def board_page(board: Board) -> Figure:
     """The calibration board on the smallest of A4 and A3 that takes it."""
     width, height = 1000 * board.square * board.columns, 1000 * board.square * board.rows
     size = A4 if width < A4[0] - 2 * _MARGIN and height < A4[1] - 35 else A3
     left, top = (size[0] - width) / 2, (size[1] - height) / 2 - 4
+    page, axes = _new_page(size, f"calibration board, {board.columns} x {board.rows} squares of {1000 * board.square:g} mm")
     module = 50 * board.square  # a square is twenty half modules of its marker, so that all edges are whole
     pixels = board.aruco().generateImage((20 * board.columns, 20 * board.rows), marginSize=0, borderBits=1)
-    shapes = [Box(left + x * module, top + y * module, w * module, h * module) for x, y, w, h in _black_boxes(pixels < 128)]
-    words = f"calibration board, {board.columns} x {board.rows} squares of {1000 * board.square:g} mm"
-    return Page("calibration_board", size, (*shapes, *_ruler(size, words)))
+    for x, y, across, down in _black_boxes(pixels < 128):
+        _draw_box(axes, left + x * module, top + y * module, across * module, down * module)
+    return page
 
 
-def write_pages(folder: Path, name: str, pages: Sequence[Page]) -> list[Path]:
-    """Write ``name``.pdf with all pages, and one SVG per page; return the paths."""
+def write_pages(folder: Path, name: str, pages: Mapping[str, Figure]) -> list[Path]:
+    """Write ``name``.pdf with all pages, and one SVG per page by its name; return the paths."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_pdf import PdfPages
 
     def write_pdf(path: Path) -> None:
         with PdfPages(path, metadata={"CreationDate": None}) as file:
-            for figure in figures:
-                file.savefig(figure)
+            for page in pages.values():
+                file.savefig(page)
 
-    figures, paths = [drawn(page) for page in pages], [folder / f"{name}.pdf"]
+    paths = [folder / f"{name}.pdf", *(folder / f"{page}.svg" for page in pages)]
     replace_file(paths[0], write_pdf)
-    for page, figure in zip(pages, figures, strict=True):
-        paths.append(folder / f"{page.name}.svg")
-        with rc_context({"svg.hashsalt": page.name}):  # else every writing names its parts anew
-            replace_file(paths[-1], lambda path, figure=figure: figure.savefig(path, format="svg", metadata={"Date": None}))
+    for path, (own, page) in zip(paths[1:], pages.items(), strict=True):
+        with rc_context({"svg.hashsalt": own}):  # else every writing names its parts anew
+            replace_file(path, lambda part, page=page: page.savefig(part, format="svg", metadata={"Date": None}))
     return paths
 
 
-def marker_shapes(marker: Marker, code: int, x: float, y: float) -> list[Shape]:
-    """The three circles of a marker about (x, y) in mm."""
-    return [
-        Disc(x, y, 1000 * marker.radius * share, shade) for share, shade in zip(ring_radii(code), (0.0, 1.0, 0.0), strict=True)
-    ]
+def _is_one_print(target: Target) -> bool:
+    """Whether the markers fit on one page of A3."""
+    reach = 1000 * QUIET_ZONE * target.radii.max()
+    return bool(np.all(1000 * np.ptp(target.positions[:, :2], axis=0) + 2 * reach < np.array(A3) - _MARGIN))
 
 
-def _together(target: Target, positions: np.ndarray) -> Page:
-    middle = 0.5 * (positions.max(axis=0) + positions.min(axis=0))
-    centre = np.array(A3) / 2
-    shapes: list[Shape] = []
-    for marker, code, (x, y) in zip(target.markers, target.codes, positions, strict=True):
-        shapes += marker_shapes(marker, int(code), centre[0] + x - middle[0], centre[1] - y + middle[1])
-    x, y = centre[0] - middle[0], centre[1] + middle[1]
-    shapes += [Box(x - 15, y - 0.1, 30, 0.2, _GREY), Box(x - 0.1, y - 15, 0.2, 30, _GREY)]
-    shapes += [Text(x + 18, y + 2, 6, "x, front \u2192"), Text(x + 2, y - 17, 4, f"origin of the {target.name}")]
-    return Page(f"{target.name}_markers", A3, (*shapes, *_ruler(A3, f"{target.name} markers", 0.32 * A3[0])))
-
-
-def _alone(target: Target, marker: Marker) -> Page:
-    x, y = A4[0] / 2, A4[1] / 2 - 8
-    code = int(target.codes[target.markers.index(marker)])
-    reach = 1000 * QUIET_ZONE * marker.radius
-    ticks: list[Shape] = []
-    for side in (-1, 1):
-        ticks += [Box(x + side * (reach + 4) - 4, y - 0.1, 8, 0.2), Box(x - 0.1, y + side * (reach + 4) - 4, 0.2, 8)]
-    place = ", ".join(f"{value:g}" for value in marker.position[:2])
-    words = f"{target.name} marker '{marker.name}', centre at ({place}) m"
-    shapes = [*marker_shapes(marker, code, x, y), *ticks, *_ruler(A4, words)]
-    return Page(f"{target.name}_marker_{marker.name}", A4, tuple(shapes))
-
-
-def _ruler(size: tuple[float, float], words: str, left: float = 2 * _MARGIN) -> list[Shape]:
-    y = size[1] - _MARGIN - 2
-    marks: list[Shape] = [Box(left, y, 100, 0.3)]
-    marks += [Box(left + 10 * k - 0.1, y - (4 if k % 5 == 0 else 2), 0.2, 4 if k % 5 == 0 else 2) for k in range(11)]
-    return [*marks, Text(left, y - 6, 3.5, f"100 mm: measure it. {words}. Print at 100 %, not fitted to the page.")]
-
-
-def _black_boxes(black: np.ndarray) -> list[tuple[int, int, int, int]]:
-    """Cover black pixels with rectangles (x, y, width, height): runs along rows, joined downwards where they are equal."""
-    boxes: list[tuple[int, int, int, int]] = []
-    growing: dict[tuple[int, int], tuple[int, int]] = {}
-    for y, row in enumerate([*black, np.zeros(black.shape[1], bool)]):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], row.astype(int), [0]])))
-        runs = {(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)}
-        for run, (top, height) in list(growing.items()):
-            if run not in runs:
-                boxes.append((run[0], top, run[1] - run[0], height))
-                del growing[run]
-        for run in runs:
-            top, height = growing.get(run, (y, 0))
-            growing[run] = (top, height + 1)
-    return boxes
-
-
-def drawn(page: Page) -> Figure:
-    """Return a page as a figure of its size, to be saved as SVG or PDF; one unit of its axes is 1 mm."""
+def _new_page(size: tuple[float, float], words: str, left: float = 2 * _MARGIN) -> tuple[Figure, Axes]:
+    """A page with its ruler; a unit of its axes is 1 mm, x right, y down from the upper left corner."""
     from matplotlib.figure import Figure
-    from matplotlib.patches import Circle, Rectangle
 
-    width, height = page.size
-    figure = Figure((width / _INCH, height / _INCH), facecolor="white")
-    axes = figure.add_axes((0, 0, 1, 1))
+    width, height = size
+    page = Figure((width / _INCH, height / _INCH), facecolor="white")
+    axes = page.add_axes((0, 0, 1, 1))
     axes.set(xlim=(0, width), ylim=(height, 0))
     axes.set_axis_off()
-    for order, shape in enumerate(page.shapes):
-        if isinstance(shape, Text):
-            axes.text(shape.x, shape.y, shape.words, fontsize=72 / _INCH * shape.height, zorder=order)
-        elif isinstance(shape, Disc):
-            axes.add_patch(Circle((shape.x, shape.y), shape.radius, color=str(shape.shade), linewidth=0, zorder=order))
-        else:
-            corner = shape.x, shape.y
-            axes.add_patch(Rectangle(corner, shape.width, shape.height, color=str(shape.shade), linewidth=0, zorder=order))
-    return figure
+    y = height - _MARGIN - 2
+    _draw_box(axes, left, y, 100, 0.3)
+    for k in range(11):
+        length = 4 if k % 5 == 0 else 2
+        _draw_box(axes, left + 10 * k - 0.1, y - length, 0.2, length)
+    _write(axes, left, y - 6, 3.5, f"100 mm: measure it. {words}. Print at 100 %, not fitted to the page.")
+    return page, axes
+
+
+def _draw_marker(axes: Axes, x: float, y: float, radius: float, code: int) -> None:
+    from matplotlib.patches import Circle
+
+    for share, colour in zip(ring_radii(code), ("black", "white", "black"), strict=True):
+        axes.add_patch(Circle((x, y), 1000 * radius * share, color=colour, linewidth=0))
+
+
+def _draw_box(axes: Axes, x: float, y: float, width: float, height: float, shade: float = 0.0) -> None:
+    from matplotlib.patches import Rectangle
+
+    axes.add_patch(Rectangle((x, y), width, height, color=str(shade), linewidth=0))
+
+
+def _write(axes: Axes, x: float, y: float, height: float, words: str) -> None:
+    axes.text(x, y, words, fontsize=72 / _INCH * height)
+
+
+def _black_boxes(black: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
+    """Cover black pixels with rectangles (x, y, width, height): runs along rows, joined downwards where they are equal."""
+    boxes: list[tuple[int, int, int, int]] = []
+    growing: dict[tuple[int, int], int] = {}  # run -> the row in which it began
+    for y, row in enumerate([*black, np.zeros(black.shape[1], bool)]):
+        edges = np.flatnonzero(np.diff(row.astype(int), prepend=0, append=0)).tolist()
+        runs = set(zip(edges[::2], edges[1::2], strict=True))
+        for start, stop in growing.keys() - runs:
+            top = growing.pop((start, stop))
+            boxes.append((start, top, stop - start, y - top))
+        for run in runs:
+            growing.setdefault(run, y)
+    return sorted(boxes)
 
 
 # --- check of a photograph --------------------------------------------------------------------------------------------
 
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-Array = NDArray[np.float64]
 
 #: 1 sigma of a print's stretch before the photograph is looked at, where the target file states none.
 _STRETCH = 0.01
@@ -234,27 +187,27 @@ class SheetCheck:
     misfit: float = 0.0
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self) -> list[str]:
         """What should be corrected before anything is measured."""
-        return (self.fault,) if self.fault else tuple(self._warnings())
-
-    def _warnings(self) -> Iterator[str]:
-        target = self.target
+        if self.fault:
+            return [self.fault]
+        target, found = self.target, []
         if self.stretch is not None and self.stretch_std is not None:
             x, y = self.stretch
             stated = math.hypot(target.stretch, _RIGHT)
             if abs(x - y) > _FAR * math.hypot(stated, self.difference_std):
-                yield (
+                found.append(
                     f"'{target.name}' is stretched by {100 * (x - y):+.2f} % more along x than along y: print it anew, or "
                     "state stretch and caliper in its file"
                 )
             if target.caliper is not None and abs(x) > _FAR * math.hypot(stated, self.stretch_std[0]):
-                yield f"'{target.name}' is stretched by {100 * x:+.2f} % along x: was it printed at 100 %?"
+                found.append(f"'{target.name}' is stretched by {100 * x:+.2f} % along x: was it printed at 100 %?")
         elif self.misfit > _FAR * target.slack:
-            yield (
+            found.append(
                 f"markers of '{target.name}' miss the places in its file by {1e3 * self.misfit:.1f} mm rms: more than its "
                 f"tolerance ({1e3 * target.tolerance:g} mm); measure the layout anew"
             )
+        return found
 
 
 def check_sheets(image: Image, camera: Camera, targets: Sequence[Target]) -> list[SheetCheck]:
@@ -278,7 +231,7 @@ def _checked(image: Image, camera: Camera, target: Target, detections: Sequence[
         return SheetCheck(target, own, sheet_fault(detections, target, camera))
     seen = seen_at(image, target, camera.values, found.rotation, found.position)
     misfit = found.residual * float(found.position[2]) / camera.focal[0]
-    if len(target_pages(target)) > 1:
+    if not _is_one_print(target):
         return SheetCheck(target, len(seen), misfit=misfit)
     view = TargetView(seen, found.rotation, found.position, np.zeros(6))
     printed = target.model_copy(update={"stretch": max(target.stretch, _STRETCH), "tolerance": min(target.tolerance, _PRINT)})

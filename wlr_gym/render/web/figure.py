@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render import stage as marks
@@ -35,6 +34,10 @@ _HEAD, _HEAD_LENGTH = 2.2 * marks.SHAFT, 6.0 * marks.SHAFT
 #: m; where an arrow lies that is not shown: viser keeps their number.
 _BELOW = np.array([[0.0, 0.0, -9.0], [0.0, 0.0, -8.9]])
 _ARROWS = 12
+#: Sides of what is round.
+_SIDES = 32
+#: Geoms of this group are hidden: what touches the floor, not what is drawn.
+_HIDDEN = 3
 
 
 def rgb(colour: Colour) -> tuple[int, int, int]:
@@ -69,9 +72,7 @@ class Figure:
 
     def pose(self, truth: Truth, parameters: Parameters, row: int = 0) -> Stage:
         """Put it where row ``row`` of a plant's truth is, in the sizes that row of its parameters gives it."""
-        if self._stage is None:
-            self._stage = Stage(self.robot, parameters, row)
-        stage = self._stage
+        self._stage = stage = self._stage or Stage(self.robot, parameters, row)
         stage.pose(truth, parameters, row)
         if stage.shape != self._shape:
             self._nodes = [(body.index, self._add(body)) for body in bodies(stage)]
@@ -84,31 +85,25 @@ class Figure:
 
     def point(self, arrows: Sequence[marks.Arrow]) -> None:
         """Show arrows; those of the time before go."""
-        points, colours = np.tile(_BELOW, (_ARROWS, 1, 1)), np.zeros((_ARROWS, 3), np.uint8)
+        points, colours = np.tile(_BELOW, (_ARROWS, 1, 1)).astype(np.float32), np.zeros((_ARROWS, 3), np.uint8)
         for k, arrow in enumerate(arrows[:_ARROWS]):
             points[k], colours[k] = (arrow.start, arrow.end), rgb(arrow.colour)
         if self._arrows is None:
             self._arrows = self._server.scene.add_arrows(
                 f"{self._root}/arrows", points, colours, shaft_radius=marks.SHAFT, head_radius=_HEAD, head_length=_HEAD_LENGTH
             )
-        elif not np.array_equal(points.astype(np.float32), self._arrows.points):
-            self._arrows.points, self._arrows.colors = points.astype(np.float32), colours
+        elif not np.array_equal(points, self._arrows.points):
+            self._arrows.points, self._arrows.colors = points, colours
 
     def _add(self, body: BodyShape) -> Any:
         name, scene = f"{self._root}/{body.name}", self._server.scene
         node = scene.add_frame(name, show_axes=False)
-        surfaces = [joined(body, GHOST)] if self.ghost else body.surfaces
-        for k, surface in enumerate(surfaces):
+        surfaces, opacity = ([(body.whole, GHOST)], GHOST_OPACITY) if self.ghost else (body.surfaces, None)
+        for k, (mesh, colour) in enumerate(surfaces):
             scene.add_mesh_simple(
-                f"{name}/{k}",
-                surface.vertices,
-                surface.faces,
-                color=rgb(surface.colour),
-                opacity=GHOST_OPACITY if self.ghost else None,
-                flat_shading=True,
-                cast_shadow=False,
-                receive_shadow=False,
-            )
+                f"{name}/{k}", np.asarray(mesh.vertices), np.asarray(mesh.faces), color=rgb(colour), opacity=opacity,
+                flat_shading=True, cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
         return node
 
 
@@ -123,17 +118,13 @@ class PageFloor:
         self._shown: list[Any] = []
         self._pads: list[Any] = []
 
-    def look(self, stage: Stage, truth: Truth, parameters: Parameters, row: int, camera: str) -> None:
-        """Move the floor so that the robot, posed in ``stage``, is seen as ``camera`` sees it."""
-        up = up_direction(parameters["ground.slope"][row])
-        turn, position = floor_pose(truth.position[row], stage.yaw(), up, CAMERAS[camera])
-        self._frame.wxyz, self._frame.position = turn, position
-
     def show(self, stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> None:
-        """Draw the floor around the robot that is posed in ``stage``."""
-        colour = friction_colour(float(np.mean([parameters[f"ground.mu_{axis}"][row] for axis in "xy"])))
-        if colour != self._colour:
-            self._server.scene.add_grid(
+        """Draw the floor around the robot that is posed in ``stage``, and move it so that ``view``'s camera sees the robot."""
+        up = up_direction(parameters["ground.slope"][row])
+        self._frame.wxyz, self._frame.position = floor_pose(truth.position[row], stage.yaw(), up, CAMERAS[view.camera])
+        scene = self._server.scene
+        if (colour := marks.floor_colour(parameters, row)) != self._colour:
+            scene.add_grid(
                 f"{FLOOR}/plane", _WIDE, _WIDE, cell_size=SQUARE, section_size=5 * SQUARE, cell_color=(170, 170, 170),
                 section_color=(140, 140, 140), plane_color=rgb(colour), plane_opacity=1.0, shadow_opacity=0.3,
                 fade_distance=12.0,
@@ -147,36 +138,28 @@ class PageFloor:
                 node.remove()
             self._shown = [node for k, area in enumerate(areas) for node in self._area(k, area)]
             self._areas = areas
-        self._put_pads(marks.spots(stage, parameters, row) if view.friction else [])
-
-    def _area(self, k: int, area: marks.Area) -> list[Any]:
-        low, high, scene = np.array(area.low), np.array(area.high), self._server.scene
-        size = (*(high - low), 2.0 * area.height)
-        box = scene.add_box(
-            f"{FLOOR}/area_{k}", rgb(friction_colour(area.mu)), size, position=(*(0.5 * (low + high)), 0.0), cast_shadow=False
-        )
-        label = scene.add_label(f"{FLOOR}/label_{k}", f"µ {area.mu:.2g}", position=(float(low[0]), float(low[1]), 0.01))
-        return [box, label]
-
-    def _put_pads(self, spots: list[marks.Spot]) -> None:
+        spots = marks.spots(stage, parameters, row) if view.friction else []
         if len(spots) != len(self._pads):
             for node in self._pads:
                 node.remove()
-            self._pads = [
-                self._server.scene.add_cylinder(f"{FLOOR}/pad_{k}", 0.06, 10 * marks.LAYER, cast_shadow=False)
-                for k in range(len(spots))
-            ]
+            names = [f"{FLOOR}/pad_{k}" for k in range(len(spots))]
+            self._pads = [scene.add_cylinder(name, 0.06, 10 * marks.LAYER, cast_shadow=False) for name in names]
         for node, spot in zip(self._pads, spots, strict=True):
             node.position, colour = spot.centre * [1.0, 1.0, 0.0], rgb(friction_colour(spot.mu))
             if tuple(node.color) != colour:
                 node.color = colour
 
+    def _area(self, k: int, area: marks.Area) -> list[Any]:
+        (x, y), scene = area.low, self._server.scene
+        size = (area.high[0] - x, area.high[1] - y, 2.0 * area.height)
+        middle = (x + 0.5 * size[0], y + 0.5 * size[1], 0.0)
+        box = scene.add_box(f"{FLOOR}/area_{k}", rgb(friction_colour(area.mu)), size, position=middle, cast_shadow=False)
+        return [box, scene.add_label(f"{FLOOR}/label_{k}", f"µ {area.mu:.2g}", position=(x, y, 0.01))]
+
 
 def arrows_of(stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> list[marks.Arrow]:
     """Return the arrows of a posed robot: slip, and the floor's friction and normal force, where the view has them."""
-    arrows: list[marks.Arrow] = []
-    if view.slip:
-        arrows += marks.slip_arrows(stage, truth, parameters, row)
+    arrows = marks.slip_arrows(stage, truth, parameters, row) if view.slip else []
     if view.forces:
         arrows += marks.force_arrows(stage, truth, parameters, row) + marks.load_arrows(stage, truth, parameters, row)
     return arrows
@@ -185,80 +168,61 @@ def arrows_of(stage: Stage, truth: Truth, parameters: Parameters, row: int, view
 # ---- the robot's bodies as triangles ----------------------------------------------------------------------------------
 
 
-Array = NDArray[np.float64]
-
-#: Sides of what is round.
-SIDES = 32
-#: Geoms of this group are hidden: what touches the floor, not what is drawn.
-_HIDDEN = 3
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Triangles of one colour in the frame of their body.
-
-    Attributes:
-        vertices: (V, 3) m.
-        faces: (F, 3) indices of vertices; seen from outside they go round against the clock.
-        colour: red, green, blue, 0 to 1.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int64]
-    colour: Colour
-
-
 @dataclass(frozen=True, eq=False)
 class BodyShape:
-    """A body in its own frame: its name and index in the model, and its surfaces, one per colour."""
+    """A body in its own frame.
+
+    Attributes:
+        name, index: in the model.
+        surfaces: triangles (a ``trimesh.Trimesh``, m) and colour (0 to 1) of each of its colours.
+    """
 
     name: str
     index: int
-    surfaces: tuple[Surface, ...]
+    surfaces: list[tuple[Any, Colour]]
+
+    @property
+    def whole(self) -> Any:
+        """All of it as one ``trimesh.Trimesh``."""
+        import trimesh
+
+        return trimesh.util.concatenate([mesh for mesh, _ in self.surfaces])
 
 
 def bodies(stage: Stage) -> list[BodyShape]:
     """Return the bodies of a stage that have something to draw; the floor is none of them."""
+    import trimesh
+
     model, found = stage.model, []
     for index in range(1, model.nbody):
         first = int(model.body_geomadr[index])
-        colours: dict[Colour, list[int]] = {}
+        colours: dict[Colour, list[Any]] = {}
         for geom in range(first, first + int(model.body_geomnum[index])):
             red, green, blue, opacity = (float(part) for part in model.geom_rgba[geom])
             if int(model.geom_group[geom]) != _HIDDEN and opacity > 0.0:
-                colours.setdefault((red, green, blue), []).append(geom)
+                colours.setdefault((red, green, blue), []).append(_mesh_of(model, geom))
         if colours:
-            surfaces = (_joined([_triangles(model, geom) for geom in geoms], colour) for colour, geoms in colours.items())
-            found.append(BodyShape(model.body(index).name, index, tuple(surfaces)))
+            surfaces = [(trimesh.util.concatenate(meshes), colour) for colour, meshes in colours.items()]
+            found.append(BodyShape(model.body(index).name, index, surfaces))
     return found
 
 
-def joined(body: BodyShape, colour: Colour) -> Surface:
-    """Return a body as one surface."""
-    return _joined([(one.vertices, one.faces) for one in body.surfaces], colour)
-
-
-def _joined(parts: list[tuple[Array, NDArray[np.int64]]], colour: Colour) -> Surface:
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
-    faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts, strict=True)])
-    return Surface(np.concatenate([vertices for vertices, _ in parts]), faces, colour)
-
-
-def _triangles(model: Any, geom: int) -> tuple[Array, NDArray[np.int64]]:
-    """Return vertices in the body's frame, and faces, of one geom."""
+def _mesh_of(model: Any, geom: int) -> Any:
+    """Return the triangles of one geom in the body's frame."""
     import trimesh
+    from scipy.spatial.transform import Rotation
 
     kind, size, shapes = int(model.geom_type[geom]), np.asarray(model.geom_size[geom]), mujoco.mjtGeom
     if kind == shapes.mjGEOM_BOX:
         mesh = trimesh.creation.box(extents=2.0 * size)
     elif kind == shapes.mjGEOM_CYLINDER:
-        mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=SIDES)
+        mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1], sections=_SIDES)
     elif kind == shapes.mjGEOM_CAPSULE:
-        mesh = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[SIDES // 2, SIDES // 2])
+        mesh = trimesh.creation.capsule(height=2.0 * size[1], radius=size[0], count=[_SIDES // 2, _SIDES // 2])
         mesh.apply_translation([0.0, 0.0, -mesh.bounds.mean(axis=0)[2]])
     else:
         raise ValueError(f"geom {geom} of the model has a shape that is not drawn: {kind}")
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    vertices = np.asarray(mesh.vertices) @ turn.reshape(3, 3).T + model.geom_pos[geom]
-    return vertices, np.asarray(mesh.faces, np.int64)
+    place = np.eye(4)
+    place[:3, :3] = Rotation.from_quat(model.geom_quat[geom], scalar_first=True).as_matrix()
+    place[:3, 3] = model.geom_pos[geom]
+    return mesh.apply_transform(place)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, FollowCamera, View
+from wlr_gym.render.view import LOOK_HEIGHT, FollowCamera, View, directions
 
 if TYPE_CHECKING:
     import viser
@@ -38,12 +38,7 @@ TEXTS = 6.0
 
 @dataclass(frozen=True)
 class Address:
-    """Where a page is served.
-
-    Attributes:
-        host: name or address that it listens on.
-        port: on which it listens.
-    """
+    """Where a page is served: name or address that it listens on, and port."""
 
     host: str
     port: int
@@ -54,14 +49,13 @@ class Address:
         shown = "localhost" if self.host in ("", "0.0.0.0", "::") else self.host
         return f"http://{shown}:{self.port}"
 
-    def lines(self, environment: dict[str, str] | None = None) -> list[str]:
+    def lines(self) -> list[str]:
         """Return how to open the page, here and through ssh: that is told by ``SSH_CONNECTION``, as sshd sets it."""
-        environment = dict(os.environ) if environment is None else environment
         try:
             user = getpass.getuser()
         except (OSError, KeyError):  # no name for this user id
             user = "USER"
-        here = environment.get("SSH_CONNECTION", "").split()
+        here = os.environ.get("SSH_CONNECTION", "").split()
         machine = here[2] if len(here) == 4 else socket.gethostname()
         port = f" -p {here[3]}" if len(here) == 4 and here[3] != "22" else ""
         return [
@@ -90,13 +84,23 @@ def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> t
     if tuple(int(part) for part in viser.__version__.split(".")[:2]) < LEAST_VISER:
         least = ".".join(map(str, LEAST_VISER))
         raise InputError(f"viser {viser.__version__} is too old: pip install 'wlr-gym[web]' brings {least} or later")
-    _check_address(host)
+    try:
+        family, kind, protocol, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as trial:
+            trial.bind(place)
+    except OSError as error:
+        raise InputError(f"--host {host}: no address of this machine: {error.strerror or error}") from None
     with contextlib.redirect_stdout(io.StringIO()):  # it says where it is in a way of its own
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-    server.scene.world_axes.visible = False
+    scene = server.scene
+    scene.world_axes.visible = False
     server.initial_camera.fov = np.radians(42.0)
-    _light(server)
+    # from above: with shadows and reflections, a browser without a graphics card takes 30 times as long
+    scene.configure_default_lights(False)
+    scene.configure_environment_map(None)
+    scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 160), intensity=2.2)
+    scene.add_light_directional("/sun", position=(-1.0, -1.5, 4.0), intensity=1.6)
     return server, Address(host, int(server.get_port()))
 
 
@@ -106,45 +110,13 @@ def close_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def _light(server: viser.ViserServer) -> None:
-    """Light the scene from above: with shadows and reflections, a browser without a graphics card takes 30 times as long."""
-    scene = server.scene
-    scene.configure_default_lights(False)
-    scene.configure_environment_map(None)
-    scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 160), intensity=2.2)
-    scene.add_light_directional("/sun", position=(-1.0, -1.5, 4.0), intensity=1.6)
-
-
-def _check_address(host: str) -> None:
-    try:
-        family, kind, protocol, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as trial:
-            trial.bind(place)
-    except OSError as error:
-        raise InputError(f"--host {host}: no address of this machine: {error.strerror or error}") from None
-
-
-def say(address: Address) -> None:
-    """Print how to open a page."""
-    print("\n".join(address.lines()), flush=True)
-
-
 # ---- where it is seen from -------------------------------------------------------------------------------------------
-
-
-def aim(server: viser.ViserServer, camera: str) -> None:
-    """Put the eye of whoever opens the page where a camera of pictures is, about a robot at the origin of the eye's world."""
-    position, look_at = eye(CAMERAS[camera])
-    server.initial_camera.position = tuple(position)
-    server.initial_camera.look_at = tuple(look_at)
 
 
 def eye(camera: FollowCamera) -> tuple[Array, Array]:
     """Return where a camera stands (3,) and what it looks at (3,), m, about a robot at the origin that heads along x."""
-    flat, rise = np.cos(camera.elevation), np.sin(camera.elevation)
-    forward = np.array([flat * np.cos(camera.azimuth), flat * np.sin(camera.azimuth), rise])
     look_at = np.array([0.0, 0.0, LOOK_HEIGHT])
-    return look_at - _FARTHER * camera.distance * forward, look_at
+    return look_at - _FARTHER * camera.distance * directions(camera)[0], look_at
 
 
 def floor_pose(place: Array, yaw: float, up: Array, camera: FollowCamera) -> tuple[Array, Array]:
@@ -184,12 +156,7 @@ _PLOTS_WIDE = 380
 
 
 class ViewControls:
-    """What whoever watches wants to see.
-
-    Args:
-        server: of the page.
-        view: what is seen until something else is chosen.
-    """
+    """What whoever watches wants to see; ``view`` is what is seen until something else is chosen."""
 
     def __init__(self, server: viser.ViserServer, view: View) -> None:
         self._first = view
@@ -203,13 +170,9 @@ class ViewControls:
     @property
     def view(self) -> View:
         """What to show now."""
-        return replace(
-            self._first,
-            camera=_CAMERAS[self._camera.value],
-            friction=bool(self._friction.value),
-            slip=bool(self._slip.value),
-            forces=bool(self._forces.value),
-        )
+        friction, slip, forces = (bool(box.value) for box in (self._friction, self._slip, self._forces))
+        camera = _CAMERAS[self._camera.value]
+        return replace(self._first, camera=camera, friction=friction, slip=slip, forces=forces)
 
 
 def plot_panel(server: viser.ViserServer) -> Any:
@@ -242,11 +205,8 @@ class Curve:
     """A channel over time.
 
     Attributes:
-        label: in the legend.
-        t: (n,) s, rising.
-        values: (n,); NaN where there is none.
-        dashed: as of what is simulated beside what was measured.
-        colour: place in :data:`COLOURS`.
+        label: in the legend. t: (n,) s, rising. values: (n,); NaN where there is none.
+        dashed: as of what is simulated beside what was measured. colour: place in :data:`COLOURS`.
     """
 
     label: str
@@ -306,18 +266,14 @@ class Plots:
     """
 
     def __init__(self, server: viser.ViserServer, place: Any, titles: Mapping[str, str], first: Sequence[str]) -> None:
-        self._server, self._place, self._units = server, place, dict(titles)
-        options = (NOTHING, *titles)
-        self._choices: list[Any] = []
-        self._plots: list[Any] = []
-        self._drawn: list[tuple[str, ...]] = []
+        self._server, self._place, self._units = server, place, titles
         with place:
-            for k, name in enumerate(first):
-                chosen = name if name in titles else NOTHING
-                self._choices.append(server.gui.add_dropdown(f"plot {k + 1}", options, initial_value=chosen))
-                self._plots.append(None)
-                self._drawn.append(())
-        self._places = [choice.order for choice in self._choices]
+            self._choices: list[Any] = [
+                server.gui.add_dropdown(f"plot {k}", (NOTHING, *titles), initial_value=name if name in titles else NOTHING)
+                for k, name in enumerate(first, start=1)
+            ]
+        self._plots: list[Any] = [None] * len(first)
+        self._drawn: list[tuple[str, ...]] = [()] * len(first)  # title and curves of each plot
 
     @property
     def chosen(self) -> list[str]:
@@ -326,7 +282,7 @@ class Plots:
 
     def offer(self, titles: Mapping[str, str]) -> None:
         """Change what can be drawn; what is drawn stays where it can."""
-        self._units = dict(titles)
+        self._units = titles
         for choice in self._choices:
             kept = choice.value if choice.value in titles else NOTHING
             choice.options = (NOTHING, *titles)
@@ -341,13 +297,10 @@ class Plots:
                 self._plots[k].remove()
                 self._plots[k] = None
             self._drawn[k] = drawn
-            if not mine:
-                continue
-            data = aligned(mine, begin, end, now)
-            if self._plots[k] is None:
-                self._plots[k] = self._add(name, mine, data, self._places[k] + 0.5)
-            else:
-                self._plots[k].data = data
+            if mine and self._plots[k] is None:
+                self._plots[k] = self._add(name, mine, aligned(mine, begin, end, now), self._choices[k].order + 0.5)
+            elif mine:
+                self._plots[k].data = aligned(mine, begin, end, now)
 
     def _add(self, name: str, curves: Sequence[Curve], data: tuple[Array, ...], order: float) -> Any:
         series: list[dict[str, Any]] = [{"label": "t (s)"}]

@@ -1,19 +1,25 @@
-"""A page that plays recordings: robot and ghost, a time axis, and plots of any channel."""
+"""Pages: a plant while it runs, in real time, with the keys that drive it; and recordings, with a time axis and a ghost.
+
+Both have the robot and its floor, what is to be said, and plots of any channel.
+"""
 
 from __future__ import annotations
 
 import threading
 import time as clock
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth
 from wlr_gym.render.scene import describe, legend
-from wlr_gym.render.view import View
-from wlr_gym.render.viewer import Pace
+from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP
+from wlr_gym.render.view import CAMERAS, View
+from wlr_gym.render.viewer import KeyCallback, Pace
 from wlr_gym.render.web.figure import Figure, PageFloor, arrows_of
 from wlr_gym.render.web.page import (
     HOST,
@@ -23,23 +29,182 @@ from wlr_gym.render.web.page import (
     Curve,
     Plots,
     ViewControls,
-    aim,
     close_server,
+    eye,
     html_lines,
     open_server,
     plot_panel,
-    say,
 )
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
+
+
+class _Page:
+    """A page of the browser: its server, the robots on the floor, and when its texts are due.
+
+    Args:
+        label: heading of the controls.
+        view: what to show; the size is the browser's own affair.
+        host, port: where the page is served.
+
+    Raises:
+        MissingPackageError: no viser here (extra ``web``).
+        InputError: no such address, or no free port.
+    """
+
+    def __init__(self, label: str, view: View, host: str, port: int) -> None:
+        self.view = view
+        self.server, self.address = open_server(host, port, label)
+        position, look_at = eye(CAMERAS[view.camera])
+        self.server.initial_camera.position = tuple(position)
+        self.server.initial_camera.look_at = tuple(look_at)
+        self._ground = PageFloor(self.server)
+        self._told = -np.inf
+
+    def _show(self, figure: Figure, truth: Truth, parameters: Parameters, row: int, view: View, arrows: View) -> None:
+        """Pose the robot that the page goes along with, with the arrows that a view has, and the floor under it."""
+        stage = figure.pose(truth, parameters, row)
+        figure.point(arrows_of(stage, truth, parameters, row, arrows))
+        self._ground.show(stage, truth, parameters, row, view)
+
+    def _texts_are_due(self) -> bool:
+        now = clock.monotonic()
+        due = now >= self._told + 1.0 / TEXTS
+        self._told = now if due else self._told
+        return due
+
+    def close(self) -> None:
+        """End the page."""
+        close_server(self.server)
+
+
+# ---- a plant while it runs -------------------------------------------------------------------------------------------
+
+
+#: Key of the page -> key code, as the window reports it, and what it does. Arrow keys turn the eye of the page.
+KEYS = {
+    "I": (UP, "faster"),
+    "K": (DOWN, "slower, backwards"),
+    "J": (LEFT, "turn left"),
+    "L": (RIGHT, "turn right"),
+    "space": (SPACE, "stop"),
+    "R": (RESET, "start anew"),
+}
+HELP = "keys on the page: I K speed, J L turning, space: stop, R: start anew; the mouse turns and moves the view"
+#: s of the past that plots show.
+WINDOW = 20.0
+#: What plots can show: channels of the truth, by element or all of a kind in one plot.
+_TITLES = {
+    name: channel.unit
+    for channel in TRUTH_LAYOUT.channels.values()
+    for name in dict.fromkeys((channel.name, *channel.elements))
+}
+_FIRST = ("linear_velocity_in_body[x]", "slip_velocity", "contact_force")
+#: Curves of one plot at most: of a kind with more elements, the first ones.
+_MOST = 12
+
+
+class WebViewer(_Page):
+    """Shows one robot on a page of the browser, no faster than real time; as :class:`wlr_gym.render.viewer.Viewer`.
+
+    Args:
+        robot: supplies the sizes that are no parameters.
+        view: what to show; the size is the browser's own affair.
+        on_key: called with the key codes of :mod:`wlr_gym.render.teleop`, from a thread of the server; None = nobody drives.
+        host, port: where the page is served.
+        pace: waits for the next tick (tests).
+
+    Raises:
+        MissingPackageError: no viser here (extra ``web``).
+        InputError: no such address, or no free port.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        view: View | None = None,
+        on_key: KeyCallback | None = None,
+        host: str = HOST,
+        port: int = PORT,
+        pace: Pace | None = None,
+    ) -> None:
+        super().__init__("wlr play", view or View(forces=True), host, port)
+        self._pace = pace or Pace()
+        self._figure = Figure(self.server, "robot", robot)
+        self._text: Any = self.server.gui.add_html("")
+        if on_key is not None:
+            self._add_keys(on_key)
+        self._look = ViewControls(self.server, self.view)
+        self._past: deque[tuple[float, NDArray[np.float64]]] = deque()  # time and truth
+        self._plots = Plots(self.server, plot_panel(self.server), _TITLES, _FIRST)
+        print("\n".join(self.address.lines()), flush=True)
+
+    def show(
+        self,
+        truth: Truth,
+        parameters: Parameters,
+        row: int = 0,
+        *,
+        period: float,
+        time: float | None = None,
+        command: Mapping[str, float] | None = None,
+        title: str = "",
+    ) -> bool:
+        """Show one robot and wait until its control period is over; the arguments are those of the window's viewer.
+
+        Returns:
+            True: browsers come and go, the page stays.
+        """
+        view = self._look.view
+        self._note(truth, row, time or 0.0)
+        with self.server.atomic():
+            self._show(self._figure, truth, parameters, row, view, view)
+        if self._texts_are_due():
+            lines = describe(truth, parameters, row, time, command, title, slip=view.slip)
+            self._text.content = html_lines([*lines, *legend(parameters, row, view)])
+            if len(self._past) > 1:
+                curves = {name: self.curves(name) for name in self._plots.chosen if name in _TITLES}
+                begin, now = self._past[0][0], self._past[-1][0]
+                self._plots.draw(curves, begin, max(now, begin + 1.0), now)
+        self._pace.wait(period)
+        return True
+
+    def _note(self, truth: Truth, row: int, time: float) -> None:
+        """Keep the present and the last :data:`WINDOW` seconds; a time that goes back begins anew."""
+        if self._past and time <= self._past[-1][0]:
+            self._past.clear()
+        self._past.append((time, truth.values[row].copy()))
+        while time - self._past[0][0] > WINDOW:
+            self._past.popleft()
+
+    def curves(self, name: str) -> list[Curve]:
+        """Return the past of a channel of the truth, element by element, or of one element of it."""
+        t, values = np.array([time for time, _ in self._past]), np.array([values for _, values in self._past])
+        elements = TRUTH_LAYOUT.channels[name].elements if name in TRUTH_LAYOUT.channels else [name]
+        columns = {one: values[:, TRUTH_LAYOUT.elements.index(one)] for one in elements[:_MOST]}
+        return [Curve(one, t, column, colour=n) for n, (one, column) in enumerate(columns.items())]
+
+    def _add_keys(self, on_key: KeyCallback) -> None:
+        lock = threading.Lock()
+
+        def press(code: int) -> None:
+            with lock:
+                on_key(code)
+
+        with self.server.gui.add_folder("Drive"):
+            for key, (code, what) in KEYS.items():
+                self.server.gui.add_command(what, hotkey=key).on_trigger(lambda _, code=code: press(code))  # pyright: ignore
+                self.server.gui.add_button(f"{what}  [{key}]").on_click(lambda _, code=code: press(code))
+
+
+# ---- recordings ------------------------------------------------------------------------------------------------------
+
 
 #: Times real time that a recording can be played at.
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
 #: s that plots show around the present; the whole recording is drawn less often, for it is more to send.
 WINDOWS = {"4 s": 4.0, "20 s": 20.0, "all": np.inf}
 _ALL_PER_SECOND = 2.0
-#: What is shown until something else is chosen.
-_VIEW = View(forces=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +212,7 @@ class Moment:
     """A robot at one time.
 
     Attributes:
-        truth: (1).
-        parameters: (1).
+        truth, parameters: (1).
         slip, forces: whether the truth knows them; what it does not is not drawn.
     """
 
@@ -59,27 +223,21 @@ class Moment:
 
 
 class Playable(Protocol):
-    """What is played. Times are s since its beginning."""
+    """What is played. Times are s since its beginning.
+
+    Attributes:
+        name: of the recording. robot: supplies the sizes that are no parameters. length: s.
+        titles: what can be plotted -> its unit.
+    """
 
     @property
-    def name(self) -> str:
-        """Of the recording."""
-        ...
-
+    def name(self) -> str: ...
     @property
-    def robot(self) -> Robot:
-        """Supplies the sizes that are no parameters."""
-        ...
-
+    def robot(self) -> Robot: ...
     @property
-    def length(self) -> float:
-        """s."""
-        ...
-
+    def length(self) -> float: ...
     @property
-    def titles(self) -> Mapping[str, str]:
-        """What can be plotted -> its unit."""
-        ...
+    def titles(self) -> Mapping[str, str]: ...
 
     def at(self, time: float) -> Moment:
         """Return the robot."""
@@ -102,7 +260,7 @@ class Playable(Protocol):
         ...
 
 
-class Player:
+class Player(_Page):
     """Plays recordings on a page of the browser.
 
     Args:
@@ -124,17 +282,14 @@ class Player:
         host: str = HOST,
         port: int = PORT,
     ) -> None:
-        self._open, self._names = open, list(names)
+        self._open, self._chosen = open, 0
         self.recording: Playable = open(0)
-        self.server, self.address = open_server(host, port, "wlr view")
-        aim(self.server, _VIEW.camera)
-        self._ground = PageFloor(self.server)
-        self._figures: dict[str, Figure] = {}
+        super().__init__("wlr view", View(forces=True), host, port)
         self._lock = threading.Lock()
-        self._time, self._drawn, self._told, self._plotted = 0.0, -1.0, -np.inf, -np.inf
-        self._chosen = 0
-        self._add_controls(first)
-        say(self.address)
+        self._time, self._drawn, self._plotted = 0.0, -1.0, -np.inf
+        self._add_controls(names, first)
+        self._add_figures()
+        print("\n".join(self.address.lines()), flush=True)
 
     # ---- time -------------------------------------------------------------------------------------------------------
 
@@ -175,65 +330,62 @@ class Player:
     def close(self) -> None:
         """End the page, and what is being worked out for it."""
         self.recording.close()
-        close_server(self.server)
+        super().close()
 
     # ---- what is shown ----------------------------------------------------------------------------------------------
 
     def update(self) -> None:
         """Bring the page to the present time; a scene that has not changed is not sent again, but by the texts' rate."""
-        self._choose()
-        now, time = clock.monotonic(), self._time
-        texts = now >= self._told + 1.0 / TEXTS
+        if (chosen := self._run.options.index(self._run.value)) != self._chosen:
+            self._change_to(chosen)
+        time, texts = self._time, self._texts_are_due()
         if time != self._drawn or texts:
             self._draw(time, texts)
             self._drawn = time
         if texts:
-            self._told = now
             self._slider.value = round(time, 2)
-            self._plot(now, time)
+            self._plot(time)
 
     def _draw(self, time: float, texts: bool) -> None:
         recording, view = self.recording, self._look.view
         moment, ghost = recording.at(time), recording.ghost_at(time) if self._show_ghost.value else None
-        seen = replace(view, slip=view.slip and moment.slip, forces=view.forces and moment.forces)
+        arrows = replace(view, slip=view.slip and moment.slip, forces=view.forces and moment.forces)
         with self.server.atomic():
-            stage = self._figures["robot"].pose(moment.truth, moment.parameters)
-            self._figures["robot"].point(arrows_of(stage, moment.truth, moment.parameters, 0, seen))
-            self._ground.show(stage, moment.truth, moment.parameters, 0, view)
-            self._ground.look(stage, moment.truth, moment.parameters, 0, view.camera)
+            self._show(self._robot, moment.truth, moment.parameters, 0, view, arrows)
             if ghost is None:
-                self._figures["ghost"].hide()
+                self._ghost.hide()
             else:  # it has arrows only where the robot has none of its own
-                seen = replace(view, slip=False, forces=view.forces and not moment.forces)
-                stage = self._figures["ghost"].pose(ghost.truth, ghost.parameters)
-                self._figures["ghost"].point(arrows_of(stage, ghost.truth, ghost.parameters, 0, seen))
+                arrows = replace(view, slip=False, forces=view.forces and not moment.forces)
+                stage = self._ghost.pose(ghost.truth, ghost.parameters)
+                self._ghost.point(arrows_of(stage, ghost.truth, ghost.parameters, 0, arrows))
         if texts:
-            lines = [*describe(moment.truth, moment.parameters, 0, time, None, recording.name, slip=moment.slip)]
+            lines = describe(moment.truth, moment.parameters, 0, time, None, recording.name, slip=moment.slip)
             self._text.content = html_lines([*lines, *recording.lines(time), *legend(moment.parameters, 0, view)])
 
-    def _plot(self, now: float, time: float) -> None:
-        width = WINDOWS[str(self._window.value)]
-        if np.isinf(width) and now < self._plotted + 1.0 / _ALL_PER_SECOND:
+    def _plot(self, time: float) -> None:
+        width, length, now = WINDOWS[str(self._window.value)], self.recording.length, clock.monotonic()
+        begin, end = 0.0, length
+        if np.isfinite(width):
+            begin = float(np.clip(time - 0.5 * width, 0.0, max(length - width, 0.0)))
+            end = min(begin + width, length)
+        elif now < self._plotted + 1.0 / _ALL_PER_SECOND:
             return
         self._plotted = now
-        length = self.recording.length
-        begin = 0.0 if np.isinf(width) else float(np.clip(time - 0.5 * width, 0.0, max(length - width, 0.0)))
-        end = length if np.isinf(width) else min(begin + width, length)
         titles = [title for title in self._plots.chosen if title in self.recording.titles]
         self._plots.draw({title: self.recording.curves(title) for title in titles}, begin, end, time)
 
     # ---- controls ---------------------------------------------------------------------------------------------------
 
-    def _add_controls(self, first: Sequence[str]) -> None:
+    def _add_controls(self, names: Sequence[str], first: Sequence[str]) -> None:
         gui = self.server.gui
-        self._run: Any = gui.add_dropdown("run", tuple(self._names), initial_value=self._names[0])
+        self._run: Any = gui.add_dropdown("run", tuple(names), initial_value=names[0])
         self._text: Any = gui.add_html("")
         self._playing = True
         self._button: Any = gui.add_button("pause  [space]")
         self._slider: Any = gui.add_slider("time (s)", 0.0, max(round(self.recording.length, 2), 0.01), 0.01, 0.0)
         self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._show_ghost: Any = gui.add_checkbox("ghost: replayed", True)
-        self._look = ViewControls(self.server, _VIEW)
+        self._look = ViewControls(self.server, self.view)
         place = plot_panel(self.server)
         with place:
             self._window: Any = gui.add_dropdown("shown", tuple(WINDOWS), initial_value="20 s")
@@ -243,25 +395,21 @@ class Player:
         gui.add_command("1 s back", hotkey="J").on_trigger(lambda _: self.seek(self._time - 1.0))
         gui.add_command("1 s on", hotkey="L").on_trigger(lambda _: self.seek(self._time + 1.0))
         self._slider.on_update(lambda event: self.seek(float(event.target.value)) if event.client is not None else None)
-        self._figures = self._new_figures()
 
     def _turn(self) -> None:
         self._playing = not self._playing
         self._button.label = "pause  [space]" if self._playing else "play  [space]"
 
-    def _new_figures(self) -> dict[str, Figure]:
-        robot = self.recording.robot
-        return {"robot": Figure(self.server, "robot", robot), "ghost": Figure(self.server, "ghost", robot, ghost=True)}
+    def _add_figures(self) -> None:
+        self._robot = Figure(self.server, "robot", self.recording.robot)
+        self._ghost = Figure(self.server, "ghost", self.recording.robot, ghost=True)
 
-    def _choose(self) -> None:
-        """Open another recording, where whoever watches has chosen one."""
-        chosen = self._run.options.index(self._run.value)
-        if chosen == self._chosen:
-            return
+    def _change_to(self, chosen: int) -> None:
+        """Open another recording."""
         self._chosen = chosen
         self.recording.close()
         self.recording = self._open(chosen)
-        self._figures = self._new_figures()
+        self._add_figures()
         self._plots.offer(self.recording.titles)
         self._slider.max = max(round(self.recording.length, 2), 0.01)
         self._drawn = -1.0
