@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.perception.markers.camera import Camera, Quality
 
 Array = NDArray[np.float64]
@@ -47,8 +47,7 @@ class Board:
     dictionary: str = "5X5_100"
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise unknown_name("board", self.kind, KINDS)
+        check_name("board", self.kind, KINDS)
         if min(self.columns, self.rows) < 2 or self.corners < FEWEST_CORNERS:
             raise InputError(
                 f"a board of {self.columns} x {self.rows} squares has {max(0, self.corners)} inner corners; at least "
@@ -74,8 +73,7 @@ class Board:
         import cv2
 
         names = {name.removeprefix("DICT_"): name for name in dir(cv2.aruco) if name.startswith("DICT_")}
-        if self.dictionary.upper() not in names:
-            raise unknown_name("dictionary", self.dictionary, names)
+        check_name("dictionary", self.dictionary.upper(), names)
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, names[self.dictionary.upper()]))
 
     def aruco(self) -> Any:
@@ -107,8 +105,7 @@ class Board:
         corners, ids, _, _ = self._detector.detectBoard(image)
         if ids is None or len(ids) < min(MINIMUM_CORNERS, self.corners):
             return None
-        seen = np.asarray(ids, np.intp).reshape(-1)
-        return self.places[seen], np.asarray(corners, np.float32).reshape(-1, 2)
+        return self.places[np.ravel(ids)], np.asarray(corners, np.float32).reshape(-1, 2)
 
 
 def _chess_corners(image: NDArray[np.uint8], columns: int, rows: int) -> NDArray[np.float32] | None:
@@ -119,14 +116,12 @@ def _chess_corners(image: NDArray[np.uint8], columns: int, rows: int) -> NDArray
     found, corners = cv2.findChessboardCornersSB(small, (columns, rows), flags=cv2.CALIB_CB_ACCURACY)
     if not found:
         return None
-    pixels = (np.asarray(corners, np.float32).reshape(-1, 2) + 0.5) / scale - 0.5
-    if scale == 1:
-        return pixels.astype(np.float32)
-    pixels = np.ascontiguousarray(pixels, np.float32)
-    apart = float(np.linalg.norm(np.diff(pixels.reshape(rows, columns, 2), axis=1), axis=2).min())
-    reach = int(np.clip(apart / 4, 2, 15))
-    end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.001)
-    return np.asarray(cv2.cornerSubPix(image, pixels, (reach, reach), (-1, -1), end), np.float32)
+    pixels = ((np.asarray(corners, np.float32).reshape(-1, 2) + 0.5) / scale - 0.5).astype(np.float32)
+    if scale < 1:
+        apart = float(np.linalg.norm(np.diff(pixels.reshape(rows, columns, 2), axis=1), axis=2).min())
+        reach, end = int(np.clip(apart / 4, 2, 15)), (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.001)
+        pixels = np.asarray(cv2.cornerSubPix(image, pixels, (reach, reach), (-1, -1), end), np.float32)
+    return pixels
 
 
 # --- the shutter ------------------------------------------------------------------------------------------------------
@@ -146,7 +141,6 @@ _LENS = 8  # focal lengths, centre, k1, k2, p1, p2
 class BoardView:
     """Corners of a board in one frame: time s, places (N, 3) m on the board, pixels (N, 2)."""
 
-    name: str
     time: float
     places: Array
     pixels: Array
@@ -174,7 +168,10 @@ def board_motion(before: BoardView, view: BoardView, after: BoardView, camera: C
     if step <= 0 or any(pose is None for pose in poses):
         return None
     first, middle, last = (pose for pose in poses if pose is not None)
-    first[:3], last[:3] = _nearest_turn(first[:3], middle[:3]), _nearest_turn(last[:3], middle[:3])
+    for pose in (first, last):  # by the rotation vector of the same turn that is nearest to the middle one
+        angle = float(np.linalg.norm(pose[:3]))
+        turns = [pose[:3] * (1 + 2 * math.pi * k / max(angle, 1e-9)) for k in (-1, 0, 1)]
+        pose[:3] = min(turns, key=lambda turn: float(np.linalg.norm(turn - middle[:3])))
     velocity: Array = (_slopes(view, middle, camera)[1][:, :6] @ ((last - first) / step)).reshape(-1, 2)
     return velocity if np.abs(velocity).max() * step < _LARGEST_MOTION * camera.width else None
 
@@ -194,23 +191,15 @@ def readout_of(views: Sequence[tuple[BoardView, Array]], camera: Camera) -> Read
     total = products.sum(axis=0)
     if np.linalg.cond(total[1:, 1:]) > _SINGULAR:
         return Readout()
-    values = [_solved(total), *(_solved(total - product) for product in products)]
+    values = [np.linalg.solve(part[1:, 1:], part[1:, 0])[0] for part in (total, *(total - products))]
     value, *without = np.array(values) * sizes[0] / sizes[1]
     count = len(without)
     return Readout(float(value), math.sqrt((count - 1) ** 2 / count) * float(np.std(without)))
 
 
-def _solved(products: Array) -> float:
-    return float(np.linalg.solve(products[1:, 1:], products[1:, 0])[0])
-
-
 def at_frame_time(view: BoardView, velocity: Array, camera: Camera, readout: float) -> BoardView:
     """The view as a shutter that is open for all rows at the frame's time would show it."""
-    return replace(view, pixels=view.pixels - readout * _rows(view, camera) * velocity)
-
-
-def _rows(view: BoardView, camera: Camera) -> Array:
-    return view.pixels[:, [1]] / camera.height - 0.5
+    return replace(view, pixels=view.pixels - readout * (view.pixels[:, [1]] / camera.height - 0.5) * velocity)
 
 
 def _without_pose(view: BoardView, velocity: Array, camera: Camera) -> Array:
@@ -219,8 +208,9 @@ def _without_pose(view: BoardView, velocity: Array, camera: Camera) -> Array:
     if pose is None:
         return np.zeros((0, 2 + _LENS))
     predicted, slopes = _slopes(view, pose, camera)
+    by_readout = (view.pixels[:, [1]] / camera.height - 0.5) * velocity
+    columns = np.column_stack([(view.pixels - predicted).ravel(), by_readout.ravel(), slopes[:, 6:]])
     basis = np.linalg.qr(slopes[:, :6])[0]
-    columns = np.column_stack([(view.pixels - predicted).ravel(), (_rows(view, camera) * velocity).ravel(), slopes[:, 6:]])
     return columns - basis @ (basis.T @ columns)
 
 
@@ -238,15 +228,6 @@ def _slopes(view: BoardView, pose: Array, camera: Camera) -> tuple[Array, Array]
 
     found = cv2.projectPoints(view.places, pose[:3], pose[3:], camera.matrix, np.array(camera.distortion))
     return np.asarray(found[0], np.float64).reshape(-1, 2), np.asarray(found[1], np.float64)[:, : 6 + _LENS]
-
-
-def _nearest_turn(turn: Array, other: Array) -> Array:
-    """The rotation vector of the same turn that is nearest to another one."""
-    angle = float(np.linalg.norm(turn))
-    if angle < 1e-9:
-        return turn
-    turns = [turn * (1 + 2 * math.pi * k / angle) for k in (-1, 0, 1)]
-    return min(turns, key=lambda found: float(np.linalg.norm(found - other)))
 
 
 # --- lens and shutter together ----------------------------------------------------------------------------------------
@@ -298,74 +279,29 @@ def calibrate_film(
     size, found = _find_corners(wanted, board)
     middles = range(0, len(found), min(3, every))
     views = {k: view for k in middles if (view := found[k]) is not None}
+    neighbours = {
+        k: (before, after)
+        for k in views
+        if 0 < k < len(found) - 1 and (before := found[k - 1]) is not None and (after := found[k + 1]) is not None
+    }
     camera = plain = _calibrated(list(views.values()), len(middles), size, board)
     told = Readout() if readout is None else Readout(readout, 0.0)
     for _ in range(_TURNS):
-        moving = {k: motion for k in views if (motion := _motion(found, k, camera)) is not None}
-        before = told
+        motions = {k: board_motion(before, views[k], after, camera) for k, (before, after) in neighbours.items()}
+        moving = {k: motion for k, motion in motions.items() if motion is not None}
+        last = told
         told = readout_of([(views[k], motion) for k, motion in moving.items()], camera) if readout is None else told
         if readout is None and not (abs(told.value) < LONGEST and told.std < _LOOSEST_STD):
             break  # a board that hardly moves
         still = [at_frame_time(v, moving[k], camera, told.value) if k in moving else v for k, v in views.items()]
         camera = _calibrated(still, len(middles), size, board)
-        if abs(told.value - before.value) < _SAME_READOUT:
+        if abs(told.value - last.value) < _SAME_READOUT:
             break
-    if not told.known:
-        camera = plain
-    quality = camera.quality and camera.quality.model_copy(update={"readout_std": told.std or None})
-    return camera.model_copy(
-        update={"readout": told.known, "quality": quality if told.known is not None else camera.quality}
-    ), told
-
-
-def _motion(found: Sequence[BoardView | None], k: int, camera: Camera) -> Array | None:
-    before, view, after = (found[i] if 0 <= i < len(found) else None for i in (k - 1, k, k + 1))
-    if before is None or view is None or after is None:
-        return None
-    return board_motion(before, view, after, camera)
-
-
-def _calibrated(views: Sequence[BoardView], pictures: int, size: tuple[int, int], board: Board) -> Camera:
-    if len(views) < MINIMUM_VIEWS:
-        raise InputError(
-            f"the board ({board.kind}, {board.columns} x {board.rows} squares) is seen well in {len(views)} of {pictures} "
-            f"images; at least {MINIMUM_VIEWS} are needed, each with {min(MINIMUM_CORNERS, board.corners)} corners, sharp, "
-            "from different angles"
-        )
-    object_points = [np.asarray(view.places, np.float32) for view in views]
-    image_points = [np.asarray(view.pixels, np.float32) for view in views]
-    coverage = _coverage(np.concatenate([view.pixels for view in views]), size)
-    if coverage < 0.5:
-        raise InputError(
-            f"the board's corners cover {100 * coverage:.0f} % of the image; show it in every corner (50 % or more)"
-        )
-    first = _solve(object_points, image_points, size)
-    keep = first["view_errors"] <= _OUTLYING_VIEW * np.median(first["view_errors"])
-    good = np.flatnonzero(keep)
-    found = first if keep.all() else _solve([object_points[k] for k in good], [image_points[k] for k in good], size)
-    matrix, deviations = found["matrix"], found["deviations"]
-    k1, k2, p1, p2, k3 = (float(k) for k in found["distortion"])
-    tilt = math.sqrt(2 * max(0.0, 1 - float(np.linalg.norm(found["normals"].mean(axis=0)))))
-    if tilt < _LEAST_TILT:
-        raise InputError(
-            f"the board's tilts differ by {math.degrees(tilt):.0f} degrees only (rms), which does not tell the focal length; "
-            "tilt it by up to 40 degrees, to every side"
-        )
-    return Camera(
-        width=size[0],
-        height=size[1],
-        focal=(float(matrix[0, 0]), float(matrix[1, 1])),
-        centre=(float(matrix[0, 2]), float(matrix[1, 2])),
-        distortion=(k1, k2, p1, p2, k3),
-        quality=Quality(
-            views=int(keep.sum()),
-            rejected=int((~keep).sum()),
-            rms=found["rms"],
-            coverage=coverage,
-            focal_std=(float(deviations[0]), float(deviations[1])),
-            centre_std=(float(deviations[2]), float(deviations[3])),
-        ),
-    )
+    camera = camera if told.known else plain
+    quality = camera.quality
+    if quality is not None and told.known is not None:
+        quality = quality.model_copy(update={"readout_std": told.std or None})
+    return camera.model_copy(update={"readout": told.known, "quality": quality}), told
 
 
 def _find_corners(
@@ -380,31 +316,61 @@ def _find_corners(
             raise InputError(f"{name}: {width} x {height} px, the images before it {size[0]} x {size[1]}; use one camera mode")
         size = (width, height)
         found = board.find(image)
-        views.append(None if found is None else BoardView(name, time, *(np.asarray(part, np.float64) for part in found)))
+        views.append(None if found is None else BoardView(time, *(np.asarray(part, np.float64) for part in found)))
     if size is None:
         raise InputError("no images to calibrate from")
     return size, views
 
 
-def _solve(object_points: list, image_points: list, size: tuple[int, int]) -> dict[str, Any]:
+def _calibrated(views: Sequence[BoardView], pictures: int, size: tuple[int, int], board: Board) -> Camera:
     import cv2
 
-    # the default solver can end in a poor minimum without a first guess; k3 stays 0, as it trades off against k2
-    guess = np.array([[size[0], 0, 0.5 * (size[0] - 1)], [0, size[0], 0.5 * (size[1] - 1)], [0, 0, 1.0]])
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
-    rms, matrix, distortion, turns, _, deviations, _, view_errors = cv2.calibrateCameraExtended(
-        object_points, image_points, size, guess, np.zeros(5), flags=flags
+    if len(views) < MINIMUM_VIEWS:
+        raise InputError(
+            f"the board ({board.kind}, {board.columns} x {board.rows} squares) is seen well in {len(views)} of {pictures} "
+            f"images; at least {MINIMUM_VIEWS} are needed, each with {min(MINIMUM_CORNERS, board.corners)} corners, sharp, "
+            "from different angles"
+        )
+    cells = np.floor(4 * np.concatenate([view.pixels for view in views]) / np.array(size)).astype(int).clip(0, 3)
+    coverage = len(np.unique(cells, axis=0)) / 16
+    if coverage < 0.5:
+        raise InputError(
+            f"the board's corners cover {100 * coverage:.0f} % of the image; show it in every corner (50 % or more)"
+        )
+
+    def solve(views: Sequence[BoardView]) -> Any:
+        # the default solver can end in a poor minimum without a first guess; k3 stays 0, as it trades off against k2
+        guess = np.array([[size[0], 0, 0.5 * (size[0] - 1)], [0, size[0], 0.5 * (size[1] - 1)], [0, 0, 1.0]])
+        flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
+        places, pixels = ([getattr(view, name).astype(np.float32) for view in views] for name in ("places", "pixels"))
+        return cv2.calibrateCameraExtended(places, pixels, size, guess, np.zeros(5), flags=flags)
+
+    found = solve(views)
+    misses = np.ravel(found[-1])
+    keep = misses <= _OUTLYING_VIEW * np.median(misses)
+    if not keep.all():
+        found = solve([view for view, fine in zip(views, keep, strict=True) if fine])
+    rms, matrix, distortion, turns, _, deviations, _, _ = found
+    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    tilt = math.sqrt(2 * max(0.0, 1 - float(np.linalg.norm(normals.mean(axis=0)))))
+    if tilt < _LEAST_TILT:
+        raise InputError(
+            f"the board's tilts differ by {math.degrees(tilt):.0f} degrees only (rms), which does not tell the focal length; "
+            "tilt it by up to 40 degrees, to every side"
+        )
+    std = np.ravel(deviations).tolist()
+    return Camera(
+        width=size[0],
+        height=size[1],
+        focal=(float(matrix[0, 0]), float(matrix[1, 1])),
+        centre=(float(matrix[0, 2]), float(matrix[1, 2])),
+        distortion=np.ravel(distortion)[:5].tolist(),
+        quality=Quality(
+            views=int(keep.sum()),
+            rejected=int((~keep).sum()),
+            rms=float(rms),
+            coverage=coverage,
+            focal_std=(std[0], std[1]),
+            centre_std=(std[2], std[3]),
+        ),
     )
-    return {
-        "rms": float(rms),
-        "matrix": matrix,
-        "distortion": np.asarray(distortion).reshape(-1)[:5],
-        "normals": np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns]),
-        "deviations": np.asarray(deviations).reshape(-1),
-        "view_errors": np.asarray(view_errors).reshape(-1),
-    }
-
-
-def _coverage(corners: Array, size: tuple[int, int]) -> float:
-    cells = np.floor(4 * corners / np.array(size)).astype(int).clip(0, 3)
-    return len({(x, y) for x, y in cells}) / 16

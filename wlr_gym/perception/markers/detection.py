@@ -123,36 +123,9 @@ def _weighted_fit(rows: Any, values: Any, weights: Any, answer: Any, inverse: An
 
 @inner_kernel
 def _median(values: Any) -> float:
-    """The median of what is known (Hoare's selection; numpy's takes a second to compile); NaN where too few rays are."""
-    known, count = np.empty(values.shape[0]), 0
-    for i in range(values.shape[0]):
-        if not math.isnan(values[i]):
-            known[count] = values[i]
-            count += 1
-    if count < _MINIMUM_SHARE * RAYS:
-        return math.nan
-    middle, low, high = count // 2, 0, count - 1
-    while low < high:
-        pivot, i, j = known[middle], low, high
-        while i <= j:
-            while known[i] < pivot:
-                i += 1
-            while known[j] > pivot:
-                j -= 1
-            if i <= j:
-                known[i], known[j] = known[j], known[i]
-                i += 1
-                j -= 1
-        if j < middle:
-            low = i
-        if i > middle:
-            high = j
-    if count % 2 == 1:
-        return known[middle]
-    below = known[0]
-    for i in range(1, middle):
-        below = max(below, known[i])
-    return 0.5 * (below + known[middle])
+    """The median of what is known; NaN where too few rays are."""
+    known = values[~np.isnan(values)]
+    return np.median(known) if known.shape[0] >= _MINIMUM_SHARE * RAYS else math.nan
 
 
 @inner_kernel
@@ -181,10 +154,9 @@ def _edges(image: Any, ellipse: Any, radii: Any, edges: Any, contrasts: Any) -> 
     scale = math.sqrt(abs(ellipse[2] * ellipse[5] - ellipse[3] * ellipse[4]))
     inside, outside, means = np.empty(RAYS), np.empty(RAYS), np.empty(RAYS)
     fitted_in, fitted_out = np.empty(RAYS), np.empty(RAYS)
+    edges[:] = math.nan
+    contrasts[:] = 0.0
     for k in range(RINGS):
-        for j in range(RAYS):
-            edges[k * RAYS + j] = math.nan
-        contrasts[k] = 0.0
         outer_gap = 0.5 if k == 0 else 0.5 * (radii[k - 1] - radii[k])
         inner_gap = 0.8 * radii[k] if k == RINGS - 1 else 0.5 * (radii[k] - radii[k + 1])
         half = min(min(outer_gap, inner_gap), _LARGEST_WINDOW / scale)
@@ -233,15 +205,12 @@ def _fit(rho: Any, cosine: Any, sine: Any, radius: Any, answer: Any, inverse: An
         Rms, infinite where the fit is no good; number of points used; the largest change.
     """
     count = rho.shape[0]
-    rows, offsets, weights = np.empty((count, 5)), np.empty(count), np.empty(count)
+    rows, offsets, weights = np.empty((count, 5)), rho - radius, np.empty(count)
     residuals, sizes = np.empty(count), np.empty(count)
-    known = 0
     for i in range(count):
         _set_row(rows, i, radius[i], cosine[i], sine[i])
-        offsets[i] = rho[i] - radius[i]
         weights[i] = 0.0 if math.isnan(rho[i]) else 1.0
-        known += weights[i] > 0.0
-    if known < _MINIMUM_SHARE * RAYS:
+    if weights.sum() < _MINIMUM_SHARE * RAYS:
         return math.inf, 0, math.inf
     spread, used = math.inf, 0
     for _ in range(3):
@@ -261,9 +230,7 @@ def _fit(rho: Any, cosine: Any, sine: Any, radius: Any, answer: Any, inverse: An
                 total += weights[i] * residuals[i] * residuals[i]
                 used += 1
         spread = math.sqrt(total / max(1, used - 5))
-    largest = 0.0
-    for a in range(5):
-        largest = max(largest, abs(answer[a]))
+    largest = np.abs(answer).max()
     return (spread if spread < 0.2 and largest <= 0.5 else math.inf), used, largest
 
 
@@ -278,18 +245,6 @@ def _change(ellipse: Any, answer: Any) -> None:
         ellipse[k], ellipse[k + 1] = a * xx + b * xy, a * xy + b * yy
 
 
-@inner_kernel
-def _to_directions(camera: Any, ellipse: Any, result: Any) -> None:
-    """Write the ellipse in undistorted coordinates, to first order."""
-    x, y = undistort(camera, ellipse[0], ellipse[1])
-    rx, ry = undistort(camera, ellipse[0] + 1.0, ellipse[1])
-    dx, dy = undistort(camera, ellipse[0], ellipse[1] + 1.0)
-    result[0], result[1] = x, y
-    for k in range(2, 4):
-        result[k] = (rx - x) * ellipse[k] + (dx - x) * ellipse[k + 2]
-        result[k + 2] = (ry - y) * ellipse[k] + (dy - y) * ellipse[k + 2]
-
-
 @njit(cache=True, nogil=True)
 def fit_marker(
     image: Any, camera: Any, ellipse: Any, radii: Any, centres: Any, covariances: Any, shape: Any, quality: Any
@@ -301,8 +256,8 @@ def fit_marker(
         camera: (9,) of :attr:`wlr_gym.perception.markers.camera.Camera.values`.
         ellipse: (6,) guess of the outer circle's image, px; refined in place.
         radii: (3,) of the marker's circles over the outer radius.
-        centres: (3, 2) output: centre of each circle's ellipse, undistorted coordinates; NaN for circles not used.
-        covariances: (3, 2, 2) output.
+        centres, covariances: (3, 2) and (3, 2, 2) output: centre of each circle's ellipse, undistorted coordinates; NaN for
+            circles not used.
         shape: (6,) output: the outer circle's ellipse, undistorted.
         quality: (4,) output, see :data:`CONTRAST` and the names beside it.
 
@@ -327,7 +282,13 @@ def fit_marker(
         if turn == 3 or largest * scale < 0.02:
             break  # the edges below belong to this ellipse
         _change(ellipse, answer)
-    _to_directions(camera, ellipse, shape)
+    x, y = undistort(camera, ellipse[0], ellipse[1])
+    rx, ry = undistort(camera, ellipse[0] + 1.0, ellipse[1])
+    dx, dy = undistort(camera, ellipse[0], ellipse[1] + 1.0)
+    shape[0], shape[1] = x, y
+    for k in range(2, 4):  # to first order
+        shape[k] = (rx - x) * ellipse[k] + (dx - x) * ellipse[k + 2]
+        shape[k + 2] = (ry - y) * ellipse[k] + (dy - y) * ellipse[k + 2]
     return _fit_circles(camera, ellipse, radii, edges, contrasts, centres, covariances, shape, quality)
 
 
@@ -337,7 +298,7 @@ def _fit_circles(
 ) -> bool:
     """One ellipse per circle, from edge points in undistorted coordinates."""
     pixels = math.sqrt(abs(ellipse[2] * ellipse[5] - ellipse[3] * ellipse[4]))
-    x, y, ring = np.empty(RAYS), np.empty(RAYS), np.empty(6)
+    x, y = np.empty(RAYS), np.empty(RAYS)
     rho, cosine, sine, radius = np.empty(RAYS), np.empty(RAYS), np.empty(RAYS), np.empty(RAYS)
     answer, inverse = np.empty(5), np.empty((5, 5))
     contrast, worst, squares, points, rings = math.inf, 0.0, 0.0, 0, 0
@@ -349,8 +310,7 @@ def _fit_circles(
                 u = ellipse[0] + edge * (ellipse[2] * _COS[j] + ellipse[3] * _SIN[j])
                 v = ellipse[1] + edge * (ellipse[4] * _COS[j] + ellipse[5] * _SIN[j])
                 x[j], y[j] = undistort(camera, u, v)
-        for i in range(6):
-            ring[i] = shape[i]
+        ring = shape.copy()
         spread, used, growth = math.inf, 0, 1.0
         for _ in range(2):
             determinant = ring[2] * ring[5] - ring[3] * ring[4]
@@ -377,8 +337,7 @@ def _fit_circles(
                 c, d = ring[2 + 2 * j], ring[3 + 2 * j]
                 covariances[k, i, j] = a * c * xx + (a * d + b * c) * xy + b * d * yy
             centres[k, i] = ring[i]
-        contrast = min(contrast, contrasts[k])
-        worst = max(worst, off)
+        contrast, worst = min(contrast, contrasts[k]), max(worst, off)
         squares += used * (spread * pixels * (spread * pixels))
         points += used
         rings += 1
@@ -475,7 +434,11 @@ def detect(image: Image, camera: Camera, box: tuple[int, int, int, int] | None =
             candidate = _identify(image, camera.values, ellipse)
             if candidate is not None:
                 found.append(candidate)
-    return _distinct(found)
+    kept: list[Detection] = []
+    for candidate in sorted(found, key=lambda d: -d.contrast * d.share):  # the better of two at one place
+        if not any(_same_place(candidate.ellipse, other) for other in kept):
+            kept.append(candidate)
+    return kept
 
 
 def _ellipses(part: Image, factor: int, block: int, corner: tuple[int, int]) -> list[Array]:
@@ -513,10 +476,10 @@ def _same_place(ellipse: Array, other: Detection) -> bool:
 def _identify(image: Image, camera: Array, ellipse: Array) -> Detection | None:
     """Try the codes and edges whose profile fits, the best first."""
     radii, profiles = _codes()
-    scores = np.empty((len(radii), 3))
+    scores = np.empty((len(radii), RINGS))
     _match(image, ellipse, radii, profiles, _GRID, scores)
     for index in np.argsort(-scores, axis=None)[:2]:
-        code, edge = divmod(int(index), 3)
+        code, edge = divmod(int(index), RINGS)
         if not scores[code, edge] > _LEAST_MATCH:
             return None
         guess = ellipse.copy()
@@ -527,25 +490,17 @@ def _identify(image: Image, camera: Array, ellipse: Array) -> Detection | None:
     return None
 
 
-def _distinct(found: list[Detection]) -> list[Detection]:
-    """Drop the worse of two at one place."""
-    ranked = sorted(found, key=lambda d: -d.contrast * d.share)
-    kept: list[Detection] = []
-    for candidate in ranked:
-        if not any(_same_place(candidate.ellipse, other) for other in kept):
-            kept.append(candidate)
-    return kept
-
-
 @njit(cache=True, nogil=True)
 def _match(image: Any, ellipse: Any, radii: Any, profiles: Any, grid: Any, scores: Any) -> None:
     """Correlate the mean profile around an ellipse with every code, taking the ellipse for each of its edges."""
     profile = np.empty(grid.shape[0])
-    for edge in range(3):
+    for edge in range(RINGS):
         for code in range(radii.shape[0]):
             if edge > 0 or code == 0:  # taken for the outer edge, the profile is the same for every code
                 _profile(image, ellipse, grid, radii[code, edge], profile)
-            scores[code, edge] = _correlation(profile, profiles, code)
+            x, y = profile - profile.mean(), profiles[code] - profiles[code].mean()
+            spread = (x * x).sum() * (y * y).sum()
+            scores[code, edge] = (x * y).sum() / math.sqrt(spread) if spread > 0.0 else -1.0
 
 
 @inner_kernel
@@ -554,8 +509,7 @@ def _profile(image: Any, ellipse: Any, grid: Any, radius: float, profile: Any) -
     for i in range(grid.shape[0]):
         rho, total, known = grid[i] / radius, 0.0, 0
         for j in range(16):
-            angle = 2.0 * math.pi * j / 16
-            c, s = math.cos(angle), math.sin(angle)
+            c, s = math.cos(2.0 * math.pi * j / 16), math.sin(2.0 * math.pi * j / 16)
             x = ellipse[0] + rho * (ellipse[2] * c + ellipse[3] * s)
             y = ellipse[1] + rho * (ellipse[4] * c + ellipse[5] * s)
             value = brightness(image, x, y)
@@ -563,19 +517,3 @@ def _profile(image: Any, ellipse: Any, grid: Any, radius: float, profile: Any) -
                 total += value
                 known += 1
         profile[i] = total / known if known >= 8 else math.nan
-
-
-@inner_kernel
-def _correlation(profile: Any, profiles: Any, code: int) -> float:
-    count = profile.shape[0]
-    mean, mean_code = 0.0, 0.0
-    for i in range(count):
-        mean += profile[i] / count
-        mean_code += profiles[code, i] / count
-    xx, xy, yy = 0.0, 0.0, 0.0
-    for i in range(count):
-        x, y = profile[i] - mean, profiles[code, i] - mean_code
-        xx += x * x
-        xy += x * y
-        yy += y * y
-    return xy / math.sqrt(xx * yy) if xx * yy > 0.0 else -1.0

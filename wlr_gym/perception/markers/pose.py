@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 from typing import Any
@@ -113,9 +113,8 @@ def solve_pose(
     """
     indices = sorted(seen)
     while len(indices) >= MINIMUM_MARKERS:
-        data = _measurements([(index, seen[index]) for index in indices], target)
+        measured, roots, places, radii, owners = _measurements([(index, seen[index]) for index in indices], target)
         turn, place = rotation.copy(), position.copy()
-        measured, roots, places, radii, owners = data
         covariance, errors = np.empty((6, 6)), np.empty((len(owners), 2))
         if not _least_squares(measured, roots, places, radii, turn, place, covariance, errors.reshape(-1)):
             return None
@@ -124,13 +123,14 @@ def solve_pose(
         chi_square = float(squares.sum() / max(1, 2 * len(squares) - 6))
         wrong = [i for i in indices if not _looks_right(seen[i], target, i, turn, place)]
         suspicious = wrong or ([indices[int(np.argmax(per_marker))]] if chi_square > _OUTLIER and len(indices) > 3 else [])
-        residual = _pixels(data, turn, place, camera)
+        centres = np.empty_like(measured)
+        circle_centres(places, radii, turn, place, centres)
+        residual = float(np.sqrt(np.mean(np.sum(((measured - centres) * np.array(camera.focal)) ** 2, axis=1))))
         explained = max(_MODEL_ERROR, _TOLERATED * target.slack * camera.focal[0] / place[2])
         if not suspicious or (not wrong and residual < explained):
-            used = np.zeros(len(target.markers), bool)
-            used[indices] = True
+            used = np.isin(np.arange(len(target.markers)), indices)
             return TargetPose(turn, place, covariance * max(1.0, chi_square), used, residual, chi_square)
-        indices = [i for i in indices if i != suspicious[0]]
+        indices.remove(suspicious[0])
     return None
 
 
@@ -145,11 +145,9 @@ def solved_floor(seen: Mapping[int, Detection], floor: Target, camera: Camera, s
 
 def expected_ellipse(target: Target, index: int, camera: Array, rotation: Array, position: Array) -> Array | None:
     """Image (6,) of a marker's outer circle at a pose, px, to first order; None behind the camera."""
-    ellipse = np.empty(6)
     marker = target.markers[index]
-    if not _expected(rotation @ np.asarray(marker.position) + position, rotation, marker.radius, camera, ellipse):
-        return None
-    return ellipse
+    ellipse = _expected(rotation @ np.asarray(marker.position) + position, rotation, marker.radius, camera)
+    return None if math.isnan(ellipse[0]) else ellipse
 
 
 def _measurements(seen: Sequence[tuple[int, Detection]], target: Target) -> tuple[Array, ...]:
@@ -216,24 +214,14 @@ def _better(found: TargetPose, best: TargetPose, up: Array | None) -> bool:
 
 def _looks_right(detection: Detection, target: Target, index: int, rotation: Array, position: Array) -> bool:
     """Whether a marker is seen as large and as tilted as the pose says."""
-    marker = target.markers[index]
-    expected = np.empty(6)
-    centre = rotation @ np.asarray(marker.position) + position
-    if not _expected(centre, rotation, marker.radius, _IDENTITY, expected):
+    expected = expected_ellipse(target, index, _IDENTITY, rotation, position)
+    if expected is None:
         return False
     ratio = np.linalg.svd(np.linalg.solve(expected[2:].reshape(2, 2), detection.shape[2:].reshape(2, 2)), compute_uv=False)
     return bool(np.all(np.abs(np.log(ratio)) < _SHAPE_TOLERANCE))
 
 
 _IDENTITY = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-
-def _pixels(data: tuple[Array, ...], rotation: Array, position: Array, camera: Camera) -> float:
-    measured, _, places, radii, _ = data
-    expected = np.empty_like(measured)
-    circle_centres(places, radii, rotation, position, expected)
-    error = (measured - expected) * np.array(camera.focal)
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
@@ -340,20 +328,20 @@ def _least_squares(
 
 
 @njit(cache=True, nogil=True)
-def _expected(centre: Any, rotation: Any, radius: Any, camera: Any, ellipse: Any) -> bool:
-    x, y, z = centre[0], centre[1], centre[2]
-    if z < 2.0 * radius:
-        return False
-    u, v = distort(camera, x / z, y / z)
-    ru, rv = distort(camera, x / z + 1e-5, y / z)
-    du, dv = distort(camera, x / z, y / z + 1e-5)
-    ellipse[0], ellipse[1] = u, v
-    for axis in range(2):
-        a = radius * (rotation[0, axis] - x / z * rotation[2, axis]) / z
-        b = radius * (rotation[1, axis] - y / z * rotation[2, axis]) / z
-        ellipse[2 + axis] = ((ru - u) * a + (du - u) * b) / 1e-5
-        ellipse[4 + axis] = ((rv - v) * a + (dv - v) * b) / 1e-5
-    return True
+def _expected(centre: Any, rotation: Any, radius: float, camera: Any) -> Any:
+    """Image (6,) of a circle with that centre in the camera frame; NaN too near or behind the camera."""
+    ellipse, (x, y, z) = np.full(6, math.nan), (centre[0], centre[1], centre[2])
+    if z >= 2.0 * radius:
+        u, v = distort(camera, x / z, y / z)
+        ru, rv = distort(camera, x / z + 1e-5, y / z)
+        du, dv = distort(camera, x / z, y / z + 1e-5)
+        ellipse[0], ellipse[1] = u, v
+        for axis in range(2):
+            a = radius * (rotation[0, axis] - x / z * rotation[2, axis]) / z
+            b = radius * (rotation[1, axis] - y / z * rotation[2, axis]) / z
+            ellipse[2 + axis] = ((ru - u) * a + (du - u) * b) / 1e-5
+            ellipse[4 + axis] = ((rv - v) * a + (dv - v) * b) / 1e-5
+    return ellipse
 
 
 # --- why a target is not found ----------------------------------------------------------------------------------------
@@ -371,7 +359,14 @@ def sheet_fault(detections: Sequence[Detection], target: Target, camera: Camera)
     key = target.markers[target.key].code
     if seen[key] > 1:
         return f"{found} seen, but '{target.name}' has one {key}: is a sheet of it there twice?"
-    swaps = list(_swaps(detections, target, camera))
+    swaps = []  # markers that, with the key's sheet in their place and theirs in its, fit what is seen
+    for other, marker in enumerate(target.markers):
+        markers = list(target.markers)
+        markers[target.key] = markers[target.key].model_copy(update={"code": marker.code})
+        markers[other] = marker.model_copy(update={"code": key})
+        swapped = target.model_copy(update={"markers": tuple(markers)})
+        if other != target.key and find_laid_target(detections, swapped, camera):
+            swaps.append(marker.name)
     if swaps:
         names = " or ".join(f"'{target.markers[target.key].name}' and '{name}'" for name in swaps)
         return f"the sheets {names} of '{target.name}' lie in each other's places"
@@ -380,16 +375,3 @@ def sheet_fault(detections: Sequence[Detection], target: Target, camera: Camera)
         f"{together} of the {count} markers of '{target.name}' seen, and at least 4 must fit together (check their positions "
         "in the target file, and the light)"
     )
-
-
-def _swaps(detections: Sequence[Detection], target: Target, camera: Camera) -> Iterator[str]:
-    """Names of the markers that, with the key's sheet in their place and theirs in its, fit what is seen."""
-    key = target.key
-    for other, marker in enumerate(target.markers):
-        if other == key:
-            continue
-        markers = list(target.markers)
-        markers[key] = markers[key].model_copy(update={"code": marker.code})
-        markers[other] = marker.model_copy(update={"code": target.markers[key].code})
-        if find_laid_target(detections, target.model_copy(update={"markers": tuple(markers)}), camera):
-            yield marker.name

@@ -72,22 +72,17 @@ class Adjustment:
     @property
     def scale_std(self) -> float:
         """1 sigma of the target's scale as a whole, in its plane."""
-        places = self._from_middle()
-        return self._std(places / np.sum(places**2))
+        return self._std((1, 1, 0), [0, 1, 2])
 
     @property
     def heading_std(self) -> float:
         """1 sigma of the target's heading as a whole, rad."""
-        places = self._from_middle()
-        return self._std(places[:, [1, 0, 2]] * (-1, 1, 0) / np.sum(places**2))
+        return self._std((-1, 1, 0), [1, 0, 2])
 
-    def _from_middle(self) -> Array:
-        places = self.target.positions - self.target.positions.mean(axis=0)
-        places[:, 2] = 0.0
-        return places
-
-    def _std(self, direction: Array) -> float:
-        row = direction.ravel()
+    def _std(self, signs: tuple[int, int, int], axes: list[int]) -> float:
+        """1 sigma of a motion in the plane that is linear in the markers' places about their middle."""
+        places = (self.target.positions - self.target.positions.mean(axis=0)) * (1, 1, 0)
+        row = (places[:, axes] * signs / np.sum(places**2)).ravel()
         return math.sqrt(float(row @ self.covariance @ row))
 
 
@@ -149,11 +144,13 @@ def velocity_between(before: TargetPose, after: TargetPose, step: float) -> Arra
 
 def at_frame_time(view: TargetView, target: Target, height: int, readout: float) -> dict[int, Detection]:
     """The detections as a shutter that is open for all rows at the frame's time would show them."""
-    circles = _circles(target, [view], height)
-    shared = target.positions.ravel()
-    pose = view.rotation[None], view.position[None]
-    shift = _centres(circles, *pose, np.append(shared, readout)) - _centres(circles, *pose, np.append(shared, 0.0))
-    return {index: replace(seen, centres=seen.centres - shift[0, index]) for index, seen in view.seen.items()}
+    circles, centres = _circles(target, [view], height), []
+    for late in (readout, 0.0):
+        shared = np.append(target.positions.ravel(), late)
+        _, points, normals, _ = _points(circles, view.rotation[None], view.position[None], shared)
+        centres.append(_projected(points, normals, circles.squares)[0][0])
+    shift = centres[0] - centres[1]
+    return {index: replace(seen, centres=seen.centres - shift[index]) for index, seen in view.seen.items()}
 
 
 def whitened(circles: Circles, rotations: Array, positions: Array, shared: Array) -> tuple[Array, Array, Array]:
@@ -190,11 +187,6 @@ def _points(circles: Circles, rotations: Array, positions: Array, shared: Array)
     return arms, points, rotations[:, :, 2], drift
 
 
-def _centres(circles: Circles, rotations: Array, positions: Array, shared: Array) -> Array:
-    _, points, normals, _ = _points(circles, rotations, positions, shared)
-    return _projected(points, normals, circles.squares)[0]
-
-
 def _projected(points: Array, normals: Array, squares: Array) -> tuple[Array, Array, Array]:
     """Centre of each circle's ellipse (F, M, 3, 2), with derivatives by the circle's centre and by its normal (., 3)."""
     x, y, z = (points[:, :, None, axis] for axis in range(3))
@@ -212,10 +204,7 @@ def _projected(points: Array, normals: Array, squares: Array) -> tuple[Array, Ar
 
 def _cross(vectors: Array) -> Array:
     """Matrices (., 3, 3) of the cross product with ``vectors`` (., 3) from the left."""
-    result = np.zeros((*vectors.shape, 3))
-    for row, column, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 0, 2, 1), (1, 2, 0, -1), (2, 0, 1, -1), (2, 1, 0, 1)):
-        result[..., row, column] = sign * vectors[..., axis]
-    return result
+    return np.cross(np.eye(3), vectors[..., None, :])
 
 
 def _step(
@@ -275,7 +264,5 @@ def _circles(target: Target, views: Sequence[TargetView], height: int) -> Circle
             measured[f, m, known] = seen.centres[known]
             roots[f, m, known] = np.linalg.inv(np.linalg.cholesky(seen.covariances[known]))
             row[f, m] = seen.ellipse[1] / height - 0.5
-    squares = np.array(
-        [[(s * r) ** 2 for s in ring_radii(c)] for r, c in zip(target.radii, target.codes.tolist(), strict=True)]
-    )
+    squares = np.square([np.multiply(r, ring_radii(c)) for r, c in zip(target.radii, target.codes.tolist(), strict=True)])
     return Circles(measured, roots, row, squares, np.stack([view.velocity for view in views]))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 
@@ -105,10 +106,8 @@ class Tracker:
         self, camera: Camera, body: Target, floor: Target, floor_pose: TargetPose, homes: Array, follow: bool = False
     ) -> None:
         self.camera, self.body, self.floor, self.floor_pose = camera, body, floor, floor_pose
-        self._homes = homes
-        self._values = camera.values
+        self._values, self._homes, self._watched = camera.values, homes, 0
         self._track: list[tuple[float, TargetPose]] = []  # the last two poses
-        self._watched = 0
         self._follow_camera, self._stated = follow, body
         if follow or camera.readout:  # what is off is found out, and taken off, so no marker may be left out for it
             self.body = body.model_copy(update={"tolerance": math.hypot(body.tolerance, _FILM_SLACK)})
@@ -118,16 +117,15 @@ class Tracker:
         check_size(frame.image, self.camera, f"frame {frame.index}")
         floor_seen = self._locate_anew(frame.image) if self._follow_camera else {}
         shift = 0.0 if self._follow_camera else self._floor_shift(frame.image)
-        found, seen = self._follow(frame)
+        found, seen = self._follow(frame) if self._track else (None, {})
         if found is None:
-            found, seen = self._search(frame)
+            found, seen = self._search(frame.image)
+        without = replace(no_pose(frame, LOST, self.body), floor=self.floor_pose, floor_seen=floor_seen)
         if found is None or shift > _MOVED_BY:
             self._track = []
             dark = found is None and math.isinf(shift)  # nothing at all is seen
-            status = MOVED if shift > _MOVED_BY and not dark else LOST
-            return replace(no_pose(frame, status, self.body), floor=self.floor_pose, floor_seen=floor_seen)
-        before = self._track[-1:]
-        self._track = [*before, (frame.time, found)]
+            return replace(without, status=MOVED if shift > _MOVED_BY and not dark else LOST)
+        self._track = [*self._track[-1:], (frame.time, found)]
         if self.camera.readout and not self._follow_camera:
             found = self._at_frame_time(found, seen)
         used = {index: detection for index, detection in seen.items() if found.used[index]}
@@ -135,19 +133,14 @@ class Tracker:
         pose, covariance = pose_in_floor(found, self.floor_pose)
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
-            nothing = no_pose(frame, IMPOSSIBLE, self.body)
-            return replace(nothing, centres=centres, floor=self.floor_pose, floor_seen=floor_seen)
-        count = int(found.used.sum())
-        status = OK if count == len(self.body.markers) else PARTIAL
-        return Sample(
-            frame.index, frame.time, status, pose, covariance, count, found.residual, centres, used, found, self.floor_pose,
-            floor_seen,
+            return replace(without, status=IMPOSSIBLE, centres=centres)
+        return replace(
+            without, status=OK if found.used.all() else PARTIAL, pose=pose, covariance=covariance,
+            markers=int(found.used.sum()), residual=found.residual, centres=centres, seen=used, in_camera=found,
         )  # fmt: skip
 
     def _follow(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look where the markers should be."""
-        if not self._track:
-            return None, {}
         found, seen = self._solved_at(frame.image, *self._predicted(frame.time))
         if found is None or found.used.all():
             return found, seen
@@ -173,15 +166,21 @@ class Tracker:
         again = solve_pose(moved, self._stated, self.camera, found.rotation, found.position)
         return again if again is not None and again.residual < LARGEST_RESIDUAL else found
 
-    def _search(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
+    def _search(self, image: Image) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look around where the body was, then everywhere."""
         up = self.floor_pose.rotation[:, 2]
-        boxes = [self._neighbourhood()] if self._track else []
-        for box in [*boxes, None]:
-            detections = detect(frame.image, self.camera, box)
+        for box in [self._neighbourhood(), None] if self._track else [None]:
+            detections = detect(image, self.camera, box)
             found = find_target(detections, self.body, self.camera, up)
-            if found is not None:
-                return found, _identified(detections, found, self.body, self._values)
+            if found is None:
+                continue
+            seen = {}
+            for index in range(len(self.body.markers)):
+                ellipse = expected_ellipse(self.body, index, self._values, found.rotation, found.position)
+                if ellipse is not None:
+                    away = [math.hypot(*(detection.ellipse[:2] - ellipse[:2])) for detection in detections]
+                    seen[index] = detections[int(np.argmin(away))]
+            return found, seen
         return None, {}
 
     def _predicted(self, time: float) -> tuple[Array, Array]:
@@ -197,10 +196,8 @@ class Tracker:
 
     def _neighbourhood(self) -> tuple[int, int, int, int]:
         _, last = self._track[-1]
-        ellipses = [
-            expected_ellipse(self.body, index, self._values, last.rotation, last.position)
-            for index in range(len(self.body.markers))
-        ]
+        count = range(len(self.body.markers))
+        ellipses = [expected_ellipse(self.body, index, self._values, last.rotation, last.position) for index in count]
         points = np.array([ellipse[:2] for ellipse in ellipses if ellipse is not None])
         low, high = points.min(axis=0), points.max(axis=0)
         margin = 0.5 * (high - low).max() + 20
@@ -212,11 +209,17 @@ class Tracker:
 
         One marker is looked at per frame, in turn; when it is not in its place, all of them: it may just be hidden.
         """
+        pose = self.floor_pose
+
+        def shift_of(index: int) -> float:
+            seen = _marker_at(image, self.floor, index, self._values, pose.rotation, pose.position)
+            return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
+
         self._watched = (self._watched + 1) % len(self._homes)
-        shift = self._marker_shift(image, self._watched)
+        shift = shift_of(self._watched)
         if shift < _MOVED_BY:
             return shift
-        shifts = np.array([self._marker_shift(image, index) for index in range(len(self._homes))])
+        shifts = np.array([shift_of(index) for index in range(len(self._homes))])
         known = shifts[np.isfinite(shifts)]
         return float(np.median(known)) if len(known) else math.inf
 
@@ -225,36 +228,23 @@ class Tracker:
         last = self.floor_pose
         seen = seen_at(image, self.floor, self._values, last.rotation, last.position)
         if len(seen) < MINIMUM_MARKERS:
-            detections = detect(image, self.camera)
-            found = find_laid_target(detections, self.floor, self.camera)
-            if found is None:
+            if (anew := find_laid_target(detect(image, self.camera), self.floor, self.camera)) is None:
                 return {}
-            last, seen = found, seen_at(image, self.floor, self._values, found.rotation, found.position)
+            last, seen = anew, seen_at(image, self.floor, self._values, anew.rotation, anew.position)
         found = solved_floor(seen, self.floor, self.camera, last)
         if found is None:
             return {}
         self.floor_pose = found
         return {index: detection for index, detection in seen.items() if found.used[index]}
 
-    def _marker_shift(self, image: Image, index: int) -> float:
-        """Distance (px) of a floor marker from its place; NaN when it is not seen there."""
-        pose = self.floor_pose
-        seen = _marker_at(image, self.floor, index, self._values, pose.rotation, pose.position)
-        return math.nan if seen is None else math.hypot(*(seen.ellipse[:2] - self._homes[index]))
-
 
 def _mirrored(pose: TargetPose) -> tuple[Array, Array]:
     """The other pose in which a small plane target looks nearly the same: its normal mirrored at the line of sight."""
-    from scipy.spatial.transform import Rotation
-
-    sight = pose.position / np.linalg.norm(pose.position)
-    normal = pose.rotation[:, 2]
-    turn = 2.0 * float(normal @ sight) * np.cross(normal, sight)  # sine of twice the angle between them, along its axis
-    sine, cosine = float(np.linalg.norm(turn)), 2 * float(normal @ sight) ** 2 - 1
-    if sine < 1e-12:
-        return pose.rotation, pose.position
-    angle = math.atan2(sine, cosine)
-    return Rotation.from_rotvec(turn * (angle / sine)).as_matrix() @ pose.rotation, pose.position
+    normal, sight = pose.rotation[:, 2], pose.position / np.linalg.norm(pose.position)
+    turn = np.eye(3)
+    for axis in (normal, sight):  # half a turn about each
+        turn = (2 * np.outer(axis, axis) - np.eye(3)) @ turn
+    return turn @ pose.rotation, pose.position
 
 
 def track(frames: Iterable[VideoFrame], camera: Camera, body: Target, floor: Target) -> Iterator[Sample]:
@@ -311,26 +301,17 @@ def pose_in_floor(body: TargetPose, floor: TargetPose, moving: bool = False) -> 
 
     That of the floor's own place is part of it only where every frame has its own (``moving``).
     """
-    rotation = floor.rotation.T @ body.rotation
-    apart = body.position - floor.position
-    pose = np.concatenate([floor.rotation.T @ apart, angles(rotation)])
+    to_floor, apart = floor.rotation.T, body.position - floor.position
+    pose = np.concatenate([to_floor @ apart, angles(to_floor @ body.rotation)])
     yaw, pitch = pose[3], pose[4]
+    (c, s), cosine = (math.cos(yaw), math.sin(yaw)), max(0.1, math.cos(pitch))
     # a small turn w about the floor's axes changes yaw, pitch and roll by this matrix times w
-    cosine = max(0.1, math.cos(pitch))
-    rates = np.array(
-        [
-            [math.cos(yaw) * math.tan(pitch), math.sin(yaw) * math.tan(pitch), 1.0],
-            [-math.sin(yaw), math.cos(yaw), 0.0],
-            [math.cos(yaw) / cosine, math.sin(yaw) / cosine, 0.0],
-        ]
-    )
+    rates = np.array([[c * math.tan(pitch), s * math.tan(pitch), 1.0], [-s, c, 0.0], [c / cosine, s / cosine, 0.0]])
     jacobian = np.zeros((6, 6))
-    jacobian[:3, 3:] = floor.rotation.T
-    jacobian[3:, :3] = rates @ floor.rotation.T
+    jacobian[:3, 3:], jacobian[3:, :3] = to_floor, rates @ to_floor
     covariance = jacobian @ body.covariance @ jacobian.T
     if moving:
-        x, y, z = apart
-        jacobian[:3, :3] = -floor.rotation.T @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        jacobian[:3, :3] = -to_floor @ np.cross(np.eye(3), apart)
         covariance = covariance + jacobian @ floor.covariance @ jacobian.T
     return pose, covariance
 
@@ -342,16 +323,16 @@ def angles(rotation: Array) -> Array:
     return np.array([yaw, pitch, math.atan2(rotation[2, 1], rotation[2, 2])])
 
 
-def without_pose(sample: Sample, status: str) -> Sample:
-    """The sample with its pose taken off."""
-    nothing = np.full(6, np.nan), np.full((6, 6), np.nan)
-    return replace(sample, status=status, pose=nothing[0], covariance=nothing[1], markers=0, residual=math.nan, in_camera=None)
-
-
 def no_pose(frame: VideoFrame, status: str, body: Target) -> Sample:
     """The sample of a frame that shows nothing."""
     nothing = np.full(6, np.nan), np.full((6, 6), np.nan)
     return Sample(frame.index, frame.time, status, *nothing, 0, math.nan, centres_of(body, {}))
+
+
+def without_pose(sample: Sample, status: str) -> Sample:
+    """The sample with its pose taken off."""
+    nothing = np.full(6, np.nan), np.full((6, 6), np.nan)
+    return replace(sample, status=status, pose=nothing[0], covariance=nothing[1], markers=0, residual=math.nan, in_camera=None)
 
 
 def centres_of(target: Target, seen: Mapping[int, Detection]) -> Array:
@@ -371,16 +352,6 @@ def seen_at(image: Image, target: Target, camera: Array, rotation: Array, positi
 def _marker_at(image: Image, target: Target, index: int, camera: Array, rotation: Array, position: Array) -> Detection | None:
     ellipse = expected_ellipse(target, index, camera, rotation, position)
     return None if ellipse is None else refine(image, camera, ellipse, int(target.codes[index]))
-
-
-def _identified(detections: Sequence[Detection], found: TargetPose, target: Target, camera: Array) -> dict[int, Detection]:
-    seen = {}
-    for index in range(len(target.markers)):
-        ellipse = expected_ellipse(target, index, camera, found.rotation, found.position)
-        if ellipse is not None and detections:
-            x, y = ellipse[:2]
-            seen[index] = min(detections, key=lambda d, x=x, y=y: math.hypot(d.ellipse[0] - x, d.ellipse[1] - y))
-    return seen
 
 
 def mean_detection(found: Sequence[Detection]) -> Detection:
@@ -464,23 +435,17 @@ class PoseFinder:
     def _look_for_floor(self, frame: VideoFrame) -> None:
         """Collect frames that show floor markers, and locate the floor from them."""
         self._waited += 1
-        if not self._floor_frames and self._waited < _EVERY and self._waited > 1:
+        if not self._floor_frames and 1 < self._waited < _EVERY:
             return
-        found = sum(detection.code in self.floor.codes for detection in detect(frame.image, self.camera))
-        if found < 4:
-            self._floor_frames = []
-            self._waited = 1
+        if sum(detection.code in self.floor.codes for detection in detect(frame.image, self.camera)) < 4:
+            self._floor_frames, self._waited = [], 1
             return
         self._floor_frames.append(frame)
-        if len(self._floor_frames) < LIVE_FLOOR_FRAMES:
-            return
-        try:
-            located = locate_floor(self._floor_frames, self.camera, self.floor)
-        except InputError:  # markers that do not fit together
-            located = None
-        self._floor_frames, self._waited = [], 0
-        if located is not None:
-            self._tracker = Tracker(self.camera, self.body, self.floor, *located)
+        if len(self._floor_frames) == LIVE_FLOOR_FRAMES:
+            with suppress(InputError):  # markers that do not fit together
+                located = locate_floor(self._floor_frames, self.camera, self.floor)
+                self._tracker = Tracker(self.camera, self.body, self.floor, *located)
+            self._floor_frames, self._waited = [], 0
 
 
 def _judged(image: Image) -> str:
