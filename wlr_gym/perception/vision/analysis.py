@@ -6,13 +6,14 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.files import replace_file, write_json
 from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, tidy
 from wlr_gym.data.run_states import rest_pose
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 ORIGINS = ("start", "floor")
+_POSE = ("x", "y", "z", "yaw", "pitch", "roll")
 #: px; above this the calibration, the print or the target file do not fit what is seen.
 POOR_FIT = 0.3
 #: m; the body's height by the camera may differ by this from what its legs say.
@@ -136,24 +138,29 @@ def analyse(
         robot: None = the one the run's meta data name.
         offset: s, servo time minus camera time; None = found from the motion.
         origin: frame of the ``cam_*`` columns: ``start`` (pose at the start is 0, 0, 0, as in simulated runs) or ``floor``.
-        watch: called with every frame and its sample.
+        watch: called with every frame and its sample, in order.
         around: s, where ``offset`` is looked for, within 1 s.
 
     Raises:
         InputError: wrong image size, no floor frame, too few poses, no motion to align on, video and run apart.
     """
-    if origin not in ORIGINS:
-        raise unknown_name("origin", origin, ORIGINS)
+    check_name("origin", origin, ORIGINS)
     found = robot_of(run, robot)
     parameters = Parameters.nominal(found)
-    shown: list[VideoFrame] = []  # the first frame, to say what is in it when the robot is not
-    samples = tuple(_observed(frames, camera, body, floor, watch or (lambda frame, sample: None), shown))
-    seen = sum(math.isfinite(sample.pose[0]) for sample in samples)
-    if seen < 10:
-        counts = ", ".join(f"{count} {name}" for name, count in Counter(sample.status for sample in samples).items())
-        why = sheet_fault(detect(shown[0].image, camera), body, camera)
-        raise InputError(f"only {seen} of {len(samples)} frames have a pose of the robot ({counts}); in the first frame {why}")
-    samples, calibration = self_calibrated(tuple(without_repeats(samples)), camera, body, floor)
+    for_tracking, for_watching = tee(frames)  # they are apart no longer than until the floor is located
+    tracked: list[Sample] = []
+    first = None  # to say what is in it when the robot is not
+    for frame, sample in zip(for_watching, track(for_tracking, camera, body, floor), strict=False):
+        first = first or frame
+        tracked.append(sample)
+        if watch is not None:
+            watch(frame, sample)
+    seen = sum(math.isfinite(sample.pose[0]) for sample in tracked)
+    if first is None or seen < 10:
+        counts = ", ".join(f"{count} {name}" for name, count in Counter(sample.status for sample in tracked).items())
+        why = sheet_fault(detect(first.image, camera) if first else [], body, camera)
+        raise InputError(f"only {seen} of {len(tracked)} frames have a pose of the robot ({counts}); in the first frame {why}")
+    samples, calibration = self_calibrated(tuple(without_repeats(tracked)), camera, body, floor)
     alignment = None
     if offset is None:
         time, poses = np.array([s.time for s in samples]), np.stack([s.pose for s in samples])
@@ -190,79 +197,44 @@ def camera_columns(
     rates = np.stack([signal.rate for signal in smoothed_poses(kept, time, time)], axis=1)
     marker = np.asarray(run.meta.marker_offset)
     place = poses[:, :3] + np.einsum("nij,j->ni", rotation(*poses[:, 3:].T), marker)
-    columns = {name: np.full(len(t), np.nan) for name in ("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch")}
     after = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
     rows = after - (time - t[after - 1] <= t[after] - time)
     late = t[rows] - time
     inside = (time > t[0] - 0.01) & (time < t[-1] + 0.01)
     values = np.column_stack([place[:, :2], poses[:, 3], place[:, 2], poses[:, 4]]) + late[:, None] * rates[:, [0, 1, 3, 2, 4]]
     if origin == "start":
-        values[:, :3] = _from_start(values[:, :3], time)
-    for index in np.argsort(-np.abs(late)):  # of two frames near one row the nearer is written last
-        if inside[index]:
-            for name, value in zip(columns, values[index], strict=True):
-                columns[name][rows[index]] = value
-    return run.table.assign(**columns)
+        x, y, yaw = values[time <= time[0] + _START, :3].mean(axis=0)
+        c, s, (dx, dy) = math.cos(yaw), math.sin(yaw), (values[:, :2] - (x, y)).T
+        values[:, :3] = np.column_stack([c * dx + s * dy, c * dy - s * dx, values[:, 2] - yaw])
+    order = np.argsort(-np.abs(late))  # of two frames near one row the nearer is written last
+    order = order[inside[order]]
+    columns = np.full((len(t), 5), np.nan)
+    columns[rows[order]] = values[order]
+    return run.table.assign(**dict(zip(("cam_x", "cam_y", "cam_yaw", "cam_z", "cam_pitch"), columns.T, strict=True)))
 
 
 def save_video_analysis(analysis: VideoAnalysis, folder: Path) -> list[Path]:
     """Write run, slip table, samples, summary and plots into ``folder``; return their paths."""
-    name = analysis.run.name
     run = analysis.run
     robot = own_robot(run.meta, run.path.parent)
-    paths = [write_run(folder / f"{name}.parquet", run.table, run.meta, robot=robot)]
+    paths = [write_run(folder / f"{run.name}.parquet", run.table, run.meta, robot=robot)]
     for file, table in (("slip.csv", analysis.slip.table()), ("frames.csv", frame_table(analysis.samples, analysis.offset))):
         replace_file(folder / file, lambda temporary, table=table: table.to_csv(temporary, index=False, float_format="%.9g"))
-        paths.append(folder / file)
     write_json(folder / "summary.json", analysis.summary())
-    paths.append(folder / "summary.json")
-    for file, draw in (("pose.png", _draw_pose), ("slip.png", _draw_slip)):
-        paths.append(save(draw(analysis), folder / file))
-    return paths
+    paths += [folder / name for name in ("slip.csv", "frames.csv", "summary.json")]
+    return [*paths, save(_draw_pose(analysis), folder / "pose.png"), save(_draw_slip(analysis), folder / "slip.png")]
 
 
 def frame_table(samples: Sequence[Sample], offset: float) -> pandas.DataFrame:
     """One row per frame: number, time on both clocks, status, pose, 1 sigma, markers used, residual."""
     import pandas
 
-    names = ("x", "y", "z", "yaw", "pitch", "roll")
-    rows = []
-    for sample in samples:
-        std = np.sqrt(np.diag(sample.covariance))
-        row = {"frame": sample.index, "camera_time": sample.time, "t": sample.time + offset, "status": sample.status}
-        row |= dict(zip(names, sample.pose, strict=True)) | {f"{n}_std": s for n, s in zip(names, std, strict=True)}
-        rows.append(row | {"markers": sample.markers, "residual_px": sample.residual})
-    return pandas.DataFrame(rows)
-
-
-def _observed(
-    frames: Iterable[VideoFrame],
-    camera: Camera,
-    body: Target,
-    floor: Target,
-    watch: Callable[[VideoFrame, Sample], None],
-    shown: list[VideoFrame],
-) -> Iterator[Sample]:
-    """Track, and hand each frame with its sample to ``watch``; frames wait no longer than until the floor is located."""
-    waiting: list[VideoFrame] = []
-
-    def passing() -> Iterator[VideoFrame]:
-        for frame in frames:
-            waiting.append(frame)
-            shown[:] = shown or [frame]
-            yield frame
-
-    for sample in track(passing(), camera, body, floor):
-        watch(waiting.pop(0), sample)
-        yield sample
-
-
-def _from_start(values: Array, time: Array) -> Array:
-    """x, y, yaw (F, 3) in the frame of the mean pose over the first moments."""
-    x, y, yaw = values[time <= time[0] + _START].mean(axis=0)
-    c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = values[:, 0] - x, values[:, 1] - y
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx, values[:, 2] - yaw])
+    poses, std = np.stack([s.pose for s in samples]), np.sqrt([np.diag(s.covariance) for s in samples])
+    frames = [(s.index, s.time, s.time + offset, s.status) for s in samples]
+    table = pandas.DataFrame(frames, columns=["frame", "camera_time", "t", "status"])
+    table[list(_POSE)] = poses
+    table[[f"{name}_std" for name in _POSE]] = std
+    return table.assign(markers=[s.markers for s in samples], residual_px=[s.residual for s in samples])
 
 
 def _findings(samples: Sequence[Sample], slip: SlipResult, height_error: float, missing: int = 0) -> Iterator[str]:
@@ -348,19 +320,15 @@ def _draw_slip(analysis: VideoAnalysis) -> Any:
             axes.fill_between(slip.time, middle - band, middle + band, color=colour, alpha=0.3, linewidth=0.5)
         panels[2].plot(slip.time, slip.ratio[:, w], line, color=colour, linewidth=width)
     along, across = (f"{1e3 * wide:.2g} mm at the end" for wide in spread[-1].max(axis=0))
-    titles = (
-        (
-            "accumulated longitudinal slip: + skids forward (turns too little), - spins (turns too much)\n"
-            f"band: 2 sigma with wheel radius and marker layout, up to {along}",
-            "longitudinal slip (mm)",
-        ),
-        (f"accumulated lateral slip: + to the left; band: 2 sigma with marker layout, up to {across}", "lateral slip (mm)"),
-        (
-            "slip ratio, signs the other way round: +1 spins on the spot, -1 is locked, beyond them turns against its travel",
-            "slip ratio (-)",
-        ),
-    )
-    for axes, (title, unit) in zip(panels, titles, strict=True):
+    slip_signs = "+ skids forward (turns too little), - spins (turns too much)"
+    ratio_signs = "signs the other way round: +1 spins on the spot, -1 is locked, beyond them turns against its travel"
+    titles = {
+        "longitudinal slip (mm)": f"accumulated longitudinal slip: {slip_signs}\n"
+        f"band: 2 sigma with wheel radius and marker layout, up to {along}",
+        "lateral slip (mm)": f"accumulated lateral slip: + to the left; band: 2 sigma with marker layout, up to {across}",
+        "slip ratio (-)": f"slip ratio, {ratio_signs}",
+    }
+    for axes, (unit, title) in zip(panels, titles.items(), strict=True):
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_ylabel(unit)
         tidy(axes)

@@ -60,28 +60,39 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
         samples: of the film. offset: servo time minus camera time, s. run: with gyroscope; without one nothing is compared.
         robot: its IMU's bandwidth delays what it says.
     """
-    late = 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
-    t = run["t"] - late
-    seen = _comparable(samples, offset, run, t)
-    if not seen:
+    t = run["t"] - 1 / (2 * math.pi * robot.sensors.imu.bandwidth)
+    seen, gyro = _comparable(samples, offset, run, t), _readings(run, "gyro")
+    if not seen or gyro is None:
         return
     time = np.array([sample.time for sample in seen]) + offset
     film = np.unwrap(np.stack([sample.pose[3:] for sample in seen]), axis=0)
     own = np.sqrt([np.diag(sample.covariance)[3:] for sample in seen])
     std = np.median(own, axis=0)
-    gyro = _readings(run, "gyro")
-    assert gyro is not None
     pitch, roll = (np.interp(t, time, film[:, k]) for k in (1, 2))
     turned = np.stack([np.interp(time, t, accumulate(rate, t)) for rate in _angle_rates(gyro, pitch, roll)], axis=1)
-    yaw = film[:, 0]
-    around = [turned[:, 0], np.cos(yaw), np.sin(yaw)]
+    free = [np.ones(len(time)), time]
     for k, axis in enumerate(("yaw", "pitch", "roll")):
-        known = np.column_stack([np.ones(len(time)), time, *(around if k else [])])
+        known = np.column_stack(free if k == 0 else [*free, turned[:, 0], np.cos(film[:, 0]), np.sin(film[:, 0])])
+        # what is left of both turns without that, and of the film's without the gyroscope's, of a scale near 1
+        left, by_gyro = _rest(film[:, k], known), _rest(turned[:, k], known)
+        scale = float(left @ by_gyro) / max(float(by_gyro @ by_gyro), 1e-12)
+        rest = left - float(np.clip(scale, 1.0 - _SCALE_ERROR, 1.0 + _SCALE_ERROR)) * by_gyro
         limit = np.maximum(TILT_ERROR if k else TURN_ERROR, SIGMAS * np.maximum(own[:, k], std[k]))
-        yield from _largest(axis, time, _without_turn(film[:, k], turned[:, k], known), limit)
+        rest, limit = (np.convolve(a, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid") for a in (rest, limit))
+        worst = int(np.argmax(np.abs(rest) / limit))
+        if abs(rest[worst]) > limit[worst]:
+            yield TurnDifference(axis, float(time[worst + _TOGETHER // 2]), float(abs(rest[worst])))
     force = _readings(run, "acc")
-    if force is not None:
-        yield from _level(time, film, std, force, t, gyro)
+    if force is None:
+        return
+    # the tilt while the robot rests, against the direction of gravity
+    still = np.abs(np.linalg.norm(force, axis=1) - _GRAVITY) < 10 * _AT_REST
+    rests = np.interp(time, t, (still & (np.abs(gyro).max(axis=1) < _AT_REST)).astype(float)) == 1.0
+    x, y, z = force.T
+    for k, (axis, tilt) in enumerate((("pitch", np.arctan2(-x, np.hypot(y, z))), ("roll", np.arctan2(y, z))), start=1):
+        apart = (film[:, k] - np.interp(time, t, tilt))[rests]
+        if len(apart) >= _TOGETHER and (off := float(abs(np.median(apart)))) > max(LEVEL_ERROR, SIGMAS * float(std[k])):
+            yield TurnDifference(axis, float(time[rests][len(apart) // 2]), off, level=True)
 
 
 def imu_compared(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> tuple[bool, list[str]]:
@@ -92,16 +103,18 @@ def imu_compared(samples: Sequence[Sample], offset: float, run: Run, robot: Robo
 
 def imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[str]:
     """What of a film the IMU contradicts, in words."""
-    size = wrong_gravity(run)
-    if size is not None:
-        yield f"the accelerometer reads {size:.1f} m/s2 (median), expected 9.8: wrong unit, sign or sensor; the IMU is not used"
+    if (force := _readings(run, "acc")) is not None:
+        size = math.copysign(float(np.median(np.linalg.norm(force, axis=1))), float(np.median(force[:, 2])))
+        if abs(size - _GRAVITY) > _SIZE_ERROR:
+            wrong = f"the accelerometer reads {size:.1f} m/s2 (median), expected 9.8"
+            yield f"{wrong}: wrong unit, sign or sensor; the IMU is not used"
     for channel, shown, time in wrong_axes(samples, offset, run, robot):
         yield (
             f"the film shows {shown} where the log has {channel}, most at {time:.2f} s: axes swapped, or a wrong sign; correct "
             "the log's columns (x ahead, y to the left, z up: +9.8 at rest); the IMU is not used"
         )
     for difference in imu_differences(samples, offset, run, robot):
-        size, axis = f"{1e3 * difference.size:.0f} mrad", difference.axis
+        size, axis, when = f"{1e3 * difference.size:.0f} mrad", difference.axis, f"most at {difference.time:.2f} s"
         if difference.level:
             yield (
                 f"at rest the {axis} differs from the accelerometer's by {size}: floor markers not level, a plate or an IMU "
@@ -109,13 +122,13 @@ def imu_findings(samples: Sequence[Sample], offset: float, run: Run, robot: Robo
             )
         elif axis == "yaw":
             yield (
-                f"camera and gyroscope see turns that differ by {size}, most at {difference.time:.2f} s: frame times that jump "
-                f"(frames dropped without a trace?), or a wrong run; {UNSURE}"
+                f"camera and gyroscope see turns that differ by {size}, {when}: frame times that jump (frames dropped without "
+                f"a trace?), or a wrong run; {UNSURE}"
             )
         else:
             yield (
-                f"the {axis} differs from the gyroscope's by {size}, most at {difference.time:.2f} s: a marker that gives way, "
-                f"a wrong readout or frame times that jump; {UNSURE}"
+                f"the {axis} differs from the gyroscope's by {size}, {when}: a marker that gives way, a wrong readout or frame "
+                f"times that jump; {UNSURE}"
             )
 
 
@@ -123,15 +136,6 @@ def _comparable(samples: Sequence[Sample], offset: float, run: Run, t: Array) ->
     """Samples with a pose within the gyroscope's times; none where they are too few or there is no gyroscope."""
     seen = [sample for sample in samples if math.isfinite(sample.pose[0]) and t[0] < sample.time + offset < t[-1]]
     return seen if _readings(run, "gyro") is not None and len(seen) >= _FEWEST else []
-
-
-def wrong_gravity(run: Run) -> float | None:
-    """The median size (m/s2; below 0 = downwards) of a specific force that cannot be a robot's on the floor; else None."""
-    force = _readings(run, "acc")
-    if force is None:
-        return None
-    size = math.copysign(float(np.median(np.linalg.norm(force, axis=1))), float(np.median(force[:, 2])))
-    return None if abs(size - _GRAVITY) <= _SIZE_ERROR else size
 
 
 def wrong_axes(samples: Sequence[Sample], offset: float, run: Run, robot: Robot) -> Iterator[tuple[str, str, float]]:
@@ -170,36 +174,6 @@ def _angle_rates(gyro: Array, pitch: Array, roll: Array) -> Array:
     return np.stack([about / np.cos(pitch), y * np.cos(roll) - z * np.sin(roll), x + about * np.tan(pitch)])
 
 
-def _without_turn(values: Array, turned: Array, known: Array) -> Array:
-    """What is left of an angle's values without the gyroscope's turn, of a scale near 1, and ``known`` (F, K)."""
-    left, own = _rest(values, known), _rest(turned, known)
-    scale = float(left @ own) / max(float(own @ own), 1e-12)
-    return left - float(np.clip(scale, 1.0 - _SCALE_ERROR, 1.0 + _SCALE_ERROR)) * own
-
-
 def _rest(values: Array, known: Array) -> Array:
     size = np.maximum(np.linalg.norm(known, axis=0), 1e-12)
     return values - known @ (np.linalg.lstsq(known / size, values, rcond=1e-6)[0] / size)
-
-
-def _largest(axis: str, time: Array, rest: Array, limit: Array) -> Iterator[TurnDifference]:
-    mean, limit = (np.convolve(a, np.full(_TOGETHER, 1 / _TOGETHER), mode="valid") for a in (rest, limit))
-    worst = int(np.argmax(np.abs(mean) / limit))
-    if abs(mean[worst]) > limit[worst]:
-        yield TurnDifference(axis, float(time[worst + _TOGETHER // 2]), float(abs(mean[worst])))
-
-
-def _level(time: Array, film: Array, std: Array, force: Array, t: Array, gyro: Array) -> Iterator[TurnDifference]:
-    """Tilt while the robot rests, against the direction of gravity."""
-    size = np.linalg.norm(force, axis=1)
-    rests = (np.abs(gyro).max(axis=1) < _AT_REST) & (np.abs(size - _GRAVITY) < 10 * _AT_REST)
-    x, y, z = force.T
-    down = np.stack([np.arctan2(-x, np.hypot(y, z)), np.arctan2(y, z)])
-    near = np.interp(time, t, rests.astype(float)) == 1.0
-    if near.sum() < _TOGETHER:
-        return
-    for k, axis in enumerate(("pitch", "roll")):
-        apart = (film[:, k + 1] - np.interp(time, t, down[k]))[near]
-        off = float(abs(np.median(apart)))
-        if off > max(LEVEL_ERROR, SIGMAS * float(std[k + 1])):
-            yield TurnDifference(axis, float(time[near][len(apart) // 2]), off, level=True)

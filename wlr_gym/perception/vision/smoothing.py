@@ -19,12 +19,11 @@ from wlr_gym.base.errors import InputError
 
 Array = NDArray[np.float64]
 
+_FACTORIALS = np.array([1.0, 1.0, 2.0])
 #: log10 of the jerk's spectral density, in unit^2/s^5, that are tried.
 _DENSITIES = np.arange(-6.0, 8.1, 0.5)
 _GATE = 100.0  # squared deviations from the prediction, in its variance
 _MOST_REJECTED = 4  # in a row; then the signal has really jumped
-#: What white jerk of density 1 adds to the covariance of value, rate and acceleration in 1 s is 1 over these.
-_SHARES = np.array([[20.0, 8.0, 6.0], [8.0, 3.0, 2.0], [6.0, 2.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,28 +83,18 @@ def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: Array
 
 
 @inner_kernel
-def _sandwich(matrix: Any, spread: Any, result: Any) -> None:
-    """Write ``matrix`` ``spread`` ``matrix``^T, all (3, 3); the result may be in the same array as ``spread``."""
-    half = np.empty((3, 3))
+def _predict(step: float, density: float, spread: Any) -> None:
+    """Carry a covariance (3, 3) over a step of constant acceleration with white jerk of that density."""
+    half = 0.5 * step * step
+    for j in range(3):
+        spread[0, j] += step * spread[1, j] + half * spread[2, j]
+        spread[1, j] += step * spread[2, j]
     for i in range(3):
-        for j in range(3):
-            half[i, j] = matrix[i, 0] * spread[0, j] + matrix[i, 1] * spread[1, j] + matrix[i, 2] * spread[2, j]
+        spread[i, 0] += step * spread[i, 1] + half * spread[i, 2]
+        spread[i, 1] += step * spread[i, 2]
     for i in range(3):
-        for j in range(3):
-            result[i, j] = half[i, 0] * matrix[j, 0] + half[i, 1] * matrix[j, 1] + half[i, 2] * matrix[j, 2]
-
-
-@inner_kernel
-def _predict(step: float, density: float, spread: Any, matrix: Any, ahead: Any) -> None:
-    """Write the change over a step to ``matrix``, and the covariance after it to ``ahead``, which may be ``spread``."""
-    for i in range(3):
-        for j in range(3):
-            matrix[i, j] = 1.0 if i == j else 0.0
-    matrix[0, 1], matrix[1, 2], matrix[0, 2] = step, step, 0.5 * step * step
-    _sandwich(matrix, spread, ahead)
-    for i in range(3):
-        for j in range(3):  # white jerk for the step's time
-            ahead[i, j] += density * step ** (5 - i - j) / _SHARES[i, j]
+        for j in range(3):  # what the jerk adds is the integral of the products of its powers of time
+            spread[i, j] += density * step ** (5 - i - j) / ((5 - i - j) * _FACTORIALS[2 - i] * _FACTORIALS[2 - j])
 
 
 @njit(cache=True, nogil=True)
@@ -113,17 +102,14 @@ def _filter(
     time: Any, values: Any, variances: Any, density: float, jump: float, rejected: Any, states: Any, spreads: Any
 ) -> float:
     """Kalman filter; returns the log likelihood. Filtered states and covariances go to ``states``, ``spreads`` unless empty."""
-    matrix, spread, state, gain = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
-    for k in range(3):
-        state[k] = 0.0
-        for j in range(3):
-            spread[k, j] = (1e4 if k == 0 else 1e2) if k == j else 0.0
+    spread, half, state, gain = np.diag(np.array([1e4, 1e2, 1e2])), np.empty((3, 3)), np.zeros(3), np.empty(3)
     likelihood, in_a_row = 0.0, 0
     for i in range(time.shape[0]):
         if i > 0 and time[i] > time[i - 1]:
-            _predict(time[i] - time[i - 1], density, spread, matrix, spread)
-            state[0] += matrix[0, 1] * state[1] + matrix[0, 2] * state[2]
-            state[1] += matrix[1, 2] * state[2]
+            step = time[i] - time[i - 1]
+            _predict(step, density, spread)
+            state[0] += step * state[1] + 0.5 * step * step * state[2]
+            state[1] += step * state[2]
         rejected[i] = False
         if not math.isnan(values[i]):
             total = spread[0, 0] + variances[i]
@@ -134,60 +120,33 @@ def _filter(
                 likelihood -= 0.5 * (_GATE + math.log(total))
             else:
                 in_a_row = 0
-                for k in range(3):
+                for k in range(3):  # Joseph's form: it stays positive however sure a sample is
                     gain[k] = spread[k, 0] / total
                     state[k] += gain[k] * error
                     for j in range(3):
-                        matrix[k, j] = (1.0 if k == j else 0.0) - (gain[k] if j == 0 else 0.0)
-                _sandwich(matrix, spread, spread)
+                        half[k, j] = spread[k, j] - gain[k] * spread[0, j]
                 for k in range(3):
                     for j in range(3):
-                        spread[k, j] += variances[i] * gain[k] * gain[j]
+                        spread[k, j] = half[k, j] - half[k, 0] * gain[j] + variances[i] * gain[k] * gain[j]
                 likelihood -= 0.5 * (error * error / total + math.log(total))
         if states.shape[0] > 0:
-            for k in range(3):
-                states[i, k] = state[k]
-                for j in range(3):
-                    spreads[i, k, j] = spread[k, j]
+            states[i], spreads[i] = state, spread
     return likelihood
-
-
-@inner_kernel
-def _divide(matrix: Any, spread: Any) -> None:
-    """Write ``matrix`` ``spread``^-1 to ``matrix``, by columns; ``spread`` is positive definite and used up."""
-    for i in range(3):
-        for k in range(3):
-            if k != i:
-                share = spread[i, k] / spread[i, i]
-                for j in range(3):
-                    spread[j, k] -= share * spread[j, i]
-                    matrix[j, k] -= share * matrix[j, i]
-    for i in range(3):
-        for j in range(3):
-            matrix[j, i] /= spread[i, i]
 
 
 @njit(cache=True, nogil=True)
 def _smooth_back(time: Any, density: float, states: Any, spreads: Any) -> None:
-    matrix, ahead, gain, change = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    off = np.empty(3)
+    """Rauch, Tung and Striebel: let filtered states and covariances hear of all later ones."""
+    matrix, ahead = np.eye(3), np.empty((3, 3))
     for i in range(time.shape[0] - 2, -1, -1):
-        state, spread, later, later_spread = states[i], spreads[i], states[i + 1], spreads[i + 1]
-        if time[i + 1] == time[i]:
-            for k in range(3):
-                state[k] = later[k]
-                for j in range(3):
-                    spread[k, j] = later_spread[k, j]
+        step = time[i + 1] - time[i]
+        if step == 0.0:
+            states[i], spreads[i] = states[i + 1], spreads[i + 1]
             continue
-        _predict(time[i + 1] - time[i], density, spread, matrix, ahead)
-        for k in range(3):
-            off[k] = later[k] - (matrix[k, 0] * state[0] + matrix[k, 1] * state[1] + matrix[k, 2] * state[2])
-            for j in range(3):
-                change[k, j] = later_spread[k, j] - ahead[k, j]
-                gain[k, j] = spread[k, 0] * matrix[j, 0] + spread[k, 1] * matrix[j, 1] + spread[k, 2] * matrix[j, 2]
-        _divide(gain, ahead)
-        _sandwich(gain, change, change)
-        for k in range(3):
-            state[k] += gain[k, 0] * off[0] + gain[k, 1] * off[1] + gain[k, 2] * off[2]
-            for j in range(3):
-                spread[k, j] += change[k, j]
+        matrix[0, 1] = matrix[1, 2] = step
+        matrix[0, 2] = 0.5 * step * step
+        ahead[:] = spreads[i]
+        _predict(step, density, ahead)
+        gain = np.linalg.solve(ahead, matrix @ spreads[i]).T
+        states[i] += gain @ (states[i + 1] - matrix @ states[i])
+        spreads[i] += gain @ (spreads[i + 1] - ahead) @ gain.T

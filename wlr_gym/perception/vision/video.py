@@ -12,7 +12,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from queue import Full, Queue
@@ -88,11 +88,9 @@ class Frames:
 
     def _images(self, source: str) -> Iterator[tuple[float, Image]]:
         path = Path(source)
-        if path.is_dir():
-            return self._folder(path)
-        if not path.is_file():
+        if not path.exists():
             raise InputError(f"{source}: no such video or folder of images")
-        return self._file(path)
+        return self._folder(path) if path.is_dir() else self._file(path)
 
     def _file(self, path: Path) -> Iterator[tuple[float, Image]]:
         import cv2
@@ -101,18 +99,14 @@ class Frames:
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as the sensor read it: lens and shutter belong to that
         if not video.isOpened():
             raise InputError(f"{path}: cannot be read as a video; expected a format that OpenCV reads (AVI, MP4, MKV)")
-        rate, announced = video.get(cv2.CAP_PROP_FPS), video.get(cv2.CAP_PROP_FRAME_COUNT)
-        rate = rate if 1 < rate < 2000 else 30.0
+        rate, announced = _plausible(video.get(cv2.CAP_PROP_FPS)), video.get(cv2.CAP_PROP_FRAME_COUNT)
         self.announced = max(round(announced), 0) if math.isfinite(announced) else 0
         index, before = 0, -math.inf
-        while True:
-            ok, image = video.read()
-            if not ok:
-                break
+        while (read := video.read())[0]:
             stamp = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
             if not stamp > before:  # a container without times
-                stamp = index / rate if index == 0 else before + 1 / rate
-            yield stamp, grey(image)
+                stamp = before + 1 / rate if index else 0.0
+            yield stamp, grey(read[1])
             index, before = index + 1, stamp
         video.release()
         if index == 0:
@@ -121,7 +115,10 @@ class Frames:
             self.missing = self.announced - index
 
     def _folder(self, folder: Path) -> Iterator[tuple[float, Image]]:
-        files = sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGES), key=_counted)
+        files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGES]
+        # numbers count as numbers, 2 before 10: text, number, text, ...
+        parts = {path: re.split(r"(\d+)", path.name) for path in files}
+        files.sort(key=lambda path: ([int(part) if k % 2 else part for k, part in enumerate(parts[path])], path.name))
         if not files:
             raise InputError(f"{folder}: no images ({', '.join(IMAGES)})")
         self.announced = len(files)
@@ -132,10 +129,9 @@ class Frames:
             yield index / 30.0, image
 
 
-def _counted(path: Path) -> tuple[list[str | int], str]:
-    """Return what puts files in order of name, with numbers as numbers: 2 before 10."""
-    parts = re.split(r"(\d+)", path.name)  # text, number, text, ...
-    return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
+def _plausible(rate: float) -> float:
+    """The rate (Hz) that a video or a driver states, or a usual one."""
+    return rate if 1 < rate < 2000 else 30.0
 
 
 def read_image(path: Path) -> Image | None:
@@ -257,13 +253,18 @@ def annotate(image: Image, sample: Sample, body: Target, trail: list[tuple[int, 
     import cv2
 
     picture: Any = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    colour = _COLOURS.get(sample.status, (40, 40, 220))
-    for x, y in sample.centres[np.isfinite(sample.centres[:, 0])]:
+    colour, seen = _COLOURS.get(sample.status, (40, 40, 220)), np.isfinite(sample.centres[:, 0])
+    for x, y in sample.centres[seen]:
         cv2.drawMarker(picture, (round(x), round(y)), colour, cv2.MARKER_CROSS, 18, 2)
-    arrow = _heading(sample.centres, body)
-    if arrow is not None:
-        trail.append(_whole(arrow[0]))
-        cv2.arrowedLine(picture, _whole(arrow[0]), _whole(arrow[1]), colour, 2, cv2.LINE_AA, tipLength=0.15)
+    if seen.sum() >= 3:
+        # from the body's origin, at the height of its markers, to a point in front: by the affine map from the markers' places
+        # to their centres, which is enough to look at
+        places = np.column_stack([body.positions[:, :2], np.ones(len(seen))])
+        plane = np.linalg.lstsq(places[seen], sample.centres[seen], rcond=None)[0]
+        ahead = 1.5 * float(np.abs(body.positions[:, 0]).max())
+        (x, y), tip = np.rint([[0.0, 0.0, 1.0], [ahead, 0.0, 1.0]] @ plane).astype(int).tolist()
+        trail.append((x, y))
+        cv2.arrowedLine(picture, (x, y), tip, colour, 2, cv2.LINE_AA, tipLength=0.15)
     if len(trail) > 1:
         cv2.polylines(picture, [np.array(trail, np.int32)], False, (200, 120, 0), 2, cv2.LINE_AA)
     text = f"frame {sample.index}  {sample.time:.3f} s  {sample.status}"
@@ -273,22 +274,6 @@ def annotate(image: Image, sample: Sample, body: Target, trail: list[tuple[int, 
     picture[:40] //= 3  # a dark strip to read the text on
     cv2.putText(picture, text, (12, 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
-
-
-def _heading(centres: NDArray[np.float64], body: Target) -> NDArray[np.float64] | None:
-    """Where (2, 2) px the body's origin, at the height of its markers, and a point in front of it are; None when too few
-    markers are seen. By the affine map from the markers' places to their centres, which is enough to look at."""
-    seen = np.isfinite(centres[:, 0])
-    if seen.sum() < 3:
-        return None
-    places = np.column_stack([body.positions[:, :2], np.ones(len(centres))])
-    plane = np.linalg.lstsq(places[seen], centres[seen], rcond=None)[0]
-    ahead = 1.5 * float(np.abs(body.positions[:, 0]).max())
-    return np.asarray(np.array([[0.0, 0.0, 1.0], [ahead, 0.0, 1.0]]) @ plane, np.float64)
-
-
-def _whole(point: Sequence[float] | NDArray[np.float64]) -> tuple[int, int]:
-    return round(float(point[0])), round(float(point[1]))
 
 
 # --- live camera ------------------------------------------------------------------------------------------------------
@@ -314,26 +299,21 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
     import cv2
 
     capture = open_device(number, camera)
-    rate = capture.get(cv2.CAP_PROP_FPS)
-    rate = rate if 1 < rate < 2000 else 30.0
-    queue: Queue[tuple[float, Image] | str | None] = Queue(_BACKLOG)
-    stop = threading.Event()
+    queue: Queue[tuple[float, Image] | str] = Queue(_BACKLOG)
+    stop, times, fault = threading.Event(), list[float](), ""
     thread = threading.Thread(target=_grab, args=(capture, queue, stop), daemon=True)
-    times: list[float] = []
-    fault = ""
+    rate = _plausible(capture.get(cv2.CAP_PROP_FPS))
     try:
         with _stopped_by_interrupt(stop), VideoFile(folder / "film.avi", "FFV1", rate) as video:
             thread.start()
-            for item in iter(queue.get, None):
-                if isinstance(item, str):
-                    fault = item
-                    continue
+            while not isinstance(item := queue.get(), str):
                 moment, image = item
                 check_size(image, camera, f"camera {number}")
                 video.write(image)
                 times.append(moment)
                 if seconds is not None and moment - times[0] >= seconds:
                     stop.set()
+            fault = item
     finally:
         stop.set()
         thread.join(timeout=5)
@@ -363,8 +343,8 @@ def open_device(device: int | str, camera: Camera) -> Any:
     return capture
 
 
-def _grab(capture: Any, queue: Queue[tuple[float, Image] | str | None], stop: threading.Event) -> None:
-    """Put (time, image) of every frame, then what went wrong if something did, then None."""
+def _grab(capture: Any, queue: Queue[tuple[float, Image] | str], stop: threading.Event) -> None:
+    """Put (time, image) of every frame, then what went wrong; empty = nothing."""
     start, fault = time.monotonic(), ""
     while not (stop.is_set() or fault):
         grabbed = capture.grab()
@@ -377,8 +357,7 @@ def _grab(capture: Any, queue: Queue[tuple[float, Image] | str | None], stop: th
                 fault = "no more frames (was it unplugged?)"
         except Full:
             fault = "frames come faster than they can be written; film slower or smaller"
-    for item in (fault, None) if fault else (None,):
-        queue.put(item)
+    queue.put(fault)
 
 
 @contextmanager
