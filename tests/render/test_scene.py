@@ -371,9 +371,9 @@ def test_the_robot_is_not_written_over(new_scene, parameters):
     lay_patch(parameters, 0, 0.05, (-0.5, 0.5), (-0.5, 0.5))
     scene = new_scene(View(size=(320, 240), camera="top"))
     scene.draw(truth_of(parameters), parameters)
-    (label,) = scene._labels(marks.areas(parameters, 0, np.zeros(2)), np.zeros(3))
+    ((_, place),) = scene._labels(marks.areas(parameters, 0, np.zeros(2)), np.zeros(3))
     robot, corner = scene.pixels([[0, 0, 0.1], [0.175, 0.16, 0.2]])
-    assert np.linalg.norm(np.array(label.place) - robot) > np.abs(corner - robot).max()
+    assert np.linalg.norm(np.array(place) - robot) > np.abs(corner - robot).max()
 
 
 # ---- OpenGL ----

@@ -75,6 +75,21 @@ class _Pair:
     free_scale: bool = False
     nuisance: Callable[[Array], Array] | None = None
 
+    def residual(self, at: Array, project: Callable[[Array], Array]) -> Array:
+        """What servo time ``at`` does not explain, of what is not ``project``-ed out."""
+        seen, servo = project(self.seen), project(self.servo(at))
+        free = [servo] if self.free_scale else []
+        if self.nuisance is not None:
+            free.append(project(self.nuisance(at)))
+        error = seen if self.free_scale else seen - servo
+        for column in np.linalg.qr(np.stack(free, axis=1))[0].T if free else ():
+            error = error - column * (column @ error)
+        return error
+
+    def costs(self, time: Array, grid: Array, project: Callable[[Array], Array]) -> Array:
+        """Squares of the residuals at each offset of a grid, summed."""
+        return np.array([np.sum(self.residual(time + offset, project) ** 2) for offset in grid])
+
 
 def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float = 0.0) -> Alignment:
     """Find the offset between the camera's clock and the run's.
@@ -103,21 +118,21 @@ def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
 
 
 def _aligned(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> Alignment:
-    inside = (time + around - SEARCH > run["t"][0]) & (time + around + SEARCH < run["t"][-1])
-    if inside.sum() < 30:
-        inside = (time + around > run["t"][0]) & (time + around < run["t"][-1])
-    if inside.sum() < 30:
+    for spare in (SEARCH, 0.0):  # frames that lie in the run at every offset, or at the middle one
+        inside = (time + around - spare > run["t"][0]) & (time + around + spare < run["t"][-1])
+        if inside.sum() >= 30:
+            break
+    else:
         raise InputError(
             f"{run.path}: only {int(inside.sum())} frames with a pose fall into the run, 30 are needed; does the video belong "
             "to it? (--offset says by how much the clocks differ)"
         )
     time, poses = time[inside], poses[inside]
-    pairs = _pairs(time, poses, run, robot, parameters, around)
     grid = around + np.arange(-SEARCH, SEARCH + 1e-9, _GRID)
-    useful: list[tuple[str, Array, float, float]] = []
-    for pair in pairs:
+    useful: dict[str, tuple[Array, float, float]] = {}
+    for pair in _pairs(time, poses, run, robot, parameters, around):
         project = without_slow(time, pair.slowest)
-        curve = np.array([_cost(pair, time + offset, project) for offset in grid])
+        curve = pair.costs(time, grid, project)
         if pair.name == "yaw" and _contradicts(project(pair.seen), curve):
             raise InputError(
                 f"{run.path}: camera and gyroscope do not see the same turns with clocks {grid[0]:+.1f} to {grid[-1]:+.1f} s "
@@ -125,10 +140,26 @@ def _aligned(time: Array, poses: Array, run: Run, robot: Robot, parameters: Para
             )
         found = _weighted(pair, curve, time, grid, project)
         if found is not None and found[2] < 5 * LARGEST_STD:
-            useful.append((pair.name, *found))
-    useful = _agreeing(useful)
-    costs = np.sum([cost for _, cost, _, _ in useful], axis=0) if useful else np.zeros(len(grid))
-    return _combined(costs, grid, {name: (offset, std) for name, _, offset, std in useful}, run)
+            useful[pair.name] = found
+    refuse = f"{run.path}: the clocks cannot be aligned: "
+    if not useful:
+        raise InputError(refuse + "no motion that camera and servos both see (a start, a stop, a turn, a leg that moves); "
+                         "film one, or give --offset; clocks more than 1 s apart need --around")  # fmt: skip
+    _, sharpest, least = min(useful.values(), key=lambda part: part[2])  # what contradicts it is left out
+    useful = {name: part for name, part in useful.items() if abs(part[1] - sharpest) < 4 * math.hypot(part[2], least)}
+    costs = np.sum([cost for cost, _, _ in useful.values()], axis=0)
+    best = int(np.argmin(costs))
+    if not 0 < best < len(grid) - 1:
+        raise InputError(refuse + f"the best offset lies at the edge of the search, {grid[best]:+.2f} s; give --around")
+    offset, std = _vertex(grid, costs, best)
+    far = np.abs(grid - offset) > _DISTINCT
+    if costs[far].min() - costs[best] < 9.0:
+        raise InputError(
+            refuse + f"offsets {offset:+.3f} and {grid[far][np.argmin(costs[far])]:+.3f} s fit alike; give --offset"
+        )
+    if std > LARGEST_STD:
+        raise InputError(refuse + f"too little motion: the offset is known to {1e3 * std:.1f} ms only; give --offset")
+    return Alignment(offset, math.hypot(std, _LATENCY), {name: part[1:] for name, part in useful.items()})
 
 
 def _pace(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> float | None:
@@ -140,49 +171,21 @@ def _pace(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
         if inside.sum() < 30:
             continue
         moments = moments[inside]
-        pair = next((p for p in _pairs(moments, poses[inside], run, robot, parameters, around) if p.name == "yaw"), None)
-        if pair is None:
-            continue
-        project = without_slow(moments, pair.slowest)
-        seen = project(pair.seen)
-        curve = np.array([_cost(pair, moments + offset, project) for offset in grid])
-        if float(seen @ seen) > _TURN**2 * len(seen) and not _contradicts(seen, curve):
-            return pace
+        for pair in _pairs(moments, poses[inside], run, robot, parameters, around):
+            project = without_slow(moments, pair.slowest)
+            seen = project(pair.seen)
+            if pair.name == "yaw" and _is_turn(seen) and not _contradicts(seen, pair.costs(moments, grid, project)):
+                return pace
     return None
+
+
+def _is_turn(seen: Array) -> bool:
+    return float(seen @ seen) > _TURN**2 * len(seen)
 
 
 def _contradicts(seen: Array, curve: Array) -> bool:
     """Whether a plain turn (rad) is explained at no offset, or best at the edge of the search."""
-    plain = float(seen @ seen) > _TURN**2 * len(seen)
-    return plain and (curve.min() > seen @ seen / _SAME_TURN**2 or int(np.argmin(curve)) in (0, len(curve) - 1))
-
-
-def _agreeing(useful: list[tuple[str, Array, float, float]]) -> list[tuple[str, Array, float, float]]:
-    """Leave out what contradicts the sharpest signal."""
-    if not useful:
-        return []
-    _, _, sharpest, least = min(useful, key=lambda part: part[3])
-    return [part for part in useful if abs(part[2] - sharpest) < 4 * math.hypot(part[3], least)]
-
-
-def _combined(costs: Array, grid: Array, parts: dict[str, tuple[float, float]], run: Run) -> Alignment:
-    best = int(np.argmin(costs))
-    refuse = f"{run.path}: the clocks cannot be aligned: "
-    if not parts:
-        raise InputError(refuse + "no motion that camera and servos both see (a start, a stop, a turn, a leg that moves); "
-                         "film one, or give --offset; clocks more than 1 s apart need --around")  # fmt: skip
-    if not 0 < best < len(grid) - 1:
-        raise InputError(refuse + f"the best offset lies at the edge of the search, {grid[best]:+.2f} s; give --around")
-    offset, curvature = _vertex(grid, costs, best)
-    std = math.sqrt(2 / max(curvature, 1e-12))
-    far = np.abs(grid - offset) > _DISTINCT
-    if costs[far].min() - costs[best] < 9.0:
-        raise InputError(
-            refuse + f"offsets {offset:+.3f} and {grid[far][np.argmin(costs[far])]:+.3f} s fit alike; give --offset"
-        )
-    if std > LARGEST_STD:
-        raise InputError(refuse + f"too little motion: the offset is known to {1e3 * std:.1f} ms only; give --offset")
-    return Alignment(offset, math.hypot(std, _LATENCY), parts)
+    return _is_turn(seen) and (curve.min() > seen @ seen / _SAME_TURN**2 or int(np.argmin(curve)) in (0, len(curve) - 1))
 
 
 def _weighted(
@@ -190,18 +193,22 @@ def _weighted(
 ) -> tuple[Array, float, float] | None:
     """Cost in units of its noise, neighbouring residuals that err alike counted once; own offset, 1 sigma. None = useless."""
     best = int(np.argmin(curve))
-    residual = _residual(pair, time + grid[best], project)
-    spread = float(residual @ residual) / max(1, len(time) - 1)
+    residual = pair.residual(time + grid[best], project)
+    size = float(residual @ residual)
     moved = project(pair.seen)
     least = _ROLLS if pair.name == _DISTANCE else 2.0
-    if spread <= 0 or moved @ moved < least**2 * (residual @ residual) or not 0 < best < len(grid) - 1:
+    if size <= 0 or moved @ moved < least**2 * size or not 0 < best < len(grid) - 1:
         return None
     if moved @ project(pair.servo(time + grid[best])) <= 0:  # the free scale would be negative: another motion
         return None
-    alike = _correlation_length(residual)
-    cost = (curve - curve[best]) / (spread * alike)
-    offset, curvature = _vertex(grid, cost, best)
-    std = math.sqrt(2 / max(curvature, 1e-12))
+    alike = 1.0  # neighbours that share one error: 1 + twice the autocorrelation until it first falls below 0.05
+    for lag in range(1, len(residual) // 3):
+        share = float(residual[lag:] @ residual[:-lag]) / size
+        if share < 0.05:
+            break
+        alike += 2 * share
+    cost = (curve - curve[best]) / (size / max(1, len(time) - 1) * alike)
+    offset, std = _vertex(grid, cost, best)
     if pair.name == _DISTANCE:
         fastest = float(np.abs(np.gradient(pair.seen, time)).max())
         wider = math.hypot(std, _START_SLIP / max(fastest, 1e-9))
@@ -210,38 +217,10 @@ def _weighted(
 
 
 def _vertex(grid: Array, costs: Array, best: int) -> tuple[float, float]:
-    """Minimum and second derivative of a parabola through five points around the best."""
+    """Minimum, and 1 sigma by the curvature, of a parabola through five points around the best."""
     near = slice(max(0, best - 2), min(len(grid), best + 3))
     a, b, _ = np.polyfit(grid[near] - grid[best], costs[near], 2)
-    return float(grid[best] - b / (2 * a)) if a > 0 else float(grid[best]), float(2 * a)
-
-
-def _correlation_length(residual: Array) -> float:
-    """How many neighbours share one error: 1 + twice the sum of the autocorrelation until it first falls below 0.05."""
-    size = float(residual @ residual)
-    total = 1.0
-    for lag in range(1, len(residual) // 3):
-        share = float(residual[lag:] @ residual[:-lag]) / size
-        if share < 0.05:
-            break
-        total += 2 * share
-    return total
-
-
-def _cost(pair: _Pair, at: Array, project: Callable[[Array], Array]) -> float:
-    residual = _residual(pair, at, project)
-    return float(residual @ residual)
-
-
-def _residual(pair: _Pair, at: Array, project: Callable[[Array], Array]) -> Array:
-    seen, servo = project(pair.seen), project(pair.servo(at))
-    free = [servo] if pair.free_scale else []
-    if pair.nuisance is not None:
-        free.append(project(pair.nuisance(at)))
-    error = seen if pair.free_scale else seen - servo
-    for column in np.linalg.qr(np.stack(free, axis=1))[0].T if free else ():
-        error = error - column * (column @ error)
-    return error
+    return float(grid[best] - (b / (2 * a) if a > 0 else 0.0)), 1 / math.sqrt(max(a, 5e-13))
 
 
 def without_slow(time: Array, slowest: float) -> Callable[[Array], Array]:
@@ -279,11 +258,18 @@ def _rolling_pair(
     yaw = smooth(time, np.unwrap(poses[:, 3]), 1e-4, time).value
     steps, heading = np.diff(poses[:, :2], axis=0), 0.5 * (yaw[1:] + yaw[:-1])
     driven = np.concatenate([[0.0], np.cumsum(steps[:, 0] * np.cos(heading) + steps[:, 1] * np.sin(heading))])
-    t = run["t"]
-    rolled = accumulate(_rolling_speeds(run, joints, rest, parameters), t).T
-    pairs = [_Pair(_DISTANCE, driven, _between(t, way), _SLIP, free_scale=True) for way in rolled]
+    # how fast the body goes along its heading if a wheel does not slip; its turn rates from legs and gyroscope
+    t, count = run["t"], len(rest)
+    turning = np.zeros((count, 3))
+    turning[:, 1] = np.gradient(rest[:, 1], t)
+    if (rate := readings(run, "gyro_z", _HOLES)) is not None:
+        turning[:, 2] = rate
+    attitude = quaternion(np.zeros(count), rest[:, 1], rest[:, 2])
+    slip = contact_slip_velocity(repeated(parameters, count), attitude, np.zeros((count, 3)), turning, *joints)
+    ways = accumulate(-slip[:, :, 0], t).T
+    pairs = [_Pair(_DISTANCE, driven, _between(t, way), _SLIP, free_scale=True) for way in ways]
     project, shifts = without_slow(time, _SLIP), np.arange(-SEARCH, SEARCH, 4 * _GRID)
-    return min(pairs, key=lambda pair: min(_cost(pair, time + shift, project) for shift in shifts))
+    return min(pairs, key=lambda pair: pair.costs(time, shifts, project).min())
 
 
 def _sag(legs: Array, parameters: Parameters) -> tuple[Array, Array]:
@@ -303,18 +289,6 @@ def joint_signals(run: Run, at: Array, robot: Robot) -> tuple[Array, Array]:
     std = max(robot.sensors.encoder.position, 1e-6) / math.sqrt(12)
     found = [smooth(run["t"], run[f"pos_{joint}"], std, at) for joint in JOINTS]
     return np.stack([f.value for f in found], axis=1), np.stack([f.rate for f in found], axis=1)
-
-
-def _rolling_speeds(run: Run, joints: tuple[Array, Array], rest: Array, parameters: Parameters) -> Array:
-    """Speed (K, 4) of the body along its heading if that wheel did not slip; turn rates from legs and gyroscope."""
-    count = len(rest)
-    attitude = quaternion(np.zeros(count), rest[:, 1], rest[:, 2])
-    turning = np.zeros((count, 3))
-    turning[:, 1] = np.gradient(rest[:, 1], run["t"])
-    if (rate := readings(run, "gyro_z", _HOLES)) is not None:
-        turning[:, 2] = rate
-    slip = contact_slip_velocity(repeated(parameters, count), attitude, np.zeros((count, 3)), turning, *joints)
-    return -slip[:, :, 0]
 
 
 def readings(run: Run, name: str, longest: float = math.inf) -> Array | None:

@@ -81,15 +81,12 @@ def leg_readings(time: Array, joints: tuple[Array, Array], robot: Robot, paramet
     """What legs say by angles and rates (K, 8) of the joints, nominal zeros taken off."""
     legs, rate = joints[0][:, LEG_SLICE], joints[1]
     values = rest_pose(repeated(parameters, len(time)), legs)
-
-    def change(wheel: Array, zero: Array) -> Array:
-        moved = Parameters(parameters.values.copy())
-        moved["wheel.radius"] = moved["wheel.radius"] + wheel  # as the floor under it
-        return (rest_pose(repeated(moved, len(time)), legs + zero) - values) / 1e-5
-
-    steps = 1e-5 * np.eye(4)
-    by_wheel = np.stack([change(step, np.zeros(4)) for step in steps], axis=2)
-    by_zero = np.stack([change(np.zeros(4), step) for step in steps], axis=2)
+    by_wheel, by_zero = np.empty((len(time), 3, 4)), np.empty((len(time), 3, 4))
+    for k, step in enumerate(1e-5 * np.eye(4)):
+        raised = Parameters(parameters.values.copy())
+        raised["wheel.radius"] = raised["wheel.radius"] + step  # as the floor under it
+        by_wheel[:, :, k] = (rest_pose(repeated(raised, len(time)), legs) - values) / 1e-5
+        by_zero[:, :, k] = (rest_pose(repeated(parameters, len(time)), legs + step) - values) / 1e-5
     length, period = 2 * float(parameters["hip.position"][0, 0]), float(np.median(np.diff(time)))
     noise = _SHAKEN**2 * _MEAN / period * by_wheel @ by_wheel.transpose(0, 2, 1)
     rolled = np.abs(rate[:, WHEEL_SLICE] * parameters["wheel.radius"])
@@ -100,27 +97,25 @@ def leg_readings(time: Array, joints: tuple[Array, Array], robot: Robot, paramet
     return LegReadings(time, values, by_wheel, by_zero, noise, way * UNEVEN**2 / length, prior)
 
 
-def leg_findings(
-    time: Array, film: tuple[Array, Array], joined: tuple[Array, Array], samples: Sequence[Sample]
-) -> Iterator[str]:
+def leg_findings(time: Array, film: SmoothedMotion, joined: SmoothedMotion, samples: Sequence[Sample]) -> Iterator[str]:
     """How a film contradicts the legs, in words: by height, pitch or roll that the legs change more than their model allows.
 
     Hausman's test: if that model holds, the variance of the change is what the legs take off the variance of the pose. Means
     over as many frames as the film is smoothed over are compared: where a drive starts with a jerk, that is too much.
 
     Args:
-        time: (K,) s. film, joined: poses (K, 6) and their 1 sigma, smoothed without and with the legs. samples: of the film.
+        time: (K,) s. film, joined: smoothed without and with the legs. samples: of the film.
     """
     seen = [sample for sample in samples if math.isfinite(sample.pose[0])]
     noise = np.median([np.diag(sample.covariance) for sample in seen], axis=0)
     frames = float(np.median(np.diff([sample.time for sample in seen]))) / float(np.median(np.diff(time)))  # rows of one
-    smoothed_over = frames * noise / np.median(film[1] ** 2, axis=0)
+    smoothed_over = frames * noise / np.median(film.value_std**2, axis=0)
     smoothed_over[2] = max(smoothed_over[2], smoothed_over[4])  # the wheels tie the height to the pitch
     for k, name, unit in zip(STANDING, ("height", "pitch", "roll"), ("mm", "mrad", "mrad"), strict=True):
         rows = min(len(time), max(1, round(smoothed_over[k])))
         change, before, after, when = (
             np.convolve(values, np.full(rows, 1 / rows), mode="valid")
-            for values in (joined[0][:, k] - film[0][:, k], film[1][:, k] ** 2, joined[1][:, k] ** 2, time)
+            for values in (joined.value[:, k] - film.value[:, k], film.value_std[:, k] ** 2, joined.value_std[:, k] ** 2, time)
         )
         sigmas = np.abs(change) / np.sqrt(np.maximum(before - after, _LEAST * before))
         worst = int(np.argmax(sigmas))
@@ -235,10 +230,9 @@ def smooth_motion(
     poses, std = _unwrapped(samples), _std(samples)
     outliers = _outliers(poses, std, time)
     kept = np.isfinite(poses[:, 0]) & ~outliers
-    inside = np.zeros(0, np.int64)
-    if imu is not None:
-        inside = np.flatnonzero((imu.time > time[kept][0]) & (imu.time < time[kept][-1]))
-    moments = np.concatenate([time[kept], rows, imu.time[inside] if imu is not None else rows[:0]])
+    first, last = time[kept][[0, -1]]
+    inside = np.flatnonzero((imu.time > first) & (imu.time < last)) if imu is not None else np.zeros(0, np.int64)
+    moments = np.concatenate([time[kept], rows, imu.time[inside] if imu is not None else []])
     order = np.argsort(moments, kind="stable")
     moments = moments[order]
     frames, shown, read = np.split(np.argsort(order, kind="stable"), np.cumsum([kept.sum(), len(rows)]))
@@ -247,7 +241,7 @@ def smooth_motion(
     for part, name in ((_VALUE, "value"), (_RATE, "rate"), (_ACCELERATION, "acceleration")):
         at[:, part] = np.stack([getattr(signal, name) for signal in near], axis=1)
 
-    seen = _Measurements.none(len(moments))
+    seen = _Measurements(len(moments))
     seen.add_frames(frames, poses[kept], np.stack([sample.covariance for sample in samples])[kept])
     last_row = np.searchsorted(shown, np.arange(len(moments)), side="right")
     wander, spread = np.zeros((len(moments), _SIZE)), np.zeros(_SIZE)
@@ -264,7 +258,9 @@ def smooth_motion(
     slope = slope[:, :, _MOTION]
     slipping_since = np.concatenate([np.zeros_like(slope[:1]), slope])  # nothing before the first row
     density = np.tile([signal.density for signal in near], (len(moments), 1))
-    unseen = _in_gap(moments, time[kept])
+    steps = np.diff(time[kept])
+    before = np.clip(np.searchsorted(time[kept], moments) - 1, 0, len(steps) - 1)
+    unseen = steps[before] > _GAP * np.median(steps)  # in a gap of the frames with a pose, or at its end
     density[unseen] = np.maximum(density[unseen], 3 * _GAINED**2)
     states, covariance = _smoothed(
         moments, shown, density, wander, slipping_since, last_row, seen, at[0], np.diag(spread)
@@ -284,13 +280,6 @@ def without_outliers(samples: Sequence[Sample], time: Array) -> list[Sample]:
     """The samples that do not contradict their neighbours."""
     kept = ~_outliers(_unwrapped(samples), _std(samples), time)
     return [sample for sample, fine in zip(samples, kept, strict=True) if fine]
-
-
-def _in_gap(time: Array, frames: Array) -> NDArray[np.bool_]:
-    """Which times lie in a gap of the frames with a pose, or end it."""
-    steps = np.diff(frames)
-    before = np.clip(np.searchsorted(frames, time) - 1, 0, len(steps) - 1)
-    return steps[before] > _GAP * np.median(steps)
 
 
 def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> list[Smoothed]:
@@ -319,7 +308,6 @@ def _unwrapped(samples: Sequence[Sample]) -> Array:
     return poses
 
 
-@dataclass(frozen=True, eq=False)
 class _Measurements:
     """What is measured at each of the moments, at most six numbers, linear in the state.
 
@@ -328,18 +316,10 @@ class _Measurements:
         gate: (M,) squared normalised innovation from which on they count for less.
     """
 
-    count: NDArray[np.int64]
-    design: Array
-    values: Array
-    noise: Array
-    gate: Array
-
-    @staticmethod
-    def none(moments: int) -> _Measurements:
-        noise = np.tile(np.eye(6), (moments, 1, 1))
-        return _Measurements(
-            np.zeros(moments, np.int64), np.zeros((moments, 6, _SIZE)), np.zeros((moments, 6)), noise, np.full(moments, _GATE)
-        )
+    def __init__(self, moments: int) -> None:
+        self.count, self.gate = np.zeros(moments, np.int64), np.full(moments, _GATE)
+        self.design, self.values = np.zeros((moments, 6, _SIZE)), np.zeros((moments, 6))
+        self.noise = np.tile(np.eye(6), (moments, 1, 1))
 
     def add_frames(self, at: NDArray[np.int64], poses: Array, covariances: Array) -> None:
         self.design[at, :, _VALUE], self.values[at], self.noise[at] = np.eye(6), poses, covariances
@@ -427,8 +407,8 @@ def _smoothed(
     Backwards by Bryson and Frazier's equations: what later measurements say is carried as a gradient and its variance, so no
     covariance is inverted, and slip, which is certain at first, may be a state.
     """
-    total = time.shape[0]
-    states, spreads = np.empty((shown.shape[0], _SIZE)), np.empty((shown.shape[0], _SIZE, _SIZE))
+    total = len(time)
+    states, spreads = np.empty((len(shown), _SIZE)), np.empty((len(shown), _SIZE, _SIZE))
     gains, weights, errors = np.zeros((total, _SIZE, 6)), np.zeros((total, 6, 6)), np.zeros((total, 6))
     count, design, seen, noise, gate = measured.count, measured.design, measured.values, measured.noise, measured.gate
     x, p, k = start.copy(), spread.copy(), 0
@@ -438,7 +418,7 @@ def _smoothed(
             matrix = _transition(step, own)
             x = matrix @ x
             p = matrix @ p @ matrix.T + _unsteadiness(step, density[i], wander[i], own)
-        if k < shown.shape[0] and shown[k] == i:
+        if k < len(shown) and shown[k] == i:
             states[k], spreads[k] = x, p
             k += 1
         m = count[i]
@@ -454,7 +434,7 @@ def _smoothed(
         p = p - gain @ seen_by.T
         p = 0.5 * (p + p.T)
         gains[i, :, :m], weights[i, :m, :m], errors[i, :m] = gain, weight, error
-    gradient, lent, k = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE)), shown.shape[0] - 1
+    gradient, lent, k = np.zeros(_SIZE), np.zeros((_SIZE, _SIZE)), len(shown) - 1
     for i in range(total - 1, -1, -1):
         m = count[i]
         if m > 0:

@@ -15,7 +15,7 @@ Markers: where the film says they are, each at its own row's time (:mod:`wlr_gym
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -73,9 +73,16 @@ def frame_noise(samples: Sequence[Sample]) -> FrameNoise:
     standing = {k for run in _standing(seen) for k in run}
     if len(seen) - len(standing) >= _LEAST_FRAMES:
         seen = [sample for k, sample in enumerate(seen) if k not in standing]
-    time, poses, variance, rates = _signals(seen)
+    time, poses, rates = _signals(seen)
+    variance = np.stack([np.diag(sample.covariance) for sample in seen])
     differences = [_fourth_difference(time, poses, variance, rates**2, stride) for stride in (1, 2)]
-    jitter = _jitter(*differences[0])
+    # the error of the frames' times that makes the differences most likely, robustly; 0 unless it is plain
+    rest, edges, late = differences[0]
+    total = _FACTORS[:, None, None, None] ** 2 * edges + _JITTERS[:, None, None] ** 2 * late
+    cost = np.sum(np.log(total) + 5 * np.log1p(rest**2 / total / 4), axis=(2, 3)) / 5  # five differences share a frame
+    best = cost.min(axis=0)
+    least = int(np.argmin(best))
+    jitter = float(_JITTERS[least]) if best[0] - best[least] > _WORTH else 0.0
     scales = [
         float(np.median(np.quantile(np.abs(rest) / np.sqrt(edges + jitter**2 * late), _ONE_SIGMA, axis=0)))
         for rest, edges, late in differences
@@ -89,10 +96,12 @@ def widened(samples: Sequence[Sample], noise: FrameNoise) -> tuple[Sample, ...]:
     if len(seen) < 2:  # no rates: :func:`wlr_gym.perception.vision.slip.measure_slip` refuses so few
         return tuple(samples)
     result, kept = list(samples), [samples[k] for k in seen]
-    _, poses, _, rates = _signals(kept)
+    _, poses, rates = _signals(kept)
     copies = np.ones(len(kept))
-    for run in _standing(kept):
-        if _scatter(poses[run], np.stack([kept[k].covariance for k in run])) < _COPIED * noise.scale:
+    for run in _standing(kept):  # how far poses lie from one to the next, over what their covariances state
+        steps, spread = np.diff(poses[run], axis=0), np.stack([kept[k].covariance for k in run])
+        squares = np.einsum("fi,fij,fj->f", steps, np.linalg.inv(spread[1:] + spread[:-1]), steps)
+        if math.sqrt(float(np.median(squares)) / poses.shape[1]) < _COPIED * noise.scale:
             copies[run] = len(run)
     for k, rate, count in zip(seen, rates, copies, strict=True):
         covariance = count * noise.scale**2 * samples[k].covariance + noise.jitter**2 * np.outer(rate, rate)
@@ -131,19 +140,11 @@ def _standing(seen: Sequence[Sample]) -> list[range]:
     return [range(first, stop) for first, stop in pairwise([0, *moved, len(seen)]) if stop - first >= _LEAST_STANDING]
 
 
-def _scatter(poses: Array, covariances: Array) -> float:
-    """How far poses (F, 6) lie from one to the next (median), over what their covariances state."""
-    steps = np.diff(poses, axis=0)
-    squares = np.einsum("fi,fij,fj->f", steps, np.linalg.inv(covariances[1:] + covariances[:-1]), steps)
-    return math.sqrt(float(np.median(squares)) / poses.shape[1])
-
-
-def _signals(seen: Sequence[Sample]) -> tuple[Array, Array, Array, Array]:
-    """Times (F,), poses, their variances and their rates (F, 6)."""
+def _signals(seen: Sequence[Sample]) -> tuple[Array, Array, Array]:
+    """Times (F,), poses and their rates (F, 6)."""
     time, poses = np.array([sample.time for sample in seen]), np.stack([sample.pose for sample in seen])
     poses[:, 3] = np.unwrap(poses[:, 3])
-    variance = np.stack([np.diag(sample.covariance) for sample in seen])
-    return time, poses, variance, np.gradient(poses, time, axis=0)
+    return time, poses, np.gradient(poses, time, axis=0)
 
 
 def _fourth_difference(time: Array, poses: Array, variance: Array, late: Array, stride: int) -> tuple[Array, Array, Array]:
@@ -152,18 +153,11 @@ def _fourth_difference(time: Array, poses: Array, variance: Array, late: Array, 
     at = (time[rows] - time[rows[:, [2]]]) / np.ptp(time[rows], axis=1)[:, None]
     weights = 1 / np.prod(at[:, :, None] - at[:, None, :] + np.eye(5), axis=2)
     weights /= np.linalg.norm(weights, axis=1)[:, None]
-    rest, *variances = (np.einsum("fk,fkc->fc", w, values[rows]) for w, values in
-                        ((weights, poses), (weights**2, variance), (weights**2, late)))  # fmt: skip
-    return rest, variances[0], variances[1]
-
-
-def _jitter(rest: Array, edges: Array, late: Array) -> float:
-    """Error of the frames' times (s) that makes the differences most likely, robustly; 0 unless it is plain."""
-    total = _FACTORS[:, None, None, None] ** 2 * edges + _JITTERS[:, None, None] ** 2 * late
-    cost = np.sum(np.log(total) + 5 * np.log1p(rest**2 / total / 4), axis=(2, 3)) / 5  # five differences share a frame
-    best = cost.min(axis=0)
-    least = int(np.argmin(best))
-    return float(_JITTERS[least]) if best[0] - best[least] > _WORTH else 0.0
+    rest, edges, by_time = (
+        np.einsum("fk,fkc->fc", w, values[rows])
+        for w, values in ((weights, poses), (weights**2, variance), (weights**2, late))
+    )
+    return rest, edges, by_time
 
 
 def _length(step: Array) -> float:
@@ -223,14 +217,13 @@ def camera_motion(samples: Sequence[Sample], camera: Camera, floor: Target, read
     names = tuple(marker.name for marker in floor.markers)
     standing = [m for m in range(len(floor.markers)) if m not in {kick.marker for kick in kicks}]
     enough = len(standing) >= MINIMUM_MARKERS
-    if not enough:
-        standing = list(range(len(floor.markers)))
+    standing = standing if enough else list(range(len(floor.markers)))
     usable = [{m: d for m, d in sample.floor_seen.items() if m in standing} for sample in samples]
-    if not _moves(centres[:, standing]):
-        means = {m: mean_detection(found) for m in standing if (found := [seen[m] for seen in usable if m in seen])}
-        found = solved_floor(means, floor, camera, first) or first
-        return CameraMotion((found,) * len(samples), False, kicks, enough, names)
-    return CameraMotion(tuple(_followed(samples, usable, camera, floor, readout)), True, kicks, enough, names)
+    if _moves(centres[:, standing]):
+        return CameraMotion(tuple(_followed(samples, usable, camera, floor, readout)), True, kicks, enough, names)
+    means = {m: mean_detection(found) for m in standing if (found := [seen[m] for seen in usable if m in seen])}
+    found = solved_floor(means, floor, camera, first) or first
+    return CameraMotion((found,) * len(samples), False, kicks, enough, names)
 
 
 def velocities(times: Sequence[float], poses: Sequence[TargetPose | None]) -> Array:
@@ -260,9 +253,9 @@ def _followed(
     for view in views:
         if view is None:
             yield None
-            continue
-        seen = at_frame_time(view, target, camera.height, readout) if readout else view.seen
-        yield solve_pose(seen, target, camera, view.rotation, view.position)
+        else:
+            seen = at_frame_time(view, target, camera.height, readout) if readout else view.seen
+            yield solve_pose(seen, target, camera, view.rotation, view.position)
 
 
 def _moves(centres: Array) -> bool:
@@ -292,36 +285,28 @@ def _kicks(centres: Array, times: Array, scale: float) -> Iterator[Kick]:
         before, after = _mean(centres[k - _AROUND : k]), _mean(centres[k : k + _AROUND])
         seen = np.flatnonzero(np.isfinite(before[:, 0]) & np.isfinite(after[:, 0]))
         if len(seen) > MINIMUM_MARKERS:
-            marker, step = _odd_one(before, after, seen)
-            away[min(k, count - 1), marker] = step
+            odd, step = _odd_one(before[seen] @ (1, 1j), after[seen] @ (1, 1j))
+            away[min(k, count - 1), seen[odd]] = step
     steps = away[away > 0]
     limit = max(KICKED_BY, KICKED_TIMES * float(np.median(steps))) if len(steps) else math.inf
-    for marker in range(markers):
-        k = int(np.argmax(away[:, marker]))
+    for marker, k in enumerate(np.argmax(away, axis=0)):
         if away[k, marker] > limit:
             yield Kick(marker, float(times[k]), scale * float(away[k, marker]))
 
 
-def _odd_one(before: Array, after: Array, seen: NDArray[np.int64]) -> tuple[int, float]:
+def _odd_one(before: NDArray[np.complex128], after: NDArray[np.complex128]) -> tuple[int, float]:
     """The marker without which the others only shift, turn and grow together, and how far (px) it leaves them."""
     best, odd, step = math.inf, 0, 0.0
-    for marker in seen:
-        others = seen[seen != marker]
-        moved = _similarity(before[others], after[others])
-        rest = float(np.linalg.norm(moved(before[others]) - after[others]))
+    for marker in range(len(before)):
+        others = np.arange(len(before)) != marker
+        start, end = before[others].mean(), after[others].mean()
+        a, b = before[others] - start, after[others] - end
+        factor = np.vdot(a, b) / np.vdot(a, a)  # turn and growth, by least squares
+        missed = after - end - factor * (before - start)
+        rest = float(np.linalg.norm(missed[others]))
         if rest < best:
-            best, odd, step = rest, int(marker), float(np.linalg.norm(moved(before[[marker]]) - after[marker]))
+            best, odd, step = rest, marker, float(abs(missed[marker]))
     return odd, step
-
-
-def _similarity(before: Array, after: Array) -> Callable[[Array], Array]:
-    """The shift, turn and growth that takes points ``before`` (K, 2) to ``after`` with least squares."""
-    start, end = before.mean(axis=0), after.mean(axis=0)
-    # as complex numbers, turn and growth are one factor
-    a, b = (before - start) @ (1, 1j), (after - end) @ (1, 1j)
-    factor = np.vdot(a, b) / np.vdot(a, a)
-    matrix = np.array([[factor.real, factor.imag], [-factor.imag, factor.real]])
-    return lambda points: (points - start) @ matrix + end
 
 
 # --- markers and shutter ----------------------------------------------------------------------------------------------
@@ -406,9 +391,7 @@ def _adjusted(samples: Sequence[Sample], speeds: Array, camera: Camera, body: Ta
 
 def calibration_findings(calibration: SelfCalibration) -> Iterator[str]:
     """What was estimated away, and what the film cannot tell, in words."""
-    found, drawn = calibration.adjustment, calibration.drawn
-    moved = calibration.moved
-    noise = calibration.noise
+    found, drawn, moved, noise = calibration.adjustment, calibration.drawn, calibration.moved, calibration.noise
     if noise.scale > TOLD_NOISE:
         yield f"poses scatter {noise.scale:.1f} times as much as their edges state (compression?); their sigmas were widened"
     if noise.jitter > TOLD_JITTER:
@@ -422,17 +405,16 @@ def calibration_findings(calibration: SelfCalibration) -> Iterator[str]:
     if moved.max() > TOLD_LAYOUT:
         places = ", ".join(f"{m.name} {1e3 * d:.1f}" for m, d in zip(drawn.markers, moved, strict=True))
         yield f"markers lie off their stated places, and were measured anew from the film (mm): {places}"
-    allowed = WRONG_LAYOUT * drawn.slack
-    if moved.max() > allowed:
+    if moved.max() > WRONG_LAYOUT * drawn.slack:
         name = drawn.markers[int(np.argmax(moved))].name
         yield (
             f"marker '{name}' lies {1e3 * moved.max():.1f} mm off: more than the tolerance in the target file allows "
             f"({1e3 * drawn.tolerance:g} mm, 1 sigma); the right file and sheet? {UNSURE}"
         )
     if calibration.readout and not calibration.stated:
-        std = 1e3 * found.readout_std
+        readout = f"{1e3 * calibration.readout:.1f} ± {1e3 * found.readout_std:.1f} ms"
         yield (
-            f"rolling shutter: {1e3 * calibration.readout:.1f} ± {std:.1f} ms from the first row to the last, estimated from "
+            f"rolling shutter: {readout} from the first row to the last, estimated from "
             "the film and taken off; write it into the camera file (readout, in s)"
         )
     if drawn.stretch and drawn.caliper is None:
@@ -459,9 +441,7 @@ def _solved(
         again = solve_pose(seen, target, camera, found.rotation, found.position)
         found = again if again is not None and again.residual < LARGEST_RESIDUAL else found
     pose, covariance = pose_in_floor(found, floor, moving)
-    count = int(found.used.sum())
-    status = OK if count == len(found.used) else PARTIAL
     return replace(
-        sample, status=status, pose=pose, covariance=covariance, residual=found.residual, markers=count, in_camera=found,
-        floor=floor,
+        sample, status=OK if found.used.all() else PARTIAL, pose=pose, covariance=covariance, residual=found.residual,
+        markers=int(found.used.sum()), in_camera=found, floor=floor,
     )  # fmt: skip

@@ -152,7 +152,7 @@ def measure_slip(
         smooth_motion(samples, time, rows, lambda value, rate: _contacts(value, rate, joints, batch)[0], imu, legs)
         for legs in (None, leg_readings(rows, joints, robot, parameters))
     )
-    other = list(leg_findings(rows, (film.value, film.value_std), (joined.value, joined.value_std), fine))
+    other = list(leg_findings(rows, film, joined, fine))
     motion = film if other else joined
     value, rate = motion.value, motion.rate
     velocity, rolling, no_slip_speed = _contacts(value, rate, joints, batch)
@@ -176,6 +176,8 @@ def measure_slip(
     way = np.stack([accumulate(heading_speed, rows), accumulate(side_speed, rows)], axis=1)
     for std, shift in zip(layout_std, (way[-1], way[-1, ::-1] * (1, -1)), strict=True):  # the same for all wheels
         covariance += std**2 * np.outer(np.tile(shift, 4), np.tile(shift, 4))
+    frames = time[seen]
+    after = np.clip(np.searchsorted(frames, rows), 1, len(frames) - 1)
     layout = np.hypot(layout_std[0] * way, layout_std[1] * way[:, ::-1])  # wrong scales err along the way, headings across
     return SlipResult(
         time=rows,
@@ -192,7 +194,7 @@ def measure_slip(
         ratio=slip_ratio(travel, rolling),
         angle=slip_angle(travel, velocity[:, :, 1]),
         no_slip_error=float(no_slip_error(accumulate(heading_speed, rows)[-1], accumulate(no_slip_speed, rows)[-1])),
-        covered=_apart(rows, time[seen]) < LONGEST_GAP,
+        covered=np.minimum(np.abs(rows - frames[after - 1]), np.abs(frames[after] - rows)) < LONGEST_GAP,
         outliers=motion.outliers,
         contradictions=(*contradictions, *other),
     )
@@ -225,9 +227,3 @@ def _squared_turns(yaw: Array, legs: Array, robot: Robot) -> Array:
     before = np.concatenate([since[:1], since[:-1]])
     finished = np.cumsum(np.where(other, (yaw[:, None] - yaw[before]) ** 2, 0.0), axis=0)
     return finished + (yaw[:, None] - yaw[since]) ** 2
-
-
-def _apart(rows: Array, frames: Array) -> Array:
-    """How far (s) each of the rows is from the nearest frame."""
-    after = np.clip(np.searchsorted(frames, rows), 1, len(frames) - 1)
-    return np.minimum(np.abs(rows - frames[after - 1]), np.abs(frames[after] - rows))

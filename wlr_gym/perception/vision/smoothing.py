@@ -19,11 +19,13 @@ from wlr_gym.base.errors import InputError
 
 Array = NDArray[np.float64]
 
-_FACTORIALS = np.array([1.0, 1.0, 2.0])
 #: log10 of the jerk's spectral density, in unit^2/s^5, that are tried.
 _DENSITIES = np.arange(-6.0, 8.1, 0.5)
 _GATE = 100.0  # squared deviations from the prediction, in its variance
 _MOST_REJECTED = 4  # in a row; then the signal has really jumped
+#: What white jerk of density 1 adds to the covariance of value, rate and acceleration: these times these powers of the time.
+_SHARES = 1 / np.array([[20.0, 8.0, 6.0], [8.0, 3.0, 2.0], [6.0, 2.0, 1.0]])
+_POWERS = np.array([[5, 4, 3], [4, 3, 2], [3, 2, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +95,8 @@ def _predict(step: float, density: float, spread: Any) -> None:
         spread[i, 0] += step * spread[i, 1] + half * spread[i, 2]
         spread[i, 1] += step * spread[i, 2]
     for i in range(3):
-        for j in range(3):  # what the jerk adds is the integral of the products of its powers of time
-            spread[i, j] += density * step ** (5 - i - j) / ((5 - i - j) * _FACTORIALS[2 - i] * _FACTORIALS[2 - j])
+        for j in range(3):
+            spread[i, j] += density * _SHARES[i, j] * step ** _POWERS[i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -102,7 +104,8 @@ def _filter(
     time: Any, values: Any, variances: Any, density: float, jump: float, rejected: Any, states: Any, spreads: Any
 ) -> float:
     """Kalman filter; returns the log likelihood. Filtered states and covariances go to ``states``, ``spreads`` unless empty."""
-    spread, half, state, gain = np.diag(np.array([1e4, 1e2, 1e2])), np.empty((3, 3)), np.zeros(3), np.empty(3)
+    spread, half, state, gain = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
+    spread[0, 0], spread[1, 1], spread[2, 2] = 1e4, 1e2, 1e2
     likelihood, in_a_row = 0.0, 0
     for i in range(time.shape[0]):
         if i > 0 and time[i] > time[i - 1]:
@@ -130,23 +133,34 @@ def _filter(
                         spread[k, j] = half[k, j] - half[k, 0] * gain[j] + variances[i] * gain[k] * gain[j]
                 likelihood -= 0.5 * (error * error / total + math.log(total))
         if states.shape[0] > 0:
-            states[i], spreads[i] = state, spread
+            for k in range(3):
+                states[i, k] = state[k]
+                for j in range(3):
+                    spreads[i, k, j] = spread[k, j]
     return likelihood
 
 
+def _smooth_back(time: Array, density: float, states: Array, spreads: Array) -> None:
+    """Rauch, Tung and Striebel: let filtered states (N, 3) and covariances hear of all later ones."""
+    step, before = np.diff(time)[:, None, None], spreads[:-1]
+    matrix = np.eye(3) + step * np.eye(3, k=1) + 0.5 * step**2 * np.eye(3, k=2)
+    ahead = matrix @ before @ matrix.transpose(0, 2, 1) + density * _SHARES * step**_POWERS
+    gain = np.linalg.solve(np.where(step > 0, ahead, np.eye(3)), matrix @ before).transpose(0, 2, 1)
+    gain = np.where(step > 0, gain, np.eye(3))
+    states[:-1] -= (gain @ matrix @ states[:-1, :, None])[..., 0]
+    spreads[:-1] -= gain @ ahead @ gain.transpose(0, 2, 1)
+    _add_later(gain, states, spreads)
+
+
 @njit(cache=True, nogil=True)
-def _smooth_back(time: Any, density: float, states: Any, spreads: Any) -> None:
-    """Rauch, Tung and Striebel: let filtered states and covariances hear of all later ones."""
-    matrix, ahead = np.eye(3), np.empty((3, 3))
-    for i in range(time.shape[0] - 2, -1, -1):
-        step = time[i + 1] - time[i]
-        if step == 0.0:
-            states[i], spreads[i] = states[i + 1], spreads[i + 1]
-            continue
-        matrix[0, 1] = matrix[1, 2] = step
-        matrix[0, 2] = 0.5 * step * step
-        ahead[:] = spreads[i]
-        _predict(step, density, ahead)
-        gain = np.linalg.solve(ahead, matrix @ spreads[i]).T
-        states[i] += gain @ (states[i + 1] - matrix @ states[i])
-        spreads[i] += gain @ (spreads[i + 1] - ahead) @ gain.T
+def _add_later(gain: Any, states: Any, spreads: Any) -> None:
+    half = np.empty((3, 3))
+    for n in range(gain.shape[0] - 1, -1, -1):
+        g, later = gain[n], spreads[n + 1]
+        for i in range(3):
+            for j in range(3):
+                states[n, i] += g[i, j] * states[n + 1, j]
+                half[i, j] = g[i, 0] * later[0, j] + g[i, 1] * later[1, j] + g[i, 2] * later[2, j]
+        for i in range(3):
+            for j in range(3):
+                spreads[n, i, j] += half[i, 0] * g[j, 0] + half[i, 1] * g[j, 1] + half[i, 2] * g[j, 2]
