@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from studies.observer.runs import PERIOD, estimated, observe, plain_odometry, simulate, slip_in_truth_order
 from wlr_gym.base.errors import InputError
-from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver, kalman
+from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver, slip_filter
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors, standing_state
 from wlr_gym.robot import CORNER_SIGNS, load_robot
@@ -261,21 +261,21 @@ def test_the_filter_is_the_textbooks():
     transition = np.eye(4)
     transition[0, 1:3], transition[1, 2] = (step, -0.5 * step**2), -step
     p = start.copy()
-    kalman.predict_direction(p, step, 0.3, 0.7)
+    slip_filter.predict_direction(p, step, 0.3, 0.7)
     np.testing.assert_allclose(p, transition @ start @ transition.T + np.diag([0, 0.3, 0.7, 0]), rtol=1e-12, atol=1e-12)
 
     age, flow, column = 0.1, 0.4, np.empty(4)
     measurements = [
-        (kalman.see_velocity(p, age, 0.0, column), column.copy(), np.array([0, 1, age, 0])),
-        (kalman.see_velocity(p, age, flow, column), column.copy(), np.array([0, 1, age, -flow])),
-        (kalman.see_position(p, age, column), column.copy(), h := np.array([1, -age, -0.5 * age**2, 0])),
+        (slip_filter.see_velocity(p, age, 0.0, column), column.copy(), np.array([0, 1, age, 0])),
+        (slip_filter.see_velocity(p, age, flow, column), column.copy(), np.array([0, 1, age, -flow])),
+        (slip_filter.see_position(p, age, column), column.copy(), h := np.array([1, -age, -0.5 * age**2, 0])),
     ]
     for spread, seen, row in measurements:
         np.testing.assert_allclose(seen, p @ row, rtol=1e-12)
         assert spread == pytest.approx(row @ p @ row)
     change, total = np.zeros(4), float(h @ p @ h) + 0.5
     corrected = p.copy()
-    kalman.correct_direction(corrected, column.copy(), 2.0, total, change)
+    slip_filter.correct_direction(corrected, column.copy(), 2.0, total, change)
     np.testing.assert_allclose(change, 2.0 * (p @ h) / total, rtol=1e-12)
     np.testing.assert_allclose(corrected, p - np.outer(p @ h, p @ h) / total, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(corrected, corrected.T)

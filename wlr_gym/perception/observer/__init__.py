@@ -4,7 +4,7 @@ Body velocity, pose, slip and load of every wheel from ``SENSOR_LAYOUT`` reading
 camera where there is one. See docs/slip_observer.md.
 """
 
-from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
 from wlr_gym.perception.observer.observer import SlipObserver
+from wlr_gym.perception.observer.slip_filter import ESTIMATE_LAYOUT
 
 __all__ = ["ESTIMATE_LAYOUT", "SlipObserver"]

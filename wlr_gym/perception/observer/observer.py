@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.perception.observer import slip_filter
-from wlr_gym.perception.observer.kalman import DIRECTION_SIZE
-from wlr_gym.perception.observer.layout import ESTIMATE_LAYOUT
+from wlr_gym.perception.observer.slip_filter import DIRECTION_SIZE, ESTIMATE_LAYOUT
 from wlr_gym.perception.observer.trust import MEMORY, WORK, load_trust
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
 from wlr_gym.robot.parameter_table import SPECS
 
-#: 1 sigma of rounding to whole counts.
-_ROUNDING = 12.0**-0.5
-#: rad/s and m/s2; what an ideal encoder and accelerometer count as: errors are divided by.
-_LEAST = 1e-4
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ROUNDING = 12.0**-0.5  # 1 sigma of rounding to whole counts
+_LEAST = 1e-4  # rad/s and m/s2; what an ideal encoder and accelerometer count as: errors are divided by
 
 
 def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
@@ -64,10 +64,9 @@ def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
         "flow_quality": flow.quality if flow else 0.0,
         **load_trust(),
     }
-    arrays = {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
-    record = np.zeros(1, np.dtype([(name, np.float64, array.shape) for name, array in arrays.items()]))
-    for name, array in arrays.items():
-        record[name] = array
+    record = np.zeros(1, np.dtype([(name, np.float64, np.shape(value)) for name, value in values.items()]))
+    for name, value in values.items():
+        record[name] = value
     return record
 
 
@@ -121,7 +120,7 @@ def state_type(history: int) -> np.dtype[Any]:
         # without corrections, for what the camera saw some steps ago
         "raw_velocity": (2,),  # start frame
         "raw": (history, 3),  # x, y, yaw at each step
-        # wheels, see contacts.py
+        # wheels, see :func:`wlr_gym.perception.observer.slip_filter.look`
         "heading": (3,),  # body frame
         "left": (3,),  # body frame
         "leg": (4, 2),  # cosine and sine of the leg angles
@@ -144,13 +143,6 @@ def state_type(history: int) -> np.dtype[Any]:
         "change": (DIRECTION_SIZE,),
     }
     return np.dtype([(name, np.float64, shape) for name, shape in numbers.items()])
-
-
-# --- the slip observer of a batch of robots ---------------------------------------------------------------------------
-
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class SlipObserver:
@@ -179,6 +171,7 @@ class SlipObserver:
     def reset(self, mask: Mask, sensors: Array) -> None:
         """Start the masked robots anew from their first readings (N, SENSOR_LAYOUT.width): at rest, or nearly."""
         self._require(mask, sensors)
+        self._states[mask] = np.zeros((), self._states.dtype)
         slip_filter.reset(self._constants, self._states, mask, sensors, self.values)
 
     def update(self, mask: Mask, sensors: Array) -> None:

@@ -1,8 +1,13 @@
-"""One control step of the observer: a small Kalman filter per robot, compiled; every robot on its own.
+"""One control step of the observer: small Kalman filters per robot, compiled; every robot on its own.
 
 Frames: *start* (the floor frame as the body stood at the reset: x along its heading), *heading* (turns with the body about the
 floor's normal; x along the wheels, y to the left in the floor), *body*. Velocities are estimated in the heading frame, each
-direction by a filter of its own (:mod:`wlr_gym.perception.observer.kalman`), heading and gyroscope bias by a third.
+direction by a filter of its own, heading and gyroscope bias by a third.
+
+State of a direction (p, v, l, e): position, velocity, leak of the accelerometer, error of the flow sensor. p' = v; v' = a - l
+with the measured acceleration a; l, what leaks into the accelerometer (bias, and gravity on an unknown slope), a random walk;
+e, ahead the scale of the optical flow less 1, to the side its rotation. The filters keep covariances only: the means live in
+frames that turn.
 
 A step predicts (the gyroscope turns, the accelerometer drives, the uncertainty grows) and takes in wheels, camera and flow.
 """
@@ -10,45 +15,142 @@ A step predicts (the gyroscope turns, the accelerometer drives, the uncertainty 
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from typing import Any
 
 from numba import njit
 
-from wlr_gym.perception.observer.kalman import (
-    LEAK,
-    LENS,
-    RADIUS,
-    VELOCITY,
-    correct,
-    correct_yaw,
-    guess_velocity,
-    predict_direction,
-    see_position,
-    see_rest,
-    see_rolling,
-    see_velocity,
-)
-from wlr_gym.perception.observer.layout import ESTIMATE, SENSOR
-from wlr_gym.perception.observer.trust import gather, judge
-from wlr_gym.robot import FIRST_WHEEL
+from wlr_gym.perception.observer.trust import LEAST_LOAD, gather, judge
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout
+from wlr_gym.robot import FIRST_WHEEL, WHEELS
 
-_WHEEL_RATE = SENSOR.joint_velocity + FIRST_WHEEL
-_WHEEL_EFFORT = SENSOR.joint_effort + FIRST_WHEEL
-#: N. Less than this counts as a wheel in the air when something is divided by its load.
-LEAST_LOAD = 0.5
+_WHEEL_XY = tuple(f"{wheel},{axis}" for wheel in WHEELS for axis in ("x", "y"))
+
+ESTIMATE_LAYOUT = Layout(
+    (
+        Channel("position", ("x", "y"), "m", "body origin in the start frame: the floor frame as the body stood at the reset"),
+        Channel("yaw", (), "rad", "heading in the start frame, unwrapped"),
+        Channel("yaw_sigma", (), "rad", "1 sigma of the yaw"),
+        Channel("linear_velocity_in_body", ("x", "y"), "m/s", "of the body origin, body frame"),
+        Channel("linear_velocity_sigma", ("x", "y"), "m/s", "1 sigma of the linear velocity"),
+        Channel("yaw_rate", (), "rad/s", "about the floor's normal"),
+        Channel("gravity_in_body", ("x", "y", "z"), "-", "direction of gravity in the body frame, unit length"),
+        Channel(
+            "slip_velocity", _WHEEL_XY, "m/s", "of the contact point over the floor: along the wheel's heading, along its axle"
+        ),
+        Channel("slip_sigma", _WHEEL_XY, "m/s", "1 sigma of the slip velocity"),
+        Channel("traction_force", WHEELS, "N", "of the floor on the wheel along its heading, from the wheel's effort"),
+        Channel("normal_force", WHEELS, "N", "of the floor on the wheel, from leg angles and accelerometer"),
+        Channel("traction_use", WHEELS, "-", "size of the traction force over the normal force"),
+        Channel("friction_demand", (), "-", "force of the floor on the whole robot: along the floor over normal to it"),
+        Channel(
+            "camera_innovation", (), "-", "size of the last camera frame's largest normalised innovation; 0 = no frame of late"
+        ),
+        Channel("camera_rejected", (), "-", "1 = the last camera frame was not believed, else 0"),
+        Channel("flow_innovation", (), "-", "size of the last flow reading's larger normalised innovation; 0 = none of late"),
+        Channel("flow_rejected", (), "-", "1 = the last flow reading was not believed, else 0"),
+    )
+)
+
+
+def _starts(layout: Layout) -> Any:
+    """Return the first column of each channel, by its name: a named tuple, as compiled code takes it for constants."""
+    return namedtuple("Starts", layout.slices)(*(columns.start for columns in layout.slices.values()))
+
+
+SENSOR, ESTIMATE = _starts(SENSOR_LAYOUT), _starts(ESTIMATE_LAYOUT)
+_WHEEL_RATE, _WHEEL_EFFORT = SENSOR.joint_velocity + FIRST_WHEEL, SENSOR.joint_effort + FIRST_WHEEL
+
+
+# --- the filter of one direction --------------------------------------------------------------------------------------
+
+
+# Where the state's elements stand, after the position; their number.
+VELOCITY, LEAK, LENS = 1, 2, 3
+DIRECTION_SIZE = 4
+
+
+@njit(cache=True, nogil=True)
+def predict_direction(p: Any, step: float, velocity_noise: float, leak_noise: float) -> None:
+    """P = F P F' + diag(0, velocity_noise, leak_noise, 0) over ``step`` s; ``p`` (4, 4) is changed."""
+    half = 0.5 * step * step
+    for k in range(DIRECTION_SIZE):
+        p[0, k] += step * p[1, k] - half * p[2, k]
+        p[1, k] -= step * p[2, k]
+    for k in range(DIRECTION_SIZE):
+        p[k, 0] += step * p[k, 1] - half * p[k, 2]
+        p[k, 1] -= step * p[k, 2]
+    p[VELOCITY, VELOCITY] += velocity_noise
+    p[LEAK, LEAK] += leak_noise
+
+
+@njit(cache=True, nogil=True)
+def see_velocity(p: Any, age: float, flow: float, column: Any) -> float:
+    """Put P h' of the measurement of the velocity ``age`` s ago less e ``flow`` into ``column`` (4,); return h P h'.
+
+    ``flow``: m/s, that the flow sensor measures; 0 = the wheels measure.
+    """
+    for k in range(DIRECTION_SIZE):
+        column[k] = p[k, VELOCITY] + age * p[k, LEAK] - flow * p[k, LENS]
+    return column[VELOCITY] + age * column[LEAK] - flow * column[LENS]
+
+
+@njit(cache=True, nogil=True)
+def see_position(p: Any, age: float, column: Any) -> float:
+    """Put P h' of the measurement of the position ``age`` s ago into ``column`` (4,); return h P h'."""
+    half = 0.5 * age * age
+    for k in range(DIRECTION_SIZE):
+        column[k] = p[k, 0] - age * p[k, VELOCITY] - half * p[k, LEAK]
+    return column[0] - age * column[VELOCITY] - half * column[LEAK]
+
+
+@njit(cache=True, nogil=True)
+def correct_direction(p: Any, column: Any, innovation: float, total: float, change: Any) -> None:
+    """Take in a measurement that came out ``innovation`` above its prediction, with the variance ``total`` of that.
+
+    ``p`` (4, 4) stays symmetric and positive; ``column``: (4,) P h'; ``change`` (4,) becomes what the state changes.
+    """
+    share = 1.0 / total
+    for j in range(DIRECTION_SIZE):
+        gain = column[j] * share
+        change[j] = gain * innovation
+        for k in range(j + 1):
+            p[j, k] = p[k, j] = p[j, k] - gain * column[k]
+
+
+@njit(cache=True, nogil=True)
+def correct(r: Any, k: int, innovation: float, total: float) -> None:
+    """Correct direction ``k`` by the measurement whose P h' is in ``r.column``."""
+    correct_direction(r.covariance[k], r.column, innovation, total, r.change)
+    c, s = r.pointing[0], r.pointing[1]
+    r.position[0] += (c if k == 0 else -s) * r.change[0]
+    r.position[1] += (s if k == 0 else c) * r.change[0]
+    r.velocity[k] += r.change[VELOCITY]
+    r.leak[k] += r.change[LEAK]
+    r.lens[k] += r.change[LENS]
+
+
+@njit(cache=True, nogil=True)
+def correct_yaw(r: Any, of_yaw: float, of_bias: float, innovation: float, total: float) -> None:
+    """Correct yaw and gyroscope bias by a measurement of of_yaw yaw + of_bias bias; ``total``: the innovation's variance."""
+    p = r.yaw_covariance
+    yaw, bias = of_yaw * p[0] + of_bias * p[1], of_yaw * p[1] + of_bias * p[2]
+    r.yaw += yaw / total * innovation
+    r.gyro_bias += bias / total * innovation
+    p[0] -= yaw * yaw / total
+    p[1] -= yaw * bias / total
+    p[2] -= bias * bias / total
+
+
+# --- wheels and floor -------------------------------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True)
 def look(robot: Any, sensors: Any, r: Any) -> None:
-    """Find heading, left and contact points for the floor normal ``r.normal``, and how each wheel rolls.
+    """Find heading, left and contact points for floor normal and rate of turn of the body, and how each wheel rolls.
 
     ``r.rolling[i]`` is the velocity of the body origin along heading and left with which wheel ``i`` would not slip;
     ``r.lift[i]`` that along the normal with which it would stay on the floor (equations of :mod:`wlr_gym.robot.slip`).
-
-    Args:
-        robot: geometry.
-        sensors: (SENSOR_LAYOUT.width,) joint angles and rates are read.
-        r: record of the robot; reads ``normal``, ``rate`` (body's angular velocity, body frame).
     """
     nx, ny, nz = r.normal[0], r.normal[1], r.normal[2]
     scale = 1.0 / math.sqrt(nx * nx + nz * nz + 1e-12)
@@ -113,9 +215,9 @@ def carry(robot: Any, r: Any) -> Any:
     mx = weight * cx - robot.mass * height * fx / robot.stiffness
     my = weight * cy - robot.mass * height * fy / robot.stiffness
     r.carries[:] = 1.0
-    a, b, c = 0.0, 0.0, 0.0
+    a = b = c = 0.0
     for _ in range(4):
-        n, sx, sy, sxx, sxy, syy, sz, sxz, syz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        n = sx = sy = sxx = sxy = syy = sz = sxz = syz = 0.0
         for i in range(4):
             on = r.carries[i]
             x, y, z = r.point[i, 0], r.point[i, 1], r.point[i, 2]
@@ -174,14 +276,10 @@ def pull(robot: Any, sensors: Any, r: Any) -> None:
 
 
 # What the prediction takes for granted; 1 sigma where it is an uncertainty. Chosen on simulated runs: docs/slip_observer.md.
-#: Share of the change of an IMU reading from step to step that one sample per step misses.
-_ALIAS = 0.25
-#: rad/s per root second: random walk of the gyroscope's bias.
-_GYRO_WANDER = 1e-5
-#: s: how fast the tilt follows the legs.
-_SETTLE = 1.5
-#: s: low-pass of the friction demand.
-_SMOOTH = 0.06
+_ALIAS = 0.25  # share of the change of an IMU reading from step to step that one sample per step misses
+_GYRO_WANDER = 1e-5  # rad/s per root second: random walk of the gyroscope's bias
+_SETTLE = 1.5  # s: how fast the tilt follows the legs
+_SMOOTH = 0.06  # s: low-pass of the friction demand
 
 
 @njit(cache=True, nogil=True)
@@ -193,10 +291,9 @@ def rate_noise(robot: Any, changed: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def shaking(robot: Any, changed: Any, square: Any) -> Any:
-    """Variance (m2/s4) of what one reading of the specific force per step misses.
+    """Variance (m2/s4) of what one reading of the specific force per step misses, that has ``changed`` by so much, m/s2.
 
-    Args:
-        robot: how much, learned. changed: by how much it has changed, m/s2. square: mean square of the legs' rates.
+    ``square``: mean square of the legs' rates; how much both count was learned.
     """
     return (robot.alias * changed) ** 2 + robot.velocity_legs**2 * square
 
@@ -217,8 +314,7 @@ def turn(robot: Any, r: Any) -> None:
         r.rate[k] = r.seen[SENSOR.gyro + k]
     mx, my, mz = (0.5 * dt * (r.rate[0] + wx), 0.5 * dt * (r.rate[1] + wy), 0.5 * dt * (r.rate[2] + wz))
     nx, ny, nz = r.normal[0], r.normal[1], r.normal[2]
-    x, y, z = nx - (my * nz - mz * ny), ny - (mz * nx - mx * nz), nz - (mx * ny - my * nx)
-    set_normal(r, x, y, z)
+    set_normal(r, nx - (my * nz - mz * ny), ny - (mz * nx - mx * nz), nz - (mx * ny - my * nx))
     r.yaw_rate = r.normal[0] * r.rate[0] + r.normal[1] * r.rate[1] + r.normal[2] * r.rate[2] - r.gyro_bias
     turned = dt * ((0.5 - robot.lag) * before + (0.5 + robot.lag) * r.yaw_rate)
     r.yaw += turned
@@ -322,20 +418,70 @@ def settle(robot: Any, r: Any) -> None:
     )
 
 
+# --- how the wheels roll, joints at rest ------------------------------------------------------------------------------
+
+
+_QUIET = 0.0005  # m/s: noise of a wheel's rolling speed from step to step
+#: Squared normalised innovation beyond which what all wheels say counts for less: they have jumped away from the IMU.
+_ROLLING_GATE = 16.0
+_DOUBT = 3.0  # s: how long the wheels are doubted once a camera has contradicted them and no longer does
+RADIUS = 0.005  # relative error of one wheel's radius
+_GRIPPING_SLIP = 0.003  # m/s: slip below which a wheel counts as gripping
+
+
+@njit(cache=True, nogil=True)
+def guess_velocity(r: Any) -> None:
+    """Begin with the geometric median of the wheels' rolling velocities: some spin while a robot is put down."""
+    for _ in range(4):
+        total, x, y = 1e-12, 0.0, 0.0
+        for i in range(4):
+            dx, dy = r.rolling[i, 0] - r.velocity[0], r.rolling[i, 1] - r.velocity[1]
+            weight = 1.0 / math.sqrt(dx * dx + dy * dy + _GRIPPING_SLIP**2)
+            total += weight
+            x += weight * r.rolling[i, 0]
+            y += weight * r.rolling[i, 1]
+        r.velocity[0], r.velocity[1] = x / total, y / total
+
+
+@njit(cache=True, nogil=True)
+def see_rolling(robot: Any, r: Any) -> None:
+    """Take in how the wheels roll, each as far as it is trusted: their weighted mean is a measurement of the velocity."""
+    speed, share = 0.0, 1.0 - robot.period / _DOUBT
+    for i in range(4):
+        speed += 0.25 * r.rolling[i, 0]
+    for k in range(2):
+        precision, moment = 0.0, 0.0
+        for i in range(4):
+            lead = r.lead[i] if k == 0 else 0.0
+            precision += r.trust[i, k]
+            moment += r.trust[i, k] * (r.rolling[i, k] - r.velocity[k] - lead)
+        innovation = moment / precision
+        if abs(innovation) < 0.5 * r.doubt:
+            r.doubt *= share
+        variance = 1.0 / precision + _QUIET**2 + (0.5 * RADIUS * speed) ** 2 + r.doubt**2
+        total = see_velocity(r.covariance[k], 0.0, 0.0, r.column) + variance
+        correct(r, k, innovation, max(total, innovation * innovation / _ROLLING_GATE))
+
+
+@njit(cache=True, nogil=True)
+def see_rest(robot: Any, r: Any) -> None:
+    """While every joint rests, the gyroscope reads its bias."""
+    for k in range(8):
+        if abs(r.seen[SENSOR.joint_velocity + k]) > 0.5 * robot.velocity_count:
+            return
+    total = r.yaw_covariance[2] + robot.gyro_noise**2
+    if r.yaw_rate * r.yaw_rate < 16.0 * total:
+        correct_yaw(r, 0.0, 1.0, r.yaw_rate, total)
+
+
 # --- camera: late frames, frames that are not believed, a camera that has been moved ----------------------------------
 
 
-#: Squared normalised innovation beyond which a frame is refused.
-CAMERA_GATE = 20.0
-#: s: refused frames that are off by the same for so long say that the camera has been moved.
-_CAMERA_PATIENCE = 0.25
-#: s: frames that steadily move away for so long say that the robot does, whatever wheels and IMU say.
-_LONG_PATIENCE = 0.5
-#: m, rad: what counts as the same.
-_SAME = 0.006
-_SAME_YAW = 0.03
-#: s without a frame after which nothing is said about the last one.
-_CAMERA_SILENCE = 0.5
+CAMERA_GATE = 20.0  # squared normalised innovation beyond which a frame is refused
+_CAMERA_PATIENCE = 0.25  # s: refused frames that are off by the same for so long say that the camera has been moved
+_LONG_PATIENCE = 0.5  # s: frames that steadily move away for so long say that the robot does, whatever wheels and IMU say
+_SAME, _SAME_YAW = 0.006, 0.03  # m, rad: what counts as the same
+_CAMERA_SILENCE = 0.5  # s without a frame after which nothing is said about the last one
 
 
 @njit(cache=True, nogil=True)
@@ -356,25 +502,27 @@ def see_camera(robot: Any, sensors: Any, r: Any) -> None:
     repeated = x == r.frame[0] and y == r.frame[1] and yaw == r.frame[2]
     r.frame[0], r.frame[1], r.frame[2] = x, y, yaw
     age = min(max(r.seen[SENSOR.camera_age], 0.0), r.tick * robot.period, (r.raw.shape[0] - 2) * robot.period)
-    then_x, then_y, then_yaw = _pose_before(robot, age, r)
-    off = _off(robot, age, x - then_x, y - then_y, yaw - then_yaw, r)
-    dx, dy, dyaw = x - then_x, y - then_y, yaw - then_yaw
+    then = _pose_before(robot, age, r)
+    error = (x - then[0], y - then[1], yaw - then[2])
+    off = _off(robot, age, error, r)
     if off <= CAMERA_GATE:
         r.anchor[:] = 0.0
     elif r.anchor[0] != 0.0 or r.anchor[1] != 0.0 or r.anchor[2] != 0.0:
         c, s = math.cos(r.anchor[2]), math.sin(r.anchor[2])
-        dx = r.anchor[0] + c * x - s * y - then_x
-        dy = r.anchor[1] + s * x + c * y - then_y
-        dyaw = yaw + r.anchor[2] - then_yaw
-        off = _off(robot, age, dx, dy, dyaw, r)
+        moved_x, moved_y = r.anchor[0] + c * x - s * y, r.anchor[1] + s * x + c * y
+        error = (moved_x - then[0], moved_y - then[1], yaw + r.anchor[2] - then[2])
+        off = _off(robot, age, error, r)
     r.camera_off = math.sqrt(off)
     if off > CAMERA_GATE or (repeated and off > 1.0):
         r.camera_rejected = 1.0
         if not repeated:
-            _refuse(x, y, yaw, then_x, then_y, then_yaw, dx, dy, dyaw, r)
+            _refuse((x, y, yaw), then, error, r)
     elif not repeated:
         r.camera_rejected = r.refused = 0.0
-        _believe(robot, age, dx, dy, dyaw, r)
+        for k in range(2):
+            variance = see_position(r.covariance[k], age, r.column) + robot.camera_noise**2
+            correct(r, k, _along(k, error, r), variance)
+        correct_yaw(r, 1.0, age, error[2], _yaw_variance(robot, age, r))
     r.frame_time = 0.0
 
 
@@ -403,55 +551,54 @@ def _yaw_variance(robot: Any, age: float, r: Any) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _off(robot: Any, age: float, dx: float, dy: float, dyaw: float, r: Any) -> float:
-    """Return the largest squared normalised innovation of a frame that is off by so much in the start frame."""
+def _along(k: int, error: Any, r: Any) -> float:
+    """Return what of an error (x, y, yaw) in the start frame lies along heading (0) or left (1)."""
     c, s = r.pointing[0], r.pointing[1]
-    off = dyaw * dyaw / _yaw_variance(robot, age, r)
+    return c * error[0] + s * error[1] if k == 0 else c * error[1] - s * error[0]
+
+
+@njit(cache=True, nogil=True)
+def _off(robot: Any, age: float, error: Any, r: Any) -> float:
+    """Return the largest squared normalised innovation of a frame that is off by so much in the start frame."""
+    off = error[2] * error[2] / _yaw_variance(robot, age, r)
     for k in range(2):
-        along = c * dx + s * dy if k == 0 else c * dy - s * dx
+        along = _along(k, error, r)
         off = max(off, along * along / (see_position(r.covariance[k], age, r.column) + robot.camera_noise**2))
     return off
 
 
 @njit(cache=True, nogil=True)
-def _believe(robot: Any, age: float, dx: float, dy: float, dyaw: float, r: Any) -> None:
-    c, s = r.pointing[0], r.pointing[1]
-    for k in range(2):
-        along = c * dx + s * dy if k == 0 else c * dy - s * dx
-        correct(r, k, along, see_position(r.covariance[k], age, r.column) + robot.camera_noise**2)
-    correct_yaw(r, 1.0, age, dyaw, _yaw_variance(robot, age, r))
+def _refuse(frame: Any, then: Any, error: Any, r: Any) -> None:
+    """Follow how refused frames are off: by the same, then the camera has been moved; or steadily moving away.
 
-
-@njit(cache=True, nogil=True)
-def _refuse(
-    x: float, y: float, yaw: float, then_x: float, then_y: float, then_yaw: float, dx: float, dy: float, dyaw: float, r: Any
-) -> None:
-    """Follow how refused frames are off: by the same, then the camera has been moved; or steadily moving away."""
+    ``frame``, ``then``, ``error``: the frame's pose, the robot's at its time, and by how much it is off, (x, y, yaw).
+    """
     if r.refused == 0.0:
-        r.first_off[0], r.first_off[1], r.first_off[2] = dx, dy, dyaw
-        r.off[0], r.off[1], r.off[2] = dx, dy, dyaw
+        for k in range(3):
+            r.first_off[k] = r.off[k] = error[k]
         r.refused = 1e-9
         return
     before = r.refused
     r.refused += r.frame_time
     ahead = r.frame_time / before if before > r.frame_time else 0.0
-    jump_x = dx - r.off[0] - ahead * (r.off[0] - r.first_off[0])
-    jump_y = dy - r.off[1] - ahead * (r.off[1] - r.first_off[1])
-    if abs(jump_x) > _SAME or abs(jump_y) > _SAME or abs(dyaw - r.off[2]) > _SAME_YAW:
+    jump_x = error[0] - r.off[0] - ahead * (r.off[0] - r.first_off[0])
+    jump_y = error[1] - r.off[1] - ahead * (r.off[1] - r.first_off[1])
+    if abs(jump_x) > _SAME or abs(jump_y) > _SAME or abs(error[2] - r.off[2]) > _SAME_YAW:
         r.refused = 0.0
         return
-    r.off[0], r.off[1], r.off[2] = dx, dy, dyaw
-    moved = max(abs(dx - r.first_off[0]), abs(dy - r.first_off[1]))
+    for k in range(3):
+        r.off[k] = error[k]
+    moved = max(abs(error[0] - r.first_off[0]), abs(error[1] - r.first_off[1]))
     if r.refused >= _CAMERA_PATIENCE and moved < _SAME:
-        turned = then_yaw - yaw
+        turned = then[2] - frame[2]
         c, s = math.cos(turned), math.sin(turned)
-        r.anchor[0], r.anchor[1], r.anchor[2] = then_x - c * x + s * y, then_y - s * x - c * y, turned
+        r.anchor[0], r.anchor[1] = then[0] - c * frame[0] + s * frame[1], then[1] - s * frame[0] - c * frame[1]
+        r.anchor[2] = turned
         r.refused = 0.0
     elif r.refused >= _LONG_PATIENCE:
         for k in range(2):
-            p = r.covariance[k]
-            p[0, 0] += dx * dx + dy * dy
-            p[1, 1] += (moved / r.refused) ** 2
+            r.covariance[k, 0, 0] += error[0] * error[0] + error[1] * error[1]
+            r.covariance[k, VELOCITY, VELOCITY] += (moved / r.refused) ** 2
         r.doubt = moved / r.refused
         r.refused = 0.0
 
@@ -459,19 +606,12 @@ def _refuse(
 # --- optical flow: a velocity, with a scale and a rotation that are learned on the way --------------------------------
 
 
-# What the sensor's scale and mounting are taken for, 1 sigma.
-SCALE = 0.03
-ROTATION = 0.03
-#: Squared normalised innovation beyond which a reading is refused.
-FLOW_GATE = 16.0
-#: s of refused readings, moving as the IMU says, after which it is the estimate that may be wrong.
-_FLOW_PATIENCE = 0.5
-#: Readings in a row, the same to the last bit, after which the sensor counts as stuck.
-_REPEATS = 8.0
-#: s without a reading after which nothing is said about the last one.
-_FLOW_SILENCE = 0.5
-#: m: shortest distance from lens to floor that is taken for one.
-_LEAST_HEIGHT = 0.02
+SCALE, ROTATION = 0.03, 0.03  # of the sensor and its mounting, 1 sigma
+FLOW_GATE = 16.0  # squared normalised innovation beyond which a reading is refused
+_FLOW_PATIENCE = 0.5  # s of refused readings, moving as the IMU says, after which it is the estimate that may be wrong
+_REPEATS = 8.0  # readings in a row, the same to the last bit, after which the sensor counts as stuck
+_FLOW_SILENCE = 0.5  # s without a reading after which nothing is said about the last one
+_LEAST_HEIGHT = 0.02  # m: shortest distance from lens to floor that is taken for one
 
 
 @njit(cache=True, nogil=True)
@@ -486,7 +626,7 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     r.repeats = r.repeats + 1.0 if x == r.reading[0] and y == r.reading[1] else 0.0
     stuck = r.repeats >= _REPEATS
     r.reading[0], r.reading[1] = x, y
-    mean_x, mean_y, height = _seen_velocity(robot, x, y, r)
+    mean, height = _seen_velocity(robot, x, y, r)
     if height < _LEAST_HEIGHT:
         return
     age = max(r.seen[SENSOR.flow_age], 0.0) + 0.5 * robot.period  # of the middle of its interval
@@ -495,9 +635,8 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     blur = (poor * robot.flow_speed_noise) ** 2
     off, ahead = 0.0, r.velocity[0] - age * r.kick[0]
     for k in range(2):
-        mean = mean_x if k == 0 else mean_y
-        r.flow_variance[k] = noise + blur * mean * mean
-        r.flow_error[k] = mean - (r.velocity[k] - age * r.kick[k])
+        r.flow_variance[k] = noise + blur * mean[k] * mean[k]
+        r.flow_error[k] = mean[k] - (r.velocity[k] - age * r.kick[k])
         spread = see_velocity(r.covariance[k], age, ahead, r.column)
         off = max(off, r.flow_error[k] ** 2 / (spread + r.flow_variance[k]))
     r.flow_off = math.sqrt(off)
@@ -520,12 +659,7 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
 def _seen_velocity(robot: Any, x: float, y: float, r: Any) -> Any:
     """Return the body origin's velocity along heading and left by a reading, and the lens's distance to the floor."""
     n, lens = r.normal, robot.lens
-    floor, carried, rise = 0.0, 1e-12, 0.0
-    for i in range(4):
-        floor += r.load[i] * r.point[i, 2]
-        rise += r.load[i] * r.lift[i]
-        carried += r.load[i]
-    floor, rise = floor / carried, rise / carried
+    floor, rise = _carried(r)
     height = (n[0] * lens[0] + n[1] * lens[1] + n[2] * lens[2] - floor) / n[2]
     c, s = math.cos(r.lens[1]), math.sin(r.lens[1])
     x, y = (1.0 + r.lens[0]) * (c * x - s * y), (1.0 + r.lens[0]) * (s * x + c * y)
@@ -534,19 +668,29 @@ def _seen_velocity(robot: Any, x: float, y: float, r: Any) -> Any:
     bx = height * (x + wy) - (wy * lens[2] - wz * lens[1]) - rise * n[0]
     by = height * (y - wx) - (wz * lens[0] - wx * lens[2]) - rise * n[1]
     along = bx / r.heading[0]
-    return along, (by - along * r.heading[1]) / r.left[1], height
+    return (along, (by - along * r.heading[1]) / r.left[1]), height
+
+
+@njit(cache=True, nogil=True)
+def _carried(r: Any) -> Any:
+    """Return height (m) and rise (m/s) of the wheels over the floor along its normal, by their loads."""
+    floor, carried, rise = 0.0, 1e-12, 0.0
+    for i in range(4):
+        floor += r.load[i] * r.point[i, 2]
+        rise += r.load[i] * r.lift[i]
+        carried += r.load[i]
+    return floor / carried, rise / carried
 
 
 # --- the step ---------------------------------------------------------------------------------------------------------
 
 
-#: m, 1 sigma at the start.
-_START_PLACE = 1e-4
+_START_PLACE = 1e-4  # m, 1 sigma at the start
 
 
 @njit(cache=True, nogil=True)
 def reset(robot: Any, states: Any, mask: Any, sensors: Any, values: Any) -> None:
-    """Start masked robots anew; see :class:`wlr_gym.perception.observer.observer.SlipObserver`."""
+    """Start masked robots anew, whose states are 0; see :class:`wlr_gym.perception.observer.observer.SlipObserver`."""
     for i in range(mask.shape[0]):
         if mask[i]:
             _start(robot[0], sensors[i], states[i])
@@ -565,23 +709,13 @@ def update(robot: Any, states: Any, mask: Any, sensors: Any, values: Any, work: 
 @njit(cache=True, nogil=True)
 def _start(robot: Any, sensors: Any, r: Any) -> None:
     """Begin level and at rest; what the accelerometer reads along the floor is bias or, where it is much, a slope."""
-    r.seen[:] = 0.0
     r.seen[SENSOR.accelerometer + 2] = robot.gravity
     _take(sensors, r)
-    r.tick = r.yaw = r.turned = r.gyro_bias = r.demand = r.shaken = r.legs = 0.0
-    r.camera_off = r.camera_rejected = r.refused = r.frame_time = r.doubt = 0.0
-    r.flow_off = r.flow_rejected = r.flow_refused = r.flow_time = r.repeats = 0.0
-    r.anchor[:] = 0.0
-    r.off[:] = 0.0
-    r.first_off[:] = 0.0
     r.frame[:] = math.inf  # as none will be
     r.reading[:] = math.inf
-    r.lens[:] = 0.0
-    r.memory[:] = 0.0
     r.wander[:] = 1.0
-    r.normal[0], r.normal[1], r.normal[2] = 0.0, 0.0, 1.0
-    r.raw[:] = 0.0
-    r.yaw_covariance[0], r.yaw_covariance[1], r.yaw_covariance[2] = 0.0, 0.0, robot.gyro_bias**2
+    r.normal[2] = 1.0
+    r.yaw_covariance[2] = robot.gyro_bias**2
     for k in range(3):
         r.rate[k] = r.last_rate[k] = r.seen[SENSOR.gyro + k]
     r.yaw_rate = r.rate[2]
@@ -592,13 +726,11 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
     pull(robot, r.seen, r)
     r.traction[:] = 0.0
     carry(robot, r)
-    r.covariance[:] = 0.0
     r.guess = math.sqrt(r.force[0] ** 2 + r.force[1] ** 2)
     for k in range(2):
         total = r.force[k]
         bias = total / (1.0 + (total / (3.0 * robot.accel_bias)) ** 4)  # more than that is a slope
         r.leak[k], r.slope[k] = bias, total - bias
-        r.position[k] = r.velocity[k] = r.raw_velocity[k] = r.last_velocity[k] = r.kick[k] = 0.0
         r.covariance[k, 0, 0] = _START_PLACE**2
         r.covariance[k, VELOCITY, VELOCITY] = robot.start_speed**2
         r.covariance[k, LEAK, LEAK] = robot.start_leak**2
@@ -618,8 +750,7 @@ def _advance(robot: Any, sensors: Any, r: Any, work: Any) -> None:
     """Predict with the IMU, then take in wheels, camera and flow."""
     _take(sensors, r)
     r.tick += 1.0
-    for i in range(4):
-        r.last_rolling[i, 0], r.last_rolling[i, 1] = r.rolling[i, 0], r.rolling[i, 1]
+    r.last_rolling[:] = r.rolling
     turn(robot, r)
     look(robot, r.seen, r)
     sense_force(robot, r)
@@ -640,12 +771,7 @@ def _advance(robot: Any, sensors: Any, r: Any, work: Any) -> None:
 @njit(cache=True, nogil=True)
 def _report(robot: Any, r: Any, out: Any) -> None:
     """Write the estimates."""
-    h, n, left = r.heading, r.normal, r.left
-    rise, carried = 0.0, 1e-12
-    for i in range(4):
-        rise += r.load[i] * r.lift[i]
-        carried += r.load[i]
-    rise /= carried
+    h, n, left, rise = r.heading, r.normal, r.left, _carried(r)[1]
     vx, vy = r.velocity[0], r.velocity[1]
     out[ESTIMATE.position], out[ESTIMATE.position + 1] = r.position[0], r.position[1]
     out[ESTIMATE.yaw], out[ESTIMATE.yaw_sigma] = r.yaw, math.sqrt(max(r.yaw_covariance[0], 0.0))

@@ -20,20 +20,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Numbers that a wheel's network sees of its own, and that all wheels' see alike.
-CLUES = 10
-CLUES_ALIKE = 8
-#: Numbers that a wheel remembers.
-MEMORY = 8
+#: Numbers that a wheel's network sees of its own, and that all wheels' see alike; numbers that a wheel remembers.
+CLUES, CLUES_ALIKE, MEMORY = 10, 8, 8
 #: Inputs of a wheel's own (clues, its memory, its partner's), and inputs alike (clues, mean memory).
-OWN = CLUES + 2 * MEMORY
-ALIKE = CLUES_ALIKE + MEMORY
-#: Precision along heading and left, lead, noise of velocity and of leak.
-OUTPUTS = 5
-#: Control period of the training, s: precisions are per reading of so long.
-_PERIOD = 0.02
-#: Least load that traction is divided by, N.
-_LEAST_LOAD = 0.5
+OWN, ALIKE = CLUES + 2 * MEMORY, CLUES_ALIKE + MEMORY
+OUTPUTS = 5  # precision along heading and left, lead, noise of velocity and of leak
+_PERIOD = 0.02  # s, control period of the training: precisions are per reading of so long
+#: N. Less than this counts as a wheel in the air when something is divided by its load.
+LEAST_LOAD = 0.5
 
 
 #: What the network needs room for while it judges one robot.
@@ -69,8 +63,7 @@ def _log(x: float, least: float) -> float:
 def gather(robot: Any, r: Any, work: Any) -> None:
     """Put what each wheel's network sees into ``work.seen_by`` (4, OWN), and what all see alike into ``work.alike``."""
     fz = max(r.force[2], 2.0)
-    mean_load = 0.1
-    mean_x, mean_y = 0.0, 0.0
+    mean_load, mean_x, mean_y = 0.1, 0.0, 0.0
     for i in range(4):
         mean_load += 0.25 * r.load[i]
         mean_x += 0.25 * (r.rolling[i, 0] - r.velocity[0])
@@ -79,9 +72,7 @@ def gather(robot: Any, r: Any, work: Any) -> None:
     sigma_x = 0.5 * (0.5 * math.log(r.covariance[0, 1, 1]) + 5.0)
     sigma_y = 0.5 * (0.5 * math.log(r.covariance[1, 1, 1]) + 5.0)
     demand = 3.0 * math.sqrt(math.sqrt(pull_x * pull_x + pull_y * pull_y + 1e-9) / fz)
-    turning = min(abs(r.yaw_rate), 2.0)
-    legs = min(r.legs, 3.0)
-    shaken = 0.5 * min(r.shaken, 5.0)
+    turning, legs, shaken = min(abs(r.yaw_rate), 2.0), min(r.legs, 3.0), 0.5 * min(r.shaken, 5.0)
     off = 0.5 * (0.5 * _log(mean_x * mean_x + mean_y * mean_y, 1e-6) + 5.0)
     change_x, change_y = r.velocity[0] - r.last_velocity[0], r.velocity[1] - r.last_velocity[1]
     a = work.alike
@@ -89,7 +80,7 @@ def gather(robot: Any, r: Any, work: Any) -> None:
     for i in range(4):
         c = work.seen_by[i]
         dx, dy = r.rolling[i, 0] - r.velocity[0], r.rolling[i, 1] - r.velocity[1]
-        use = r.traction[i] / max(r.load[i], _LEAST_LOAD)
+        use = r.traction[i] / max(r.load[i], LEAST_LOAD)
         c[0] = 0.5 * (_log(dx, 1e-3) + 5.0)
         c[1] = 0.5 * (_log(dy, 1e-3) + 5.0)
         c[2] = 2.0 * abs(use)
@@ -170,7 +161,7 @@ def _say(robot: Any, r: Any, work: Any) -> None:
     for i in range(4):
         for k in range(2):
             r.trust[i, k] = math.exp(min(max(work.sum[i, k], 0.0), 14.5)) * robot.period / _PERIOD
-        use = r.traction[i] / max(r.load[i], _LEAST_LOAD)
+        use = r.traction[i] / max(r.load[i], LEAST_LOAD)
         r.lead[i] = math.exp(min(max(work.sum[i, 2], -8.0), 0.0)) * min(max(use, -1.0), 1.0)
     for k in range(2):
         mean = 0.25 * (work.sum[0, 3 + k] + work.sum[1, 3 + k] + work.sum[2, 3 + k] + work.sum[3, 3 + k])

@@ -154,8 +154,7 @@ def _fourth_difference(time: Array, poses: Array, variance: Array, late: Array, 
     weights = 1 / np.prod(at[:, :, None] - at[:, None, :] + np.eye(5), axis=2)
     weights /= np.linalg.norm(weights, axis=1)[:, None]
     rest, edges, by_time = (
-        np.einsum("fk,fkc->fc", w, values[rows])
-        for w, values in ((weights, poses), (weights**2, variance), (weights**2, late))
+        np.einsum("fk,fkc->fc", w, values[rows]) for w, values in ((weights, poses), (weights**2, variance), (weights**2, late))
     )
     return rest, edges, by_time
 
