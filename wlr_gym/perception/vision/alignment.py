@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.run_states import quaternion, rest_pose
 from wlr_gym.data.runs import Run
+from wlr_gym.perception.vision.motion import repeated
 from wlr_gym.perception.vision.smoothing import smooth
 from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -302,11 +303,6 @@ def readings(run: Run, name: str, longest: float = math.inf) -> Array | None:
     if np.diff(np.flatnonzero([True, *fine, True])).max() > longest + 1:
         return None
     return np.interp(run["t"], run["t"][fine], run[name][fine])
-
-
-def repeated(parameters: Parameters, count: int) -> Parameters:
-    """The parameters of one robot as a batch of ``count``."""
-    return Parameters(np.repeat(parameters.values, count, axis=0))
 
 
 def _between(t: Array, values: Array) -> Callable[[Array], Array]:

@@ -26,7 +26,6 @@ from wlr_gym.data.run_states import rest_pose
 from wlr_gym.data.runs import Run
 from wlr_gym.perception.observer.observer import constants
 from wlr_gym.perception.observer.slip_filter import leak_noise, rate_noise, shaking
-from wlr_gym.perception.vision.alignment import repeated
 from wlr_gym.perception.vision.smoothing import Smoothed, smooth
 from wlr_gym.perception.vision.tracking import Sample
 from wlr_gym.physics.plants.sensors import rotation
@@ -95,6 +94,11 @@ def leg_readings(time: Array, joints: tuple[Array, Array], robot: Robot, paramet
     known = robot.tolerances.get("joint_zero")
     prior = np.repeat([_CONSTANT_STD, UNEVEN, _SLOPE_STD, _ZERO if known is None else known.legs], _OPENS)
     return LegReadings(time, values, by_wheel, by_zero, noise, way * UNEVEN**2 / length, prior)
+
+
+def repeated(parameters: Parameters, count: int) -> Parameters:
+    """The parameters of one robot as a batch of ``count``."""
+    return Parameters(np.repeat(parameters.values, count, axis=0))
 
 
 def leg_findings(time: Array, film: SmoothedMotion, joined: SmoothedMotion, samples: Sequence[Sample]) -> Iterator[str]:

@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.run_states import quaternion
 from wlr_gym.data.runs import Run
-from wlr_gym.perception.vision.alignment import joint_signals, repeated
+from wlr_gym.perception.vision.alignment import joint_signals
 from wlr_gym.perception.vision.imu_check import imu_compared
 from wlr_gym.perception.vision.motion import (
     body_rates,
     imu_readings,
     leg_findings,
     leg_readings,
+    repeated,
     smooth_motion,
     without_outliers,
 )
