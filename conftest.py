@@ -28,7 +28,7 @@ def own_kernels(shared_kernels, monkeypatch):
 def graphics():
     """Skip where there is no OpenGL at all."""
     from wlr_gym.base.errors import InputError
-    from wlr_gym.render.gl import Canvas
+    from wlr_gym.render.scene import Canvas
     from wlr_gym.render.stage import Stage
     from wlr_gym.robot import load_robot
     from wlr_gym.robot.parameters import Parameters

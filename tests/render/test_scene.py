@@ -10,7 +10,7 @@ from standing import PLAIN, truth_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants import SIMULATORS, PlantOptions, make_plant
-from wlr_gym.render import gl
+from wlr_gym.render import scene as gl
 from wlr_gym.render import stage as marks
 from wlr_gym.render import view as camera
 from wlr_gym.render.scene import describe

@@ -1,6 +1,6 @@
 """Frames of the same scene as MuJoCo draws it: a second renderer, to check the first one and the detector against.
 
-No lens distortion and no exposure time: a pinhole camera, OpenGL's own edges. Needs OpenGL (see :mod:`wlr_gym.render.gl`).
+No lens distortion and no exposure time: a pinhole camera, OpenGL's own edges. Needs OpenGL (see :mod:`wlr_gym.render.scene`).
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.scene import PLATE, Look, ScenePose, circles_of, develop
-from wlr_gym.render.gl import Canvas
+from wlr_gym.render.scene import Canvas
 from wlr_gym.render.stage import Stage
 from wlr_gym.robot import LEGS, Robot
 from wlr_gym.robot.parameters import Parameters

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from test_measure import OFFSET, STD, samples_of
 
 from studies.bench.vision import skid_turn
-from wlr_gym.perception.vision.imu_check import _angle_rates, imu_differences
 from wlr_gym.perception.vision.self_calibration import frame_noise, widened, without_repeats
+from wlr_gym.perception.vision.slip import _angle_rates, imu_differences
 from wlr_gym.perception.vision.tracking import REPEATED, without_pose
 from wlr_gym.robot import load_robot
 

@@ -11,9 +11,8 @@ from test_measure import OFFSET, samples_of
 from studies.bench.vision import pose_at, skid_turn, true_slip
 from wlr_gym.data import Run
 from wlr_gym.perception.vision import slip
-from wlr_gym.perception.vision.imu_check import imu_findings, wrong_axes
 from wlr_gym.perception.vision.motion import ImuReadings, smooth_motion
-from wlr_gym.perception.vision.slip import measure_slip
+from wlr_gym.perception.vision.slip import imu_findings, measure_slip, wrong_axes
 from wlr_gym.perception.vision.tracking import OK, Sample, angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters

@@ -9,9 +9,8 @@ from standing import truth_of
 from wlr_gym.render.stage import Arrow, Stage
 from wlr_gym.render.teleop import UP
 from wlr_gym.render.view import View
-from wlr_gym.render.web.figure import Figure, PageFloor
 from wlr_gym.render.web.page import NOTHING, Curve, close_server, open_server
-from wlr_gym.render.web.player import KEYS, Moment, Player, WebViewer
+from wlr_gym.render.web.player import KEYS, Figure, Moment, PageFloor, Player, WebViewer
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 

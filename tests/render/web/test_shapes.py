@@ -9,8 +9,8 @@ pytest.importorskip("viser", minversion="1.1", reason="needs the extra web")
 from wlr_gym.base.errors import InputError
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, up_direction
-from wlr_gym.render.web.figure import bodies
 from wlr_gym.render.web.page import Address, Curve, aligned, eye, floor_pose, open_server, thinned
+from wlr_gym.render.web.player import bodies
 from wlr_gym.robot import WHEELS, load_robot
 from wlr_gym.robot.parameters import Parameters
 

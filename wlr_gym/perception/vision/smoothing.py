@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 #: log10 of the jerk's spectral density, in unit^2/s^5, that are tried.
 _DENSITIES = np.arange(-6.0, 8.1, 0.5)
-_GATE = 100.0  # squared deviations from the prediction, in its variance
+_OUTLYING = 100.0  # squared deviations from the prediction, in its variance
 _MOST_REJECTED = 4  # in a row; then the signal has really jumped
 #: What white jerk of density 1 adds to the covariance of value, rate and acceleration: these times these powers of the time.
 _SHARES = 1 / np.array([[20.0, 8.0, 6.0], [8.0, 3.0, 2.0], [6.0, 2.0, 1.0]])
@@ -117,10 +117,10 @@ def _filter(
         if not math.isnan(values[i]):
             total = spread[0, 0] + variances[i]
             error = values[i] - state[0]
-            if error * error > _GATE * total and abs(error) > jump and in_a_row < _MOST_REJECTED:
+            if error * error > _OUTLYING * total and abs(error) > jump and in_a_row < _MOST_REJECTED:
                 rejected[i] = True
                 in_a_row += 1
-                likelihood -= 0.5 * (_GATE + math.log(total))
+                likelihood -= 0.5 * (_OUTLYING + math.log(total))
             else:
                 in_a_row = 0
                 for k in range(3):  # Joseph's form: it stays positive however sure a sample is
