@@ -1,10 +1,12 @@
-"""An OpenGL context that draws into memory: opened when the first picture is drawn, never before.
+"""Pictures of a robot from the truth of any plant, with text and a legend; a portrait with its dimensions.
 
-``mujoco`` picks its context class once, when it is first imported, from ``MUJOCO_GL``. Here it is picked when it is needed, so
-a headless machine draws through EGL without any setting, whatever was imported before. ``MUJOCO_GL`` still decides where it is
-set.
+They are drawn into memory by an OpenGL context that opens with the first picture, never before. ``mujoco`` picks its context
+class once, when it is first imported, from ``MUJOCO_GL``. Here it is picked when it is needed, so a headless machine draws
+through EGL without any setting, whatever was imported before. ``MUJOCO_GL`` still decides where it is set.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
 import functools
@@ -25,22 +27,8 @@ from PIL import Image, ImageDraw, ImageFont
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth, standing_state
-from wlr_gym.render.stage import (
-    FORCE_SCALE,
-    SLIP_SCALE,
-    Area,
-    Mark,
-    Stage,
-    Trail,
-    add_marks,
-    areas,
-    force_arrows,
-    pair,
-    pieces,
-    slip_arrows,
-    spots,
-    squares,
-)
+from wlr_gym.render import stage as marks
+from wlr_gym.render.stage import Area, Mark, Stage, Trail
 from wlr_gym.render.view import (
     CAMERAS,
     LOOK_HEIGHT,
@@ -54,10 +42,6 @@ from wlr_gym.render.view import (
 )
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
-
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo fills its namespace when it is imported.)
-
 
 #: System -> contexts that can draw into memory there, the preferred first. On Linux EGL needs no display.
 CONTEXTS = {"Linux": ("egl", "glfw", "osmesa"), "Darwin": ("cgl", "glfw"), "Windows": ("glfw",)}
@@ -143,11 +127,7 @@ def _open_context(width: int, height: int) -> Any:
     raise InputError(f"no OpenGL to draw pictures with ({'; '.join(failures) or 'no context to try'}): {remedy}")
 
 
-# --- pictures of a robot from the truth of any plant, with text and a legend; a portrait with its dimensions ----------
-
-
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo fills its namespace when it is imported.)
+# --- pictures -----------------------------------------------------------------------------------------------------------
 
 
 Picture = NDArray[np.uint8]
@@ -219,9 +199,9 @@ class Scene:
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(stage.model, stage.data, mujoco.MjvOption(), None, eye, everything, scene)
         aim(scene, *place)
-        floor = areas(parameters, row, truth.position[row]) if self.view.friction else []
-        add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
-        add_marks(scene, [piece for trail in trails for piece in pieces(trail)])
+        floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
+        marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+        marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail)])
         picture = self._canvas.draw(scene)
         if not self.view.text:
             return picture
@@ -256,19 +236,19 @@ class Scene:
             text = (places[:, 0] < 0.48 * width) & ((places[:, 1] < 0.27 * height) | (places[:, 1] > 0.76 * height))
             good = inside & ~text & (np.linalg.norm(places - robot, axis=1) > clear)
             if good.any():
-                notes.append((f"µ {area.mu:.2g}", pair(places[np.argmax(good)])))
+                notes.append((f"µ {area.mu:.2g}", marks.pair(places[np.argmax(good)])))
         return notes
 
 
 def marks_of(stage: Stage, truth: Truth, parameters: Parameters, row: int, floor: list[Area], view: View) -> list[Mark]:
     """Return all that is drawn besides the robot, posed in ``stage``."""
-    drawn: list[Mark] = [squares(stage, truth.position[row]), *floor]
+    drawn: list[Mark] = [marks.squares(stage, truth.position[row]), *floor]
     if view.friction:
-        drawn += spots(stage, parameters, row)
+        drawn += marks.spots(stage, parameters, row)
     if view.forces:
-        drawn += force_arrows(stage, truth, parameters, row)
+        drawn += marks.force_arrows(stage, truth, parameters, row)
     if view.slip:
-        drawn += slip_arrows(stage, truth, parameters, row)
+        drawn += marks.slip_arrows(stage, truth, parameters, row)
     return drawn
 
 
@@ -279,9 +259,9 @@ def legend(parameters: Parameters, row: int, view: View) -> list[str]:
     floor = f"floor µ {low}" if low == high else f"floors µ {low} to {high}"
     lines = [f"{floor}, squares 0.2 m" if view.friction else "squares 0.2 m"]
     if view.slip:
-        lines.append(f"slip: 0.1 m of arrow = {0.1 / SLIP_SCALE:g} m/s")
+        lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
     if view.forces:
-        lines.append(f"friction (green): 0.1 m = {0.1 / FORCE_SCALE:g} N")
+        lines.append(f"friction (green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
     if view.path:
         lines.append("path: pink; as commanded: dashed")
     return lines

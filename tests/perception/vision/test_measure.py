@@ -11,8 +11,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data import Run, read_run
 from wlr_gym.perception.vision.alignment import align
 from wlr_gym.perception.vision.analysis import VideoAnalysis, _findings, camera_columns, save_video_analysis
+from wlr_gym.perception.vision.motion import smooth
 from wlr_gym.perception.vision.slip import measure_slip
-from wlr_gym.perception.vision.smoothing import smooth
 from wlr_gym.perception.vision.tracking import LOST, OK, Sample, angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters

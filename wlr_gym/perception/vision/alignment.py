@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.run_states import quaternion, rest_pose
 from wlr_gym.data.runs import Run
-from wlr_gym.perception.vision.motion import repeated
-from wlr_gym.perception.vision.smoothing import smooth
+from wlr_gym.perception.vision.motion import repeated, smooth
 from wlr_gym.robot import JOINTS, LEG_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import accumulate, contact_slip_velocity

@@ -1,8 +1,17 @@
-"""Hold a film's turns and tilts against the IMU: what gyroscope and accelerometer contradict is no motion of the body.
+"""Slip of every wheel and of the body from the camera's poses and the encoders, with uncertainty; and what the IMU contradicts.
 
-Turns are compared as angles. Of each axis the gyroscope's constant, drift and scale (to 10 %) are left open; of pitch and roll
-also how the IMU is turned on the body (which shows along the yaw) and how the floor markers' plane is tilted (along its cosine
-and sine). Of the accelerometer, starts and stops tell which of its axes is which.
+Poses (with IMU and legs, :mod:`wlr_gym.perception.vision.motion`) and joint angles are smoothed onto the run's rows; their
+rates give each wheel's slip velocity by :mod:`wlr_gym.robot.slip`.
+
+Three kinds of error are kept apart. Random ones: of frames, IMU and legs, of which the smoother knows the joint covariance of
+all slips, and of the offset of the clocks; so heading errors that turn the way driven sideways, and tilts that move the
+contacts, are in it. That of the wheels' radius (``tolerances`` of the robot file), and that of the layout of the markers on the
+body (its scale and heading): both grow with the distance driven and dominate long drives.
+
+What gyroscope and accelerometer contradict is no motion of the body. Turns are compared as angles. Of each axis the gyroscope's
+constant, drift and scale (to 10 %) are left open; of pitch and roll also how the IMU is turned on the body (which shows along
+the yaw) and how the floor markers' plane is tilted (along its cosine and sine). Of the accelerometer, starts and stops tell
+which of its axes is which.
 """
 
 from __future__ import annotations
@@ -195,14 +204,7 @@ def _rest(values: Array, known: Array) -> Array:
     return values - known @ (np.linalg.lstsq(known / size, values, rcond=1e-6)[0] / size)
 
 
-# --- slip of every wheel and of the body from the camera's poses and the encoders, with uncertainty -------------------
-# Poses (with IMU and legs, :mod:`wlr_gym.perception.vision.motion`) and joint angles are smoothed onto the run's rows; their
-# rates give each wheel's slip velocity by :mod:`wlr_gym.robot.slip`.
-#
-# Three kinds of error are kept apart. Random ones: of frames, IMU and legs, of which the smoother knows the joint covariance of
-# all slips, and of the offset of the clocks; so heading errors that turn the way driven sideways, and tilts that move the
-# contacts, are in it. That of the wheels' radius (``tolerances`` of the robot file), and that of the layout of the markers on the
-# body (its scale and heading): both grow with the distance driven and dominate long drives.
+# --- slip ---------------------------------------------------------------------------------------------------------------
 
 
 #: s; rows further than this from a frame with a pose are flagged.

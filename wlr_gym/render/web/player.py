@@ -1,5 +1,10 @@
-"""What stands on the page: a robot with its arrows, a ghost of it, and the floor with its friction."""
+"""Pages: a plant while it runs, in real time, with the keys that drive it; and recordings, with a time axis and a ghost.
 
+Both have robots with their arrows, the floor with its friction, what is to be said, and plots of any channel.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
 from __future__ import annotations
 
 import threading
@@ -20,29 +25,13 @@ from wlr_gym.render.stage import SQUARE, Stage
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP
 from wlr_gym.render.view import CAMERAS, Colour, View, friction_colour, up_direction
 from wlr_gym.render.viewer import KeyCallback, Pace
-from wlr_gym.render.web.page import (
-    HOST,
-    PORT,
-    TEXTS,
-    UPDATES,
-    Curve,
-    Plots,
-    ViewControls,
-    close_server,
-    eye,
-    floor_pose,
-    html_lines,
-    open_server,
-    plot_panel,
-)
+from wlr_gym.render.web import page
+from wlr_gym.render.web.page import HOST, PORT, Curve
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     import viser
-
-# pyright: reportAttributeAccessIssue=false
-# (MuJoCo fills its namespace when it is imported.)
 
 
 #: The node that everything stands on; it moves, so that the robot stays where eyes look at.
@@ -144,7 +133,7 @@ class PageFloor:
     def show(self, stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> None:
         """Draw the floor around the robot that is posed in ``stage``, and move it so that ``view``'s camera sees the robot."""
         up = up_direction(parameters["ground.slope"][row])
-        self._frame.wxyz, self._frame.position = floor_pose(truth.position[row], stage.yaw(), up, CAMERAS[view.camera])
+        self._frame.wxyz, self._frame.position = page.floor_pose(truth.position[row], stage.yaw(), up, CAMERAS[view.camera])
         scene = self._server.scene
         if (colour := marks.floor_colour(parameters, row)) != self._colour:
             scene.add_grid(
@@ -251,7 +240,7 @@ def _mesh_of(model: Any, geom: int) -> Any:
     return mesh.apply_transform(place)
 
 
-# --- pages: a plant while it runs, in real time, with the keys that drive it; and recordings, with a time axis and a gh
+# --- pages -------------------------------------------------------------------------------------------------------------
 # Both have the robot and its floor, what is to be said, and plots of any channel.
 
 
@@ -270,8 +259,8 @@ class _Page:
 
     def __init__(self, label: str, view: View, host: str, port: int) -> None:
         self.view = view
-        self.server, self.address = open_server(host, port, label)
-        position, look_at = eye(CAMERAS[view.camera])
+        self.server, self.address = page.open_server(host, port, label)
+        position, look_at = page.eye(CAMERAS[view.camera])
         self.server.initial_camera.position = tuple(position)
         self.server.initial_camera.look_at = tuple(look_at)
         self._ground = PageFloor(self.server)
@@ -285,13 +274,13 @@ class _Page:
 
     def _texts_are_due(self) -> bool:
         now = clock.monotonic()
-        due = now >= self._told + 1.0 / TEXTS
+        due = now >= self._told + 1.0 / page.TEXTS
         self._told = now if due else self._told
         return due
 
     def close(self) -> None:
         """End the page."""
-        close_server(self.server)
+        page.close_server(self.server)
 
 
 # ---- a plant while it runs -------------------------------------------------------------------------------------------
@@ -350,9 +339,9 @@ class WebViewer(_Page):
         self._text: Any = self.server.gui.add_html("")
         if on_key is not None:
             self._add_keys(on_key)
-        self._look = ViewControls(self.server, self.view)
+        self._look = page.ViewControls(self.server, self.view)
         self._past: deque[tuple[float, NDArray[np.float64]]] = deque()  # time and truth
-        self._plots = Plots(self.server, plot_panel(self.server), _TITLES, _FIRST)
+        self._plots = page.Plots(self.server, page.plot_panel(self.server), _TITLES, _FIRST)
         print("\n".join(self.address.lines()), flush=True)
 
     def show(
@@ -377,7 +366,7 @@ class WebViewer(_Page):
             self._show(self._figure, truth, parameters, row, view, view)
         if self._texts_are_due():
             lines = describe(truth, parameters, row, time, command, title, slip=view.slip)
-            self._text.content = html_lines([*lines, *legend(parameters, row, view)])
+            self._text.content = page.html_lines([*lines, *legend(parameters, row, view)])
             if len(self._past) > 1:
                 curves = {name: self.curves(name) for name in self._plots.chosen if name in _TITLES}
                 begin, now = self._past[0][0], self._past[-1][0]
@@ -539,7 +528,7 @@ class Player(_Page):
                 self.advance(now - last)
                 last = now
                 self.update()
-                pace.wait(1.0 / UPDATES)
+                pace.wait(1.0 / page.UPDATES)
         finally:
             self.close()
 
@@ -576,7 +565,7 @@ class Player(_Page):
                 self._ghost.point(arrows_of(stage, ghost.truth, ghost.parameters, 0, arrows))
         if texts:
             lines = describe(moment.truth, moment.parameters, 0, time, None, recording.name, slip=moment.slip)
-            self._text.content = html_lines([*lines, *recording.lines(time), *legend(moment.parameters, 0, view)])
+            self._text.content = page.html_lines([*lines, *recording.lines(time), *legend(moment.parameters, 0, view)])
 
     def _plot(self, time: float) -> None:
         width, length, now = WINDOWS[str(self._window.value)], self.recording.length, clock.monotonic()
@@ -601,11 +590,11 @@ class Player(_Page):
         self._slider: Any = gui.add_slider("time (s)", 0.0, max(round(self.recording.length, 2), 0.01), 0.01, 0.0)
         self._speed: Any = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._show_ghost: Any = gui.add_checkbox("ghost: replayed", True)
-        self._look = ViewControls(self.server, self.view)
-        place = plot_panel(self.server)
+        self._look = page.ViewControls(self.server, self.view)
+        place = page.plot_panel(self.server)
         with place:
             self._window: Any = gui.add_dropdown("shown", tuple(WINDOWS), initial_value="20 s")
-        self._plots = Plots(self.server, place, self.recording.titles, first)
+        self._plots = page.Plots(self.server, place, self.recording.titles, first)
         self._button.on_click(lambda _: self._turn())
         gui.add_command("play or pause", hotkey="space").on_trigger(lambda _: self._turn())
         gui.add_command("1 s back", hotkey="J").on_trigger(lambda _: self.seek(self._time - 1.0))
