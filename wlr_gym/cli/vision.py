@@ -26,7 +26,7 @@ from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import JsonOption, OutOption, RunsRobotOption, Seconds, settings_of
 from wlr_gym.cli.terminal import print_json, print_table
-from wlr_gym.perception.markers.targets import Target
+from wlr_gym.perception.markers.targets import Target, load_target
 
 if TYPE_CHECKING:
     from wlr_gym.data import Run
@@ -90,12 +90,14 @@ def run(options: VisionOptions) -> int:
 
     from wlr_gym.data import read_run
     from wlr_gym.perception.markers.camera import load_camera
-    from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.analysis import save_video_analysis
+    from wlr_gym.perception.vision.video import film
 
     if Path(options.video).is_dir() and options.rate is None and options.times is None:
         raise InputError(f"{options.video}: images do not say when they were taken: give --rate (Hz) or --times")
     live = options.video.isdigit() and not Path(options.video).exists()
+    if live and (options.times is not None or options.rate is not None):
+        raise InputError("--times, --rate: a live camera's frames have the times at which they come")
     measured = None if live else read_run(options.run)
     camera, body, floor = load_camera(options.camera), load_target(options.markers), load_target(options.floor)
     if options.out.resolve() == options.run.resolve().parent:
@@ -106,11 +108,16 @@ def run(options: VisionOptions) -> int:
     console = Console(highlight=False, soft_wrap=True)
     try:
         if live:
-            options = _filmed(options, camera, console)
-            fresh = False  # the film stays, whatever comes
+            end = "Ctrl-C ends it" if options.seconds is None else f"{options.seconds:g} s"
+            console.print(f"filming with camera {options.video}; {end}")
+            video, times = film(int(options.video), options.out, camera, options.seconds)
+            console.print(
+                f"filmed: {video}; to analyse it again, give it in place of the camera's number, with --times {times}"
+            )
+            options = replace(options, video=str(video), times=times)
         analysis = _analyse(options, measured or read_run(options.run), camera, body, floor, console)
     except BaseException:
-        if fresh and not (options.out / "film.avi").exists():  # a refusal leaves no folder behind
+        if fresh and not (options.out / "film.avi").exists():  # a refusal leaves no folder behind; a film stays
             shutil.rmtree(options.out, ignore_errors=True)
         raise
     paths = save_video_analysis(analysis, options.out)
@@ -123,39 +130,26 @@ def run(options: VisionOptions) -> int:
     return OK
 
 
-def _filmed(options: VisionOptions, camera: Camera, console: Console) -> VisionOptions:
-    """Film, and say how to analyse the film (again); returns the options for that."""
-    from wlr_gym.perception.vision.video import film
-
-    if options.times is not None or options.rate is not None:
-        raise InputError("--times, --rate: a live camera's frames have the times at which they come")
-    end = "Ctrl-C ends it" if options.seconds is None else f"{options.seconds:g} s"
-    console.print(f"filming with camera {options.video}; {end}")
-    video, times = film(int(options.video), options.out, camera, options.seconds)
-    console.print(f"filmed: {video}; to analyse it again, give it in place of the camera's number, with --times {times}")
-    return replace(options, video=str(video), times=times)
-
-
 def _analyse(
     options: VisionOptions, measured: Run, camera: Camera, body: Target, floor: Target, console: Console
 ) -> VideoAnalysis:
-
+    """Analyse, tell how far it is, and write ``annotated.mp4`` on the way."""
     from wlr_gym.perception.vision.analysis import analyse
     from wlr_gym.perception.vision.video import AnnotatedVideo, Frames
 
-    began: float | None = None
     frames = Frames(options.video, options.rate, options.times, options.seconds)
     writer = AnnotatedVideo(options.out / "annotated.mp4", body) if options.annotate else nullcontext()
     length = min(float(np.ptp(measured["t"])), options.seconds or math.inf)  # a film is about as long as its run
+    began: list[float] = []
     with writer as video, progress(console) as tell:
 
         def watch(frame: VideoFrame, sample: Sample) -> None:
-            nonlocal began
-            began = frame.time if began is None else began
+            began[:] = began or [frame.time]
             if video is not None:
                 video.add(frame, sample)
             if frame.index % 30 == 0:
-                tell("", f"tracking: frame {frame.index}, {sample.status}", min((frame.time - began) / length, 0.99))
+                share = min((frame.time - began[0]) / length, 0.99)
+                tell("", f"tracking: frame {frame.index}, {sample.status}", share)
 
         return analyse(
             frames, measured, camera, body, floor, options.robot, options.offset, options.origin, watch, options.around
@@ -169,14 +163,12 @@ def _print(analysis: VideoAnalysis, console: Console) -> None:
     status = ", ".join(f"{count} {name}" for name, count in found["status"].items() if count)
     known = f" ± {1e3 * found['offset_std_s']:.1f}" if found["offset_std_s"] else " (given)"
     console.print(f"{found['frames']} frames ({status}); clocks differ by {1e3 * found['offset_s']:.1f}{known} ms")
-    rows = [
-        (
-            wheel, f"{1e3 * w['longitudinal_slip_m']:+.2f} ± {1e3 * w['longitudinal_std_m']:.2f}",
-            f"{1e3 * w['longitudinal_std_from_radius_m']:.2f}",
-            f"{1e3 * w['lateral_slip_m']:+.2f} ± {1e3 * w['lateral_std_m']:.2f}",
-            ", ".join(f"{1e3 * w[f'{axis}_std_from_layout_m']:.2f}" for axis in ("longitudinal", "lateral")),
-        ) for wheel, w in found["wheels"].items()
-    ]  # fmt: skip
+    rows = []
+    for wheel, in_m in found["wheels"].items():
+        w = {name: 1e3 * value for name, value in in_m.items()}
+        along, across = (f"{w[f'{axis}_slip_m']:+.2f} ± {w[f'{axis}_std_m']:.2f}" for axis in ("longitudinal", "lateral"))
+        layout = f"{w['longitudinal_std_from_layout_m']:.2f}, {w['lateral_std_from_layout_m']:.2f}"
+        rows.append((wheel, along, f"{w['longitudinal_std_from_radius_m']:.2f}", across, layout))
     longitudinal, lateral = (f"{1e3 * found[f'body_{axis}_slip_m']:+.2f}" for axis in ("longitudinal", "lateral"))
     headings = ("wheel", "longitudinal", "± from radius", "lateral", "± from layout")
     title = f"Slip over {found['seconds']:.1f} s, mm ± 1 sigma"
@@ -196,7 +188,6 @@ def check_photo(options: VisionCheckOptions) -> int:
     require_package("cv2", "vision")
 
     from wlr_gym.perception.markers.camera import load_camera
-    from wlr_gym.perception.markers.targets import load_target
     from wlr_gym.perception.vision.sheets import check_sheets
     from wlr_gym.perception.vision.video import read_image
 
@@ -207,18 +198,19 @@ def check_photo(options: VisionCheckOptions) -> int:
     if image is None:
         raise InputError(f"{options.photo}: no such picture, or it cannot be read as one")
     checks = check_sheets(image, camera, targets)
-    if options.json:
-        print_json([_content(check) for check in checks])
+    if options.json:  # m, shares
+        names = ("seen", "fault", "stretch", "stretch_std", "difference_std", "misfit", "warnings")
+        print_json(
+            [
+                {"target": check.target.name, "markers": len(check.target.markers)}
+                | {name: getattr(check, name) for name in names}
+                for check in checks
+            ]
+        )
     for check in checks:
         print(_line(check))
         print("".join(f"  {warning}\n" for warning in check.warnings), end="")
     return FAILED if any(check.warnings for check in checks) else OK
-
-
-def _content(check: SheetCheck) -> dict[str, object]:
-    """Return a check as JSON has it: m, shares."""
-    names = ("seen", "fault", "stretch", "stretch_std", "difference_std", "misfit", "warnings")
-    return {"target": check.target.name, "markers": len(check.target.markers), **{name: getattr(check, name) for name in names}}
 
 
 def _line(check: SheetCheck) -> str:

@@ -33,13 +33,11 @@ GREY = 80.0
 PLATE = (0.40, 0.29)
 #: Half the side of a sheet with a floor marker, in outer radii of the marker.
 _SHEET = 1.6
-# Outline of a facet.
-_RECTANGLE = 0.0
-_DISC = 1.0
-#: Rays a side in every pixel.
-_FEW = 3
-#: Grey levels by which they may differ in a pixel without an edge.
-_FLAT = 8.0
+#: Rays a side in every pixel; grey levels by which they may differ in a pixel without an edge.
+_FEW, _FLAT = 3, 8.0
+#: Facets as the kernels take them: geometry (instants, facets, 12), per facet its kind (9) and its box in the image (4),
+#: circles, tags and the cells of all tags.
+_Packed = tuple[Array, Array, NDArray[np.int64], Array, Array, NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -177,12 +175,10 @@ class Renderer:
     def __init__(self, camera: Camera, floor_in_camera: ScenePose, still: Sequence[Facet], samples: int = 12) -> None:
         self.camera, self.floor_in_camera, self.still, self.samples = camera, floor_in_camera, tuple(still), samples
         self._rays = _rays(camera)
-        whole = np.array([0, 0, camera.width, camera.height])
         self._background = np.zeros((camera.height, camera.width), np.float32)
-        if not self.still:
-            return
-        packed = self._pack([self.still])
-        _cast(self._rays, *packed, whole, samples, 0, self._background)
+        if self.still:
+            whole = np.array([0, 0, camera.width, camera.height])
+            _cast(self._rays, self._pack([self.still]), whole, samples, 0, self._background)
 
     def frame(self, moving: Sequence[Sequence[Facet]], look: Look, seed: int) -> Image:
         """Render one frame.
@@ -195,12 +191,10 @@ class Renderer:
         if moving and moving[0]:
             packed = self._pack([[*self.still, *instant] for instant in moving])
             box = self._box([p for instant in moving for p in instant])
-            _cast(self._rays, *packed, box, self.samples, len(self.still), image)
+            _cast(self._rays, packed, box, self.samples, len(self.still), image)
         return develop(image, look, seed)
 
-    def _pack(
-        self, instants: Sequence[Sequence[Facet]]
-    ) -> tuple[Array, Array, NDArray[np.int64], Array, Array, NDArray[np.uint8]]:
+    def _pack(self, instants: Sequence[Sequence[Facet]]) -> _Packed:
         turn, shift = self.floor_in_camera.rotation, self.floor_in_camera.position
         seen = [[facet.moved(shift, turn) for facet in instant] for instant in instants]
         geometry = np.array([[np.concatenate([p.centre, p.axes.ravel(), np.cross(*p.axes)]) for p in i] for i in seen])
@@ -212,20 +206,16 @@ class Renderer:
                 tags.append((x, y, side, len(bits), offset))
                 cells.append(np.asarray(bits, np.uint8).ravel())
                 offset += bits.size
-            disc = _DISC if facet.disc else _RECTANGLE
-            kinds.append((*facet.half, facet.shade, disc, first[0], len(circles), first[1], len(tags), facet.texture))
-        bits = np.concatenate(cells) if cells else np.zeros(0, np.uint8)
+            kinds.append((*facet.half, facet.shade, facet.disc, first[0], len(circles), first[1], len(tags), facet.texture))
         boxes = np.array([self._box(same) for same in zip(*instants, strict=True)])
         rings, signs = (np.array(rows, float).reshape(-1, 5) for rows in (circles, tags))
-        return geometry, np.array(kinds, float), boxes, rings, signs, bits
+        return geometry, np.array(kinds, float), boxes, rings, signs, np.concatenate([np.zeros(0, np.uint8), *cells])
 
     def _box(self, facets: Sequence[Facet]) -> NDArray[np.int64]:
         """Pixels (x0, y0, x1, y1) that show the facets, with a margin."""
-        corners = []
-        for facet in facets:
-            for s, t in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-                corners.append(facet.centre + s * facet.half[0] * facet.axes[0] + t * facet.half[1] * facet.axes[1])
-        points = np.array(corners) @ self.floor_in_camera.rotation.T + self.floor_in_camera.position
+        signs = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+        corners = np.concatenate([facet.centre + signs * facet.half @ facet.axes for facet in facets])
+        points = corners @ self.floor_in_camera.rotation.T + self.floor_in_camera.position
         limit = [self.camera.width, self.camera.height]
         if (points[:, 2] < 0.05).any() or np.abs(points).max() > 20:
             return np.array([0, 0, *limit])
@@ -305,7 +295,9 @@ def _uneven(x: float, y: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _shade(kind: Any, circles: Any, tags: Any, cells: Any, x: float, y: float) -> float:
+def _shade(packed: Any, facet: int, x: float, y: float) -> float:
+    _, kinds, _, circles, tags, cells = packed
+    kind = kinds[facet]
     shade = kind[2]
     if kind[8] > 0.0:
         shade *= 1.0 + kind[8] * _uneven(x, y)
@@ -323,23 +315,12 @@ def _shade(kind: Any, circles: Any, tags: Any, cells: Any, x: float, y: float) -
 
 
 @njit(cache=True, nogil=True)
-def _cast(
-    rays: Any,
-    geometry: Any,
-    kinds: Any,
-    boxes: Any,
-    circles: Any,
-    tags: Any,
-    cells: Any,
-    box: Any,
-    samples: Any,
-    first: Any,
-    image: Any,
-) -> None:
-    """Render the pixels of ``box`` that may show facet ``first`` or a later one; ``geometry`` is (instants, facets, 12).
+def _cast(rays: Any, packed: Any, box: Any, samples: int, first: int, image: Any) -> None:
+    """Render the pixels of ``box`` that may show facet ``first`` or a later one.
 
     A few rays per pixel first; where they differ there is an edge, and samples x samples rays say where.
     """
+    geometry, boxes = packed[0], packed[2]
     facets = geometry.shape[1]
     near, corners = np.empty(facets, np.int64), np.empty((4, 2))
     for v in range(box[1], box[3]):
@@ -353,17 +334,16 @@ def _cast(
                 continue
             corners[0], corners[1] = rays[v, u], rays[v, u + 1]
             corners[2], corners[3] = rays[v + 1, u], rays[v + 1, u + 1]
-            mean, spread = _pixel(corners, geometry, kinds, circles, tags, cells, near[:count], _FEW, u + 2 * v)
+            mean, spread = _pixel(corners, packed, near[:count], _FEW, u + 2 * v)
             if spread > _FLAT:
-                mean, _ = _pixel(corners, geometry, kinds, circles, tags, cells, near[:count], samples, u + 2 * v)
+                mean, _ = _pixel(corners, packed, near[:count], samples, u + 2 * v)
             image[v, u] = mean
 
 
 @njit(cache=True, nogil=True)
-def _pixel(
-    corners: Any, geometry: Any, kinds: Any, circles: Any, tags: Any, cells: Any, near: Any, samples: Any, turn: Any
-) -> tuple[float, float]:
+def _pixel(corners: Any, packed: Any, near: Any, samples: int, turn: int) -> tuple[float, float]:
     """Mean and range of the brightness over a pixel; its rays take turns through the instants of the exposure."""
+    geometry, kinds = packed[0], packed[1]
     instants = geometry.shape[0]
     total, darkest, brightest = 0.0, math.inf, -math.inf
     for s in range(samples):
@@ -384,14 +364,14 @@ def _pixel(
                     continue
                 dx, dy, dz = depth * x - g[0], depth * y - g[1], depth - g[2]
                 px, py = g[3] * dx + g[4] * dy + g[5] * dz, g[6] * dx + g[7] * dy + g[8] * dz
-                if kinds[p, 3] == _DISC:
+                if kinds[p, 3] > 0.0:  # a disc
                     inside = px * px + py * py < kinds[p, 0] * kinds[p, 0]
                 else:
                     inside = abs(px) < kinds[p, 0] and abs(py) < kinds[p, 1]
                 if inside:
                     nearest, hit, hx, hy = depth, p, px, py
             if hit >= 0:
-                shade = _shade(kinds[hit], circles, tags, cells, hx, hy)
+                shade = _shade(packed, hit, hx, hy)
             total += shade
             darkest, brightest = min(darkest, shade), max(brightest, shade)
     return total / (samples * samples), brightest - darkest

@@ -43,8 +43,6 @@ _ROLLS = 20.0  # a wheel that rolls explains the distance this many times better
 _DISTINCT = 0.1  # s; a second minimum this far off
 #: rad rms; a turn seen by the camera that the gyroscope must explain.
 _TURN = 0.02
-#: Slow motion and time lapse that are looked for where nothing fits: how many times as fast as the film the clock ran.
-_PACES = (2.0, 4.0, 8.0, 16.0, 32.0, 0.5, 0.25)
 #: The part of it that stays unexplained is at most one over this.
 _SAME_TURN = 10.0
 
@@ -101,23 +99,10 @@ def align(time: Array, poses: Array, run: Run, robot: Robot, parameters: Paramet
 
     Raises:
         InputError: too few poses in common, no motion that fixes the offset to :data:`LARGEST_STD`, or turns that camera and
-            gyroscope saw differently at every offset tried; slow motion is named.
+            gyroscope saw differently at every offset tried.
     """
     known = np.isfinite(poses).all(axis=1)
     time, poses = time[known], poses[known]
-    try:
-        return _aligned(time, poses, run, robot, parameters, around)
-    except InputError as error:
-        if (pace := _pace(time, poses, run, robot, parameters, around)) is None:
-            raise
-        rate = pace / float(np.median(np.diff(time)))
-        raise InputError(
-            f"{run.path}: camera and gyroscope see the same turns if the video's times run {pace:g} times as fast: slow "
-            f"motion, or sped up? Give the rate at which it was filmed: --rate {rate:.6g}"
-        ) from error
-
-
-def _aligned(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> Alignment:
     for spare in (SEARCH, 0.0):  # frames that lie in the run at every offset, or at the middle one
         inside = (time + around - spare > run["t"][0]) & (time + around + spare < run["t"][-1])
         if inside.sum() >= 30:
@@ -136,7 +121,8 @@ def _aligned(time: Array, poses: Array, run: Run, robot: Robot, parameters: Para
         if pair.name == "yaw" and _contradicts(project(pair.seen), curve):
             raise InputError(
                 f"{run.path}: camera and gyroscope do not see the same turns with clocks {grid[0]:+.1f} to {grid[-1]:+.1f} s "
-                "apart; does the video belong to the run? If the clocks differ by more, give --around"
+                "apart; does the video belong to the run? If the clocks differ by more, give --around; if it is slow motion or "
+                "a time lapse, the rate at which it was filmed (--rate)"
             )
         found = _weighted(pair, curve, time, grid, project)
         if found is not None and found[2] < 5 * LARGEST_STD:
@@ -162,30 +148,10 @@ def _aligned(time: Array, poses: Array, run: Run, robot: Robot, parameters: Para
     return Alignment(offset, math.hypot(std, _LATENCY), {name: part[1:] for name, part in useful.items()})
 
 
-def _pace(time: Array, poses: Array, run: Run, robot: Robot, parameters: Parameters, around: float) -> float | None:
-    """How many times as fast as the film the camera's clock ran, if that explains its turns; None = it does not."""
-    grid = around + np.arange(-SEARCH, SEARCH + 1e-9, 4 * _GRID)
-    for pace in _PACES:
-        moments = time[0] + (time - time[0]) / pace
-        inside = (moments + around > run["t"][0]) & (moments + around < run["t"][-1])
-        if inside.sum() < 30:
-            continue
-        moments = moments[inside]
-        for pair in _pairs(moments, poses[inside], run, robot, parameters, around):
-            project = without_slow(moments, pair.slowest)
-            seen = project(pair.seen)
-            if pair.name == "yaw" and _is_turn(seen) and not _contradicts(seen, pair.costs(moments, grid, project)):
-                return pace
-    return None
-
-
-def _is_turn(seen: Array) -> bool:
-    return float(seen @ seen) > _TURN**2 * len(seen)
-
-
 def _contradicts(seen: Array, curve: Array) -> bool:
     """Whether a plain turn (rad) is explained at no offset, or best at the edge of the search."""
-    return _is_turn(seen) and (curve.min() > seen @ seen / _SAME_TURN**2 or int(np.argmin(curve)) in (0, len(curve) - 1))
+    plain = float(seen @ seen) > _TURN**2 * len(seen)
+    return plain and (curve.min() > seen @ seen / _SAME_TURN**2 or int(np.argmin(curve)) in (0, len(curve) - 1))
 
 
 def _weighted(
