@@ -29,10 +29,8 @@ BLACK = 25.0
 FLOOR = 130.0
 DARK = 45.0
 GREY = 80.0
-#: m; size of the sheet with the robot's markers.
-PLATE = (0.40, 0.29)
-#: Half the side of a sheet with a floor marker, in outer radii of the marker.
-_SHEET = 1.6
+PLATE = (0.40, 0.29)  # m; size of the sheet with the robot's markers
+_SHEET = 1.6  # half the side of a sheet with a floor marker, in outer radii of the marker
 #: Rays a side in every pixel; grey levels by which they may differ in a pixel without an edge.
 _FEW, _FLAT = 3, 8.0
 #: Facets as the kernels take them: geometry (instants, facets, 12), per facet its kind (9) and its box in the image (4),

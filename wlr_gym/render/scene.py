@@ -132,10 +132,8 @@ def _open_context(width: int, height: int) -> Any:
 
 Picture = NDArray[np.uint8]
 
-#: Areas, pads and arrows a scene has room for.
-MAX_MARKS = 400
-#: Degrees; a smaller slope is not written.
-LEAST_SLOPE = 0.5
+MAX_MARKS = 400  # areas, pads and arrows a scene has room for
+LEAST_SLOPE = 0.5  # degrees; a smaller slope is not written
 
 
 class Scene:
@@ -307,12 +305,9 @@ def describe(
 # Colours (red, green, blue, opacity), 0 to 255.
 PAPER = (255, 255, 255, 205)
 INK = (25, 28, 32, 255)
-#: Pixels; width of the friction bar.
-BAR = 120
-#: Friction coefficients at its ends.
-BAR_RANGE = (0.0, 1.0)
-#: Pixels.
-MARGIN = 8
+BAR = 120  # pixels; width of the friction bar
+BAR_RANGE = (0.0, 1.0)  # friction coefficients at its ends
+MARGIN = 8  # pixels
 
 
 #: A short text, and its place in the picture (column, row).
@@ -381,8 +376,7 @@ def banner(width: int, text: str, height: int) -> Picture:
 # ---- the portrait ----------------------------------------------------------------------------------------------------
 
 
-#: Pixels; of one of the four views.
-SIZE = (640, 480)
+SIZE = (640, 480)  # pixels; of one of the four views
 
 
 def draw_portrait(path: Path, robot: Robot) -> None:

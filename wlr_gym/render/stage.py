@@ -32,8 +32,7 @@ SHAPING = ("hip.position", "leg.length", "wheel.radius", "payload.mass", "payloa
 _SHAPES = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_rbound", "geom_aabb", "geom_rgba", "qpos0")
 PAYLOAD_DENSITY = 2500.0  # kg/m3, for its size only
 SPOKES = 3
-#: m; width of the floor's squares.
-SQUARE = 0.2
+SQUARE = 0.2  # m; width of the floor's squares
 # Colours (red, green, blue, opacity), 0 to 1.
 METAL = (0.72, 0.74, 0.78, 1.0)
 DARK = (0.16, 0.17, 0.19, 1.0)
@@ -119,8 +118,7 @@ def floor_colour(parameters: Parameters, row: int) -> Colour:
 # --- dressing ---------------------------------------------------------------------------------------------------------
 
 
-#: Turns a cylinder, whose own axis is z, to y.
-_AXLE = [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]
+_AXLE = [np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0]  # turns a cylinder, whose own axis is z, to y
 
 
 def _light_and_floor(spec: mujoco.MjSpec, size: tuple[int, int]) -> None:
@@ -196,34 +194,24 @@ def _geom(body: mujoco.MjsBody, kind: str, **properties: Any) -> None:
 # ---- what is drawn besides the robot: areas of other friction, paths, slip and force arrows ---------------------------
 
 
-#: m of arrow per m/s of slip.
-SLIP_SCALE = 2.0
-#: m/s; less slip is not drawn.
-SLIP_FLOOR = 0.003
-#: m of arrow per N of friction.
-FORCE_SCALE = 0.025
-#: N; less friction is not drawn.
-FORCE_FLOOR = 0.2
-#: m.
-LONGEST_ARROW = 0.4
-#: m; half the width of an arrow.
-SHAFT = 0.006
+SLIP_SCALE = 2.0  # m of arrow per m/s of slip
+SLIP_FLOOR = 0.003  # m/s; less slip is not drawn
+FORCE_SCALE = 0.025  # m of arrow per N of friction
+FORCE_FLOOR = 0.2  # N; less friction is not drawn
+LONGEST_ARROW = 0.4  # m
+SHAFT = 0.006  # m; half the width of an arrow
 #: m; slip arrows start this far outside the wheel's middle plane, beside the tyre, where they can be seen.
 SLIP_BESIDE = 0.022
-#: m; force arrows start outside of them.
-FORCE_BESIDE = 0.040
-#: m; areas are drawn on the floor this far around the robot.
-REACH = 15.0
+FORCE_BESIDE = 0.040  # m; force arrows start outside of them
+REACH = 15.0  # m; areas are drawn on the floor this far around the robot
 LAYER = 4e-4
 #: m; the floor's squares are drawn this far around the robot, and this high: over areas and pads.
 SQUARES_REACH = 40.0
 SQUARES_HEIGHT = 6 * LAYER
 #: Away from the body along the axle (left): corners are lf, rf, lr, rr.
 OUTWARDS = np.array([[1.0], [-1.0], [1.0], [-1.0]])
-#: m; half the width of a trail.
-LINE = 0.004
-#: m; length of its pieces.
-PIECE = 0.03
+LINE = 0.004  # m; half the width of a trail
+PIECE = 0.03  # m; length of its pieces
 
 
 @dataclass(frozen=True)

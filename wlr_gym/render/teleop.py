@@ -16,8 +16,7 @@ DOWN = 264
 LEFT = 263
 RIGHT = 262
 SPACE = 32
-#: R.
-RESET = 82
+RESET = 82  # R
 #: A tap changes a command by this share of its range on the named side, of the other where it has none there.
 TAP = 0.1
 #: What the arrow keys and sticks steer: command -> (more, less).

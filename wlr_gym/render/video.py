@@ -16,8 +16,7 @@ from wlr_gym.base.files import replace_file, require_ending
 
 Picture = NDArray[np.uint8]
 
-#: Pictures per second unless asked otherwise.
-FPS = 25.0
+FPS = 25.0  # pictures per second unless asked otherwise
 
 
 def check_video(path: Path, option: str = "--video") -> None:

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 
     from wlr_gym.robot import Robot
 
-#: Pixels; smallest width and height.
-SMALLEST = 64
-#: Pixels; largest width and height.
-LARGEST = 4096
+SMALLEST = 64  # pixels; smallest width and height
+LARGEST = 4096  # pixels; largest width and height
 
 
 @dataclass(frozen=True)
@@ -192,12 +190,10 @@ Colour = tuple[float, float, float]
 FRICTION = ((0.0, (0.22, 0.54, 0.74)), (0.3, (0.62, 0.82, 0.90)), (0.6, (0.80, 0.80, 0.78)), (1.0, (0.72, 0.50, 0.30)))
 #: Slip speed (m/s) -> colour of its arrow.
 SLIP = ((0.0, (1.0, 0.85, 0.10)), (0.05, (1.0, 0.55, 0.05)), (0.2, (0.90, 0.08, 0.08)))
-#: Arrows of friction and of normal force on a wheel.
-FORCE: Colour = (0.10, 0.45, 0.15)
-LOAD: Colour = (0.45, 0.62, 0.45)
-#: Paths over the floor: as commanded, and as driven.
-WANTED: Colour = (0.10, 0.10, 0.12)
-DRIVEN: Colour = (0.95, 0.10, 0.55)
+FORCE: Colour = (0.10, 0.45, 0.15)  # arrows of friction on a wheel
+LOAD: Colour = (0.45, 0.62, 0.45)  # of normal force
+WANTED: Colour = (0.10, 0.10, 0.12)  # paths over the floor: as commanded
+DRIVEN: Colour = (0.95, 0.10, 0.55)  # and as driven
 
 
 def friction_colour(mu: float) -> Colour:

@@ -23,8 +23,7 @@ Array = NDArray[np.float64]
 #: Kinds of boards: with coded markers; the same as OpenCV drew them before 4.6 (differs with an even number of rows); plain.
 CHARUCO, LEGACY, CHESSBOARD = "charuco", "charuco-legacy", "chessboard"
 KINDS = (CHARUCO, LEGACY, CHESSBOARD)
-#: Corners that a view needs, and that a board must have.
-MINIMUM_CORNERS, FEWEST_CORNERS = 12, 6
+MINIMUM_CORNERS, FEWEST_CORNERS = 12, 6  # corners that a view needs, and that a board must have
 #: A chessboard is looked for in a picture of at most so many pixels along its longer side, then refined in the whole one.
 _CHESS_SIDE = 1280
 
@@ -238,8 +237,7 @@ MINIMUM_VIEWS = 6
 _OUTLYING_VIEW = 3.0
 #: rad rms, of the board's tilts about their mean. Parallel views do not tell the focal length, nor does its sigma tell that.
 _LEAST_TILT = math.radians(8)
-#: s; a readout less certain than this is not followed.
-_LOOSEST_STD = 0.005
+_LOOSEST_STD = 0.005  # s; a readout less certain than this is not followed
 #: Lens and shutter are found in turns, at most so many, until the readout stays (s).
 _TURNS, _SAME_READOUT = 8, 2e-5
 

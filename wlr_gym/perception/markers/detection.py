@@ -31,12 +31,9 @@ from wlr_gym.perception.markers.targets import CODE_NAMES, ring_radii
 RAYS = 64
 RINGS = 3
 # Columns of the quality row.
-#: Least contrast of the used edges, grey levels.
-CONTRAST = 0
-#: Rms of the edges about the ellipses, px.
-RESIDUAL = 1
-#: Share of the edge points that are used.
-SHARE = 2
+CONTRAST = 0  # least contrast of the used edges, grey levels
+RESIDUAL = 1  # rms of the edges about the ellipses, px
+SHARE = 2  # share of the edge points that are used
 #: Worst error of a circle's radius over the outer radius (blur moves edges of narrow rings).
 RADIUS_ERROR = 3
 
@@ -360,8 +357,7 @@ Image = NDArray[np.uint8]
 SMALLEST_RADIUS = 5.0  # px, of a marker's outer circle
 #: Shrinking of the image and block (px) of the adaptive threshold: large markers, usual ones, ones beside a shadow's edge.
 _PASSES = ((1, 51), (2, 51), (1, 21))
-#: Grey levels below the mean of the block from which on a pixel is dark.
-_OFFSET = 6
+_OFFSET = 6  # grey levels below the mean of the block from which on a pixel is dark
 _LARGEST_AXIS_RATIO = 4.0
 _ELLIPSE_TOLERANCE = 0.15  # of the area
 _LEAST_MATCH = 0.78  # correlation of a brightness profile with a code

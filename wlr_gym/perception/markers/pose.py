@@ -29,12 +29,9 @@ from wlr_gym.perception.markers.targets import CODE_NAMES, Target, ring_radii
 
 Array = NDArray[np.float64]
 
-#: At least this many markers make a pose; a target found anew needs four.
-MINIMUM_MARKERS = 3
-#: px; a pose whose circle centres miss by more (rms) is none.
-LARGEST_RESIDUAL = 1.5
-#: m; markers that were laid and measured by hand may be off by this much.
-FLOOR_TOLERANCE = 0.01
+MINIMUM_MARKERS = 3  # at least this many markers make a pose; a target found anew needs four
+LARGEST_RESIDUAL = 1.5  # px; a pose whose circle centres miss by more (rms) is none
+FLOOR_TOLERANCE = 0.01  # m; markers that were laid and measured by hand may be off by this much
 _SHAPE_TOLERANCE = 0.25  # of a marker's seen size and shape against what the pose says
 _OUTLIER = 16.0  # chi square per degree of freedom that makes the worst marker suspicious
 _MODEL_ERROR = 0.15  # px; beyond its noise, but too small for an outlier

@@ -29,8 +29,7 @@ CODES: dict[str, tuple[float, float]] = {
     "floor_key": (0.78, 0.25),
 }
 CODE_NAMES = tuple(CODES)
-#: White around a marker must reach this many outer radii.
-QUIET_ZONE = 1.3
+QUIET_ZONE = 1.3  # white around a marker must reach this many outer radii
 
 
 class Marker(SettingsModel):

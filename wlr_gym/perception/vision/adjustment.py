@@ -24,14 +24,11 @@ from wlr_gym.perception.markers.targets import Target, ring_radii
 
 Array = NDArray[np.float64]
 
-#: m, 1 sigma of a caliper reading.
-CALIPER_STD = 0.0002
+CALIPER_STD = 0.0002  # m, 1 sigma of a caliper reading
 #: s, 1 sigma of an unknown readout before the film is looked at; of a readout that the camera file states.
 UNKNOWN_READOUT, STATED_READOUT = 0.015, 0.0002
-#: Frames that are adjusted together at most.
-MOST_VIEWS = 150
-#: s; frames further apart do not give a speed.
-LONGEST_STEP = 0.3
+MOST_VIEWS = 150  # frames that are adjusted together at most
+LONGEST_STEP = 0.3  # s; frames further apart do not give a speed
 _TURNS = 8
 _HUBER = 3.0  # sigmas from which on a circle counts less
 _FLATNESS = 0.1  # tolerance of a marker's height over the tolerance in the plane: markers lie on a flat plate

@@ -25,14 +25,11 @@ from wlr_gym.robot.slip import accumulate, contact_slip_velocity
 
 Array = NDArray[np.float64]
 
-#: s; the offset is looked for within this.
-SEARCH = 1.0
-#: s; an offset less certain than this is refused.
-LARGEST_STD = 0.004
+SEARCH = 1.0  # s; the offset is looked for within this
+LARGEST_STD = 0.004  # s; an offset less certain than this is refused
 #: s; of turns and heights, differences with a longer period are drift of the gyroscope and not of the clocks.
 _DRIFT = 40.0
-#: s; of the distance driven, differences with a longer period are slip.
-_SLIP = 5.0
+_SLIP = 5.0  # s; of the distance driven, differences with a longer period are slip
 _GRID = 0.005  # s
 #: Share of a sensor's readings that must be there; most missing ones in a row with which the gyroscope tells the clocks.
 _SHARE, _HOLES = 0.9, 4
@@ -41,10 +38,8 @@ _DISTANCE = "distance"
 _START_SLIP = 1e-4  # m; a wheel that starts later than the body looks like a clock that is late
 _ROLLS = 20.0  # a wheel that rolls explains the distance this many times better than nothing
 _DISTINCT = 0.1  # s; a second minimum this far off
-#: rad rms; a turn seen by the camera that the gyroscope must explain.
-_TURN = 0.02
-#: The part of it that stays unexplained is at most one over this.
-_SAME_TURN = 10.0
+_TURN = 0.02  # rad rms; a turn seen by the camera that the gyroscope must explain
+_SAME_TURN = 10.0  # the part of it that stays unexplained is at most one over this
 
 
 @dataclass(frozen=True)

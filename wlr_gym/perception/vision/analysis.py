@@ -52,10 +52,8 @@ POOR_FIT = 0.3
 HEIGHT_TOLERANCE = 0.005
 #: s without a row of the run after which its slip is no longer known to its sigma.
 _LONGEST_PAUSE = 0.11
-#: s of the first poses that make the start pose.
-_START = 0.3
-#: m/s; a robot faster than this is not at rest.
-_AT_REST = 0.01
+_START = 0.3  # s of the first poses that make the start pose
+_AT_REST = 0.01  # m/s; a robot faster than this is not at rest
 
 
 @dataclass(frozen=True, eq=False)

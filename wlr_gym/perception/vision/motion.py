@@ -193,12 +193,10 @@ def _add_later(gain: Any, states: Any, spreads: Any) -> None:
 
 #: m, 1 sigma by which the floor under a wheel is off a plane, after a way as long as the body.
 UNEVEN = 0.001
-#: How many times a leg's own way counts: it shifts the loads.
-_SPRINGY = 2.0
+_SPRINGY = 2.0  # how many times a leg's own way counts: it shifts the loads
 #: m, 1 sigma of the height of a wheel's axle, mean of _MEAN s: legs and tyres that spring.
 _SHAKEN, _MEAN = 0.0003, 0.02
-#: rad, 1 sigma of the zero of a leg whose robot file states none.
-_ZERO = 0.01
+_ZERO = 0.01  # rad, 1 sigma of the zero of a leg whose robot file states none
 #: 1 sigma of constants of height (m), pitch and roll (rad), and of the slopes.
 _CONSTANT_STD, _SLOPE_STD = 0.02, 0.01
 #: Sigmas by which legs may change a pose; share of its variance that they are taken to take off at least.
@@ -306,10 +304,8 @@ _PRIOR = (
 )  # fmt: skip
 #: How much noisier the IMU of a robot that drives is taken for than that of one at rest.
 _DRIVING = 2.0
-#: rad/s per root second: walk of the gyroscope's bias.
-_GYRO_WANDER = 1e-5
-#: Squared normalised innovation beyond which an IMU reading counts for less.
-_GATE = 36.0
+_GYRO_WANDER = 1e-5  # rad/s per root second: walk of the gyroscope's bias
+_GATE = 36.0  # squared normalised innovation beyond which an IMU reading counts for less
 _STEP = 1e-5  # of derivatives
 #: Where poses follow each other by more than this many frames, the film does not tell how the body moves: it may then gain a
 #: rate (m/s, rad/s) of this size in a second.

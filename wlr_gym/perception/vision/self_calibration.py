@@ -46,8 +46,7 @@ _ONE_SIGMA = 0.683  # share of normal errors below 1 sigma; compression errs une
 #: Errors of a frame's time (s, 1 sigma) and factors of the noise that are tried.
 _JITTERS = np.array([0.0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8, 12]) * 1e-3
 _FACTORS = 0.6 * 1.15 ** np.arange(15)
-#: Twice the gain in log likelihood that an error of the times must bring.
-_WORTH = 12.0
+_WORTH = 12.0  # twice the gain in log likelihood that an error of the times must bring
 #: Share of the steps before and after that markers move by at most in a picture shown once more, which compression may still
 #: change; px, of those steps.
 _SAME_SHARE, _MOVING = 0.2, 0.1
@@ -313,16 +312,13 @@ def _odd_one(before: NDArray[np.complex128], after: NDArray[np.complex128]) -> t
 
 #: s; a readout that the film alone tells counts from here on, and from so many sigmas on: global shutters stay exact.
 LEAST_READOUT, SURE_READOUT = 0.001, 4.0
-#: m; a layout that is right to this leaves the film's poses as they are.
-LEAST_LAYOUT = 0.00005
-#: m; marker places that the film moves by more are worth saying.
-TOLD_LAYOUT = 0.0005
+LEAST_LAYOUT = 0.00005  # m; a layout that is right to this leaves the film's poses as they are
+TOLD_LAYOUT = 0.0005  # m; marker places that the film moves by more are worth saying
 #: Sigmas (of the stated tolerance) by which a marker may lie off before the target file is held to be wrong.
 WRONG_LAYOUT = 4.0
 #: Films are said to be noisy from here on: noise of the poses over what the edges of their markers state; s, of the times.
 TOLD_NOISE, TOLD_JITTER = 1.6, 0.001
-#: In findings that doubt the result.
-UNSURE = "the slip may be off by more than its sigma"
+UNSURE = "the slip may be off by more than its sigma"  # in findings that doubt the result
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,12 +159,9 @@ def _black_boxes(black: NDArray[np.bool_]) -> list[tuple[int, int, int, int]]:
 
 #: 1 sigma of a print's stretch before the photograph is looked at, where the target file states none.
 _STRETCH = 0.01
-#: m, 1 sigma of a marker's place on a sheet, stretch apart.
-_PRINT = 0.0001
-#: A print that is stretched by less is right.
-_RIGHT = 0.001
-#: Sigmas from which on something is worth a warning.
-_FAR = 3.0
+_PRINT = 0.0001  # m, 1 sigma of a marker's place on a sheet, stretch apart
+_RIGHT = 0.001  # a print that is stretched by less is right
+_FAR = 3.0  # sigmas from which on something is worth a warning
 
 
 @dataclass(frozen=True, eq=False)

@@ -207,8 +207,7 @@ def _rest(values: Array, known: Array) -> Array:
 # --- slip ---------------------------------------------------------------------------------------------------------------
 
 
-#: s; rows further than this from a frame with a pose are flagged.
-LONGEST_GAP = 0.15
+LONGEST_GAP = 0.15  # s; rows further than this from a frame with a pose are flagged
 _ENCODER_PACE = 20.0  # 1/s; an encoder's error changes over two or three control steps
 
 

@@ -37,18 +37,12 @@ from wlr_gym.perception.vision.adjustment import LONGEST_STEP, TargetView, at_fr
 Array = NDArray[np.float64]
 
 # Status of a sample.
-#: Pose from all markers.
-OK = "ok"
-#: Pose from fewer than all markers.
-PARTIAL = "partial"
-#: No markers found.
-LOST = "lost"
-#: The camera moved.
-MOVED = "moved"
-#: A pose that cannot be: in the floor, or upside down.
-IMPOSSIBLE = "impossible"
-#: The picture before once more.
-REPEATED = "repeated"
+OK = "ok"  # pose from all markers
+PARTIAL = "partial"  # pose from fewer than all markers
+LOST = "lost"  # no markers found
+MOVED = "moved"  # the camera moved
+IMPOSSIBLE = "impossible"  # a pose that cannot be: in the floor, or upside down
+REPEATED = "repeated"  # the picture before once more
 FLOOR_FRAMES = 20
 _MOVED_BY = 0.4  # px, median over the floor's markers: 1 mm at 2 m with a focal length of 800 px
 _FILM_SLACK = 0.001  # m; 1 sigma of what a rolling shutter displaces a marker by
@@ -369,14 +363,10 @@ def mean_detection(found: Sequence[Detection]) -> Detection:
 
 
 # Status of a sample without a pose, besides those of :mod:`wlr_gym.perception.vision.tracking`.
-#: The floor markers are not found (yet).
-NO_FLOOR = "no floor"
-#: Too dark, or nothing to be seen: a covered lens, no light.
-DARK = "dark"
-#: Overexposed.
-GLARE = "glare"
-#: Exactly the picture before: the camera repeats itself.
-FROZEN = "frozen"
+NO_FLOOR = "no floor"  # the floor markers are not found (yet)
+DARK = "dark"  # too dark, or nothing to be seen: a covered lens, no light
+GLARE = "glare"  # overexposed
+FROZEN = "frozen"  # exactly the picture before: the camera repeats itself
 #: What a status means, for people.
 MEANINGS = {
     NO_FLOOR: "the floor markers are not found",
@@ -387,12 +377,9 @@ MEANINGS = {
     GLARE: "the picture is overexposed",
     FROZEN: "the camera repeats the same picture",
 }
-#: Frames with floor markers that the floor is located from.
-LIVE_FLOOR_FRAMES = 10
-#: Frames between two tries to find the floor where it was not found.
-_EVERY = 5
-#: Every so many pixels are looked at, along both axes, to judge a picture as a whole.
-_SPARSE = 8
+LIVE_FLOOR_FRAMES = 10  # frames with floor markers that the floor is located from
+_EVERY = 5  # frames between two tries to find the floor where it was not found
+_SPARSE = 8  # every so many pixels are looked at, along both axes, to judge a picture as a whole
 #: Grey levels: spread (1 sigma) below which nothing is to be seen, and mean above which a picture is overexposed.
 _BLANK, _BRIGHT = 12.0, 240.0
 

@@ -22,18 +22,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: The usual port; where it is taken, the next free one.
-PORT = 8080
-#: Only this machine: a page on a network could be driven by anyone on it.
-HOST = "localhost"
-#: Version of viser from which on it has panels, keys and uPlot.
-LEAST_VISER = (1, 1)
-#: Updates of the scene per second.
-UPDATES = 30.0
-#: Times the distance of pictures: panels stand at both sides.
-_FARTHER = 1.3
-#: Updates of texts and sliders per second.
-TEXTS = 6.0
+PORT = 8080  # the usual port; where it is taken, the next free one
+HOST = "localhost"  # only this machine: a page on a network could be driven by anyone on it
+LEAST_VISER = (1, 1)  # version of viser from which on it has panels, keys and uPlot
+UPDATES = 30.0  # updates of the scene per second
+_FARTHER = 1.3  # times the distance of pictures: panels stand at both sides
+TEXTS = 6.0  # updates of texts and sliders per second
 
 
 @dataclass(frozen=True)
@@ -151,8 +145,7 @@ def html_lines(lines: list[str]) -> str:
 
 #: What a page calls its cameras; the direction from which it is seen is the mouse's affair.
 _CAMERAS = {"goes with the robot": "follow", "turns with the robot": "chase"}
-#: Pixels.
-_PLOTS_WIDE = 380
+_PLOTS_WIDE = 380  # pixels
 
 
 class ViewControls:
@@ -188,15 +181,12 @@ def plot_panel(server: viser.ViserServer) -> Any:
 # ---- curves over time, drawn by uPlot, which viser's page brings along ------------------------------------------------
 
 
-#: Columns of a plot: more points than it has pixels are not drawn.
-COLUMNS = 400
+COLUMNS = 400  # columns of a plot: more points than it has pixels are not drawn
 #: Colours of a plot's curves, and of the line at the present time.
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#17becf", "#e377c2")
 _NOW = "#444444"
-#: Pixels; height of a plot.
-_HEIGHT = 190
-#: s; half the width of the line at the present time.
-_THIN = 1e-6
+_HEIGHT = 190  # pixels; height of a plot
+_THIN = 1e-6  # s; half the width of the line at the present time
 NOTHING = "(nothing)"
 
 

@@ -36,20 +36,14 @@ if TYPE_CHECKING:
 
 #: The node that everything stands on; it moves, so that the robot stays where eyes look at.
 FLOOR = "/floor"
-#: Colour and opacity of a ghost.
-GHOST: Colour = (0.20, 0.35, 0.85)
-GHOST_OPACITY = 0.35
-#: m; width of the floor.
-_WIDE = 60.0
-#: m; heads of arrows.
-_HEAD, _HEAD_LENGTH = 2.2 * marks.SHAFT, 6.0 * marks.SHAFT
+GHOST, GHOST_OPACITY = (0.20, 0.35, 0.85), 0.35
+_WIDE = 60.0  # m; width of the floor
+_HEAD, _HEAD_LENGTH = 2.2 * marks.SHAFT, 6.0 * marks.SHAFT  # m; heads of arrows
 #: m; where an arrow lies that is not shown: viser keeps their number.
 _BELOW = np.array([[0.0, 0.0, -9.0], [0.0, 0.0, -8.9]])
 _ARROWS = 12
-#: Sides of what is round.
-_SIDES = 32
-#: Geoms of this group are hidden: what touches the floor, not what is drawn.
-_HIDDEN = 3
+_SIDES = 32  # sides of what is round
+_HIDDEN = 3  # geoms of this group are hidden: what touches the floor, not what is drawn
 
 
 def rgb(colour: Colour) -> tuple[int, int, int]:
@@ -296,8 +290,7 @@ KEYS = {
     "R": (RESET, "start anew"),
 }
 HELP = "keys on the page: I K speed, J L turning, space: stop, R: start anew; the mouse turns and moves the view"
-#: s of the past that plots show.
-WINDOW = 20.0
+WINDOW = 20.0  # s of the past that plots show
 #: What plots can show: channels of the truth, by element or all of a kind in one plot.
 _TITLES = {
     name: channel.unit
@@ -305,8 +298,7 @@ _TITLES = {
     for name in dict.fromkeys((channel.name, *channel.elements))
 }
 _FIRST = ("linear_velocity_in_body[x]", "slip_velocity", "contact_force")
-#: Curves of one plot at most: of a kind with more elements, the first ones.
-_MOST = 12
+_MOST = 12  # curves of one plot at most: of a kind with more elements, the first ones
 
 
 class WebViewer(_Page):
