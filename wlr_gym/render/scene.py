@@ -142,8 +142,7 @@ class Scene:
     A picture is a function of what is passed to :meth:`draw`: there is no memory from one to the next.
 
     Args:
-        robot: supplies the sizes that are no parameters.
-        view: what to show.
+        robot: supplies the sizes that are no parameters. view: what to show.
     """
 
     def __init__(self, robot: Robot, view: View | None = None) -> None:
@@ -169,13 +168,10 @@ class Scene:
         """Return the picture (H, W, 3), uint8, of one robot.
 
         Args:
-            truth: of a plant, any number of robots; nothing in it is changed.
+            truth: of a plant, any number of robots; nothing in it is changed. row: which robot.
             parameters: of the same robots: sizes of wheels and legs, payload, friction of the floor, slope.
-            row: which robot.
-            time: s, written into the picture.
-            command: name -> value in SI units, written into the picture beside what the robot does.
-            title: first line of the text.
-            result: last line of the text.
+            time: s. command: name -> value in SI units; both are written into the picture.
+            title, result: first and last line of the text.
             look_at: (x, y) of the floor in the middle of the picture, m; None = the robot.
             trails: paths over the floor to draw.
 

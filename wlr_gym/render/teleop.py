@@ -33,8 +33,7 @@ class Script:
     """A written schedule: ``0.1,0`` for good, or ``0:0.1,0; 3:0.05,0.3`` from the named times (s) on.
 
     Args:
-        text: values in the order of ``names``.
-        names: commands of the task.
+        text: values in the order of ``names``, the commands of the task.
 
     Raises:
         InputError: not a schedule, or times that do not rise from 0.
@@ -118,8 +117,7 @@ class Gamepad:
     """Commands from the left stick of the first gamepad; its first button stops, its second starts anew.
 
     Args:
-        ranges: name -> (low, high).
-        joystick: GLFW's joystick functions (tests pass their own).
+        ranges: name -> (low, high). joystick: GLFW's joystick functions (tests pass their own).
 
     Raises:
         InputError: no gamepad is plugged in.
@@ -152,11 +150,9 @@ class Gamepad:
 
 
 def stick_commands(ranges: Ranges, sticks: Sequence[float]) -> dict[str, float]:
-    """Return the commands of a gamepad's sticks.
+    """Return the commands of a gamepad's sticks: position of each axis, -1 to 1; up and left are negative.
 
-    Args:
-        ranges: name -> (low, high), of :func:`steered` commands.
-        sticks: position of each axis, -1 to 1; up and left are negative.
+    ``ranges`` are those of :func:`steered` commands.
     """
     values = {}
     for name, (low, high) in ranges.items():

@@ -129,10 +129,8 @@ def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, 
     """Point the scene's camera at a robot, with gravity pulling down in the picture: a slope is seen as a slope.
 
     Args:
-        scene: its frustum stays as it is.
-        camera: from where.
-        place: (x, y, ...) of the robot in the floor frame, m.
-        yaw: heading of the robot, rad.
+        scene: its frustum stays as it is. camera: from where.
+        place: (x, y, ...) of the robot in the floor frame, m. yaw: its heading, rad.
         up: (3,) unit vector against gravity in the floor frame.
         scale: factor on distance and height; see :func:`magnification`.
     """

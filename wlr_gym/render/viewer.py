@@ -66,11 +66,9 @@ class Viewer:
     inclined in the window (MuJoCo's camera keeps the floor's normal upright); the text says how much.
 
     Args:
-        robot: supplies the sizes that are no parameters.
-        view: what to show; the size is the window's own affair.
+        robot: supplies the sizes that are no parameters. view: what to show; the size is the window's own affair.
         on_key: called with GLFW's key code, from the window's thread.
-        open: how the window is opened (tests).
-        pace: waits for the next tick (tests).
+        open: how the window is opened (tests). pace: waits for the next tick (tests).
     """
 
     def __init__(

@@ -27,9 +27,7 @@ _LEAST = 1e-4  # rad/s and m/s2; what an ideal encoder and accelerometer count a
 def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:
     """Return one record (1,): the robot as its file describes it, its sensors' errors, the learned weights of ``trust.py``.
 
-    Args:
-        period: s between two readings.
-        camera: whether its poses are used.
+    ``period``: s between two readings. ``camera``: whether its poses are used.
     """
     sensors, flow = robot.sensors, robot.sensors.flow
     frames = max(flow.rate * period, 1.0) if flow else 1.0  # of a reading
@@ -150,9 +148,7 @@ class SlipObserver:
 
     Args:
         robot: as its file describes it; how the real one differs is what the filter's noise stands for.
-        control_period: s between two readings.
-        count: N.
-        camera: use camera poses where the sensors bring them.
+        control_period: s between two readings. count: N. camera: use camera poses where the sensors bring them.
 
     Attributes:
         values: (N, ESTIMATE_LAYOUT.width), overwritten by ``reset`` and ``update``.

@@ -63,8 +63,7 @@ def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> t
 
     Args:
         host: name or address to listen on; the default can be reached from this machine, and through ssh, only.
-        port: the first one that is tried.
-        label: heading of the controls.
+        port: the first one that is tried. label: heading of the controls.
 
     Raises:
         MissingPackageError: no viser here (extra ``web``).
@@ -119,8 +118,7 @@ def floor_pose(place: Array, yaw: float, up: Array, camera: FollowCamera) -> tup
     So the mouse turns the eye about the robot wherever that goes, and every browser has its own eye.
 
     Args:
-        place: (x, y, ...) of the robot in the floor frame, m.
-        yaw: its heading, rad.
+        place: (x, y, ...) of the robot in the floor frame, m. yaw: its heading, rad.
         up: (3,) against gravity in the floor frame: it becomes the eye's z, so that a slope is seen as a slope.
         camera: turns with the robot, or keeps its direction.
     """
@@ -249,10 +247,8 @@ class Plots:
     """Plots that whoever watches chooses the channels of.
 
     Args:
-        server: of the page.
-        place: panel that they stand in.
-        titles: what can be drawn, and its unit.
-        first: what is drawn until something else is chosen.
+        server: of the page. place: panel that they stand in.
+        titles: what can be drawn, and its unit. first: what is drawn until something else is chosen.
     """
 
     def __init__(self, server: viser.ViserServer, place: Any, titles: Mapping[str, str], first: Sequence[str]) -> None:

@@ -56,10 +56,8 @@ class Figure:
     """A robot on the page, and the arrows at its wheels.
 
     Args:
-        server: of the page.
-        name: of its node.
-        robot: supplies the sizes that are no parameters.
-        ghost: drawn in one colour that the floor shines through, without arrows.
+        server: of the page. name: of its node. robot: supplies the sizes that are no parameters.
+        ghost: drawn in one colour that the floor shines through.
     """
 
     def __init__(self, server: viser.ViserServer, name: str, robot: Robot, ghost: bool = False) -> None:
@@ -239,17 +237,7 @@ def _mesh_of(model: Any, geom: int) -> Any:
 
 
 class _Page:
-    """A page of the browser: its server, the robots on the floor, and when its texts are due.
-
-    Args:
-        label: heading of the controls.
-        view: what to show; the size is the browser's own affair.
-        host, port: where the page is served.
-
-    Raises:
-        MissingPackageError: no viser here (extra ``web``).
-        InputError: no such address, or no free port.
-    """
+    """A page of the browser: its server, the robots on the floor, and when its texts are due."""
 
     def __init__(self, label: str, view: View, host: str, port: int) -> None:
         self.view = view
@@ -305,15 +293,9 @@ class WebViewer(_Page):
     """Shows one robot on a page of the browser, no faster than real time; as :class:`wlr_gym.render.viewer.Viewer`.
 
     Args:
-        robot: supplies the sizes that are no parameters.
-        view: what to show; the size is the browser's own affair.
+        robot: supplies the sizes that are no parameters. view: what to show; the size is the browser's own affair.
         on_key: called with the key codes of :mod:`wlr_gym.render.teleop`, from a thread of the server; None = nobody drives.
-        host, port: where the page is served.
-        pace: waits for the next tick (tests).
-
-    Raises:
-        MissingPackageError: no viser here (extra ``web``).
-        InputError: no such address, or no free port.
+        host, port: where the page is served, see :func:`wlr_gym.render.web.page.open_server`. pace: of the ticks (tests).
     """
 
     def __init__(
@@ -424,7 +406,10 @@ class Playable(Protocol):
 
     Attributes:
         name: of the recording. robot: supplies the sizes that are no parameters. length: s.
-        titles: what can be plotted -> its unit.
+        titles: what can be plotted -> its unit; ``curves`` are what is known of one.
+
+    ``at`` is the robot, ``ghost_at`` its ghost (None = there is none, or none yet), ``lines`` what is to be said: what both
+    are, and how far they have been worked out; ``close`` gives up what is being worked out.
     """
 
     @property
@@ -436,48 +421,24 @@ class Playable(Protocol):
     @property
     def titles(self) -> Mapping[str, str]: ...
 
-    def at(self, time: float) -> Moment:
-        """Return the robot."""
-        ...
-
-    def ghost_at(self, time: float) -> Moment | None:
-        """Return its ghost; None = there is none, or none yet."""
-        ...
-
-    def curves(self, title: str) -> Sequence[Curve]:
-        """Return what is known of a title of ``titles``."""
-        ...
-
-    def lines(self, time: float) -> list[str]:
-        """Return what is to be said: what the robot and the ghost are, and how far these have been worked out."""
-        ...
-
-    def close(self) -> None:
-        """Give up what is being worked out."""
-        ...
+    def at(self, time: float) -> Moment: ...
+    def ghost_at(self, time: float) -> Moment | None: ...
+    def curves(self, title: str) -> Sequence[Curve]: ...
+    def lines(self, time: float) -> list[str]: ...
+    def close(self) -> None: ...
 
 
 class Player(_Page):
     """Plays recordings on a page of the browser.
 
     Args:
-        names: of the recordings.
-        open: return a recording by its place in ``names``; called when it is chosen.
+        names: of the recordings. open: return a recording by its place in ``names``; called when it is chosen.
         first: titles that are plotted at the beginning.
-        host, port: where the page is served.
-
-    Raises:
-        MissingPackageError: no viser here (extra ``web``).
-        InputError: no such address, or no free port; and what ``open`` raises.
+        host, port: where the page is served, see :func:`wlr_gym.render.web.page.open_server`.
     """
 
     def __init__(
-        self,
-        names: Sequence[str],
-        open: Callable[[int], Playable],
-        first: Sequence[str],
-        host: str = HOST,
-        port: int = PORT,
+        self, names: Sequence[str], open: Callable[[int], Playable], first: Sequence[str], host: str = HOST, port: int = PORT
     ) -> None:
         self._open, self._chosen = open, 0
         self.recording: Playable = open(0)
@@ -507,12 +468,7 @@ class Player(_Page):
             self.seek(later if self._time < self.recording.length else 0.0)
 
     def run(self, stop: Callable[[], bool] = lambda: False, pace: Pace | None = None) -> None:
-        """Play until ``stop`` says so: :data:`wlr_gym.render.web.page.UPDATES` updates a second.
-
-        Args:
-            stop: asked before each update.
-            pace: waits for the next one (tests).
-        """
+        """Play until ``stop``, asked before each update, says so; ``pace`` waits for the next one (tests)."""
         pace, last = pace or Pace(), clock.monotonic()
         try:
             while not stop():
