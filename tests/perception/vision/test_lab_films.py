@@ -2,25 +2,30 @@
 
 import numpy as np
 import pytest
+from vision_studio import OFFSET, wrapped
 
 from studies.bench.lab_renderer import Lab, frames, lens, true_places
-from studies.bench.vision import skid_turn, true_slip
+from studies.bench.vision import pose_at, true_slip
 from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.perception.vision.analysis import analyse
-from wlr_gym.perception.vision.tracking import PoseFinder
-from wlr_gym.robot import load_robot
+from wlr_gym.perception.vision.tracking import OK, PoseFinder, Tracker, angles, locate_floor
 
 SECONDS, RATE = 4.6, 15.0
-
-
-@pytest.fixture(scope="module")
-def drive():
-    return skid_turn(load_robot())
 
 
 def analysed(drive, lab, **body):
     target = load_target("body").model_copy(update=body)
     return analyse(list(frames(drive, lab, SECONDS, RATE)), drive.run, lens(), target, load_target("floor"), drive.robot)
+
+
+def test_poses_are_right_in_the_pictures_of_another_renderer(drive):
+    shots, body, floor = list(frames(drive, Lab(), 6.0, 0.7)), load_target("body"), load_target("floor")
+    tracker = Tracker(lens(), body, floor, *locate_floor(shots, lens(), floor))
+    for shot in shots:
+        sample, pose = tracker(shot), pose_at(drive, shot.time + OFFSET)
+        assert sample.status == OK
+        assert np.hypot(*(sample.pose[:2] - pose.position[:2])) < 0.5e-3
+        assert abs(wrapped(sample.pose[3] - angles(pose.rotation)[0])) < 1e-3
 
 
 def checked(drive, analysis):

@@ -6,13 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_frame_noise import tilted
-from test_measure import OFFSET, samples_of
+from vision_studio import OFFSET, measured, samples_of, with_table
 
-from studies.bench.vision import paper_test, pose_at, skid_turn, true_slip
-from wlr_gym.data import Run
+from studies.bench.vision import paper_test, pose_at, true_slip
 from wlr_gym.perception.vision import slip
 from wlr_gym.perception.vision.motion import STANDING, leg_readings
-from wlr_gym.perception.vision.slip import measure_slip
 from wlr_gym.perception.vision.tracking import angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameter_table import read_tolerances
@@ -20,21 +18,8 @@ from wlr_gym.robot.parameters import Parameters
 
 
 @pytest.fixture(scope="module")
-def drive():
-    return skid_turn(load_robot())
-
-
-@pytest.fixture(scope="module")
 def paper():
     return paper_test(1, load_robot())
-
-
-def measured(drive, samples, run=None, robot=None):
-    return measure_slip(samples, OFFSET, run or drive.run, robot or drive.robot, Parameters.nominal(drive.robot))
-
-
-def logged(drive, kept):
-    return Run(drive.run.table[kept].reset_index(drop=True), drive.run.meta, drive.run.path)
 
 
 def drifting(samples, pitch, roll):
@@ -71,7 +56,7 @@ def alone(monkeypatch):
     def without(drive, samples, run=None):
         with monkeypatch.context() as patch:
             patch.setattr(slip, "leg_findings", lambda *_: ["not used"])
-            return measured(drive, samples, run)
+            return measured(drive, samples, run=run)
 
     return without
 
@@ -111,12 +96,9 @@ def standing(robot, front, rear, period=0.02):
 
 
 def test_a_short_wheelbase_tells_the_pitch_worse(drive):
-    long, short = (
-        standing(drive.robot, math.radians(30), math.radians(150)),
-        standing(drive.robot, math.radians(150), math.radians(30)),
-    )
-    parameters = Parameters.nominal(drive.robot)
-    hip, reach = float(parameters["hip.position"][0, 0]), float(parameters["leg.length"][0, 0]) * math.cos(math.radians(30))
+    out, back = math.radians(30), math.radians(150)
+    long, short = standing(drive.robot, out, back), standing(drive.robot, back, out)
+    hip, reach = drive.robot.hip_position.x, drive.robot.leg.length * math.cos(out)
     assert short.noise[0, 1, 1] / long.noise[0, 1, 1] == pytest.approx(((hip + reach) / (hip - reach)) ** 2, rel=0.02)
     assert short.noise[0, 0, 0] == pytest.approx(long.noise[0, 0, 0], rel=0.02)
 
@@ -158,8 +140,8 @@ def test_a_robot_that_is_lifted_is_said(drive, height):
 
 def test_what_happens_after_the_log_does_not_count(drive, alone):
     """The robot is picked up: film and legs are compared, and the legs used, within the log."""
-    samples, run = raised(samples_of(drive), 0.1, 7.1, 9.0), logged(drive, drive.run["t"] < 7.0)
-    found, film = measured(drive, samples, run), alone(drive, samples, run)
+    samples, run = raised(samples_of(drive), 0.1, 7.1, 9.0), with_table(drive.run, drive.run.table[drive.run["t"] < 7.0])
+    found, film = measured(drive, samples, run=run), alone(drive, samples, run)
     assert not found.contradictions
     assert np.all(normalised(drive, found) < 1.1 * normalised(drive, film))
 
@@ -174,4 +156,4 @@ def test_single_frames_that_err_do_not_count(drive):
 
 def test_zeros_of_legs_may_be_certain(drive):
     certain = drive.robot.model_copy(update={"tolerances": read_tolerances({"joint_zero": "0 rad"})})
-    assert np.isfinite(measured(drive, samples_of(drive), robot=certain).pose).all()
+    assert np.isfinite(measured(drive, robot=certain).pose).all()

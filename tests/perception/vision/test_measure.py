@@ -5,42 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from vision_studio import OFFSET, measured, samples_of, with_table
 
-from studies.bench.vision import paper_test, pose_at, skid_turn, true_slip
+from studies.bench.vision import paper_test, pose_at, true_slip
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Run, read_run
 from wlr_gym.perception.vision.alignment import align
 from wlr_gym.perception.vision.analysis import VideoAnalysis, _findings, camera_columns, save_video_analysis
 from wlr_gym.perception.vision.motion import smooth
-from wlr_gym.perception.vision.slip import measure_slip
-from wlr_gym.perception.vision.tracking import LOST, OK, Sample, angles
+from wlr_gym.perception.vision.tracking import angles
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
-
-STD = np.array([5e-5, 5e-5, 1.4e-4, 5e-5, 7e-4, 7e-4])  # of a pose from 2 m above
-OFFSET = 0.137
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot()
-
-
-@pytest.fixture(scope="module")
-def turn(robot):
-    return skid_turn(robot)
-
-
-def samples_of(drive, offset=OFFSET, seed=0, gap=()):
-    rng, result = np.random.default_rng(seed), []
-    for index in range(int((drive.time[-1] - 0.1) * 30)):
-        time = 0.011 + index / 30
-        pose = pose_at(drive, time)
-        values = np.concatenate([pose.position, angles(pose.rotation)]) + STD * rng.standard_normal(6)
-        seen = not any(start < time < stop for start, stop in gap)
-        values, covariance = (values, np.diag(STD**2)) if seen else (np.full(6, np.nan), np.full((6, 6), np.nan))
-        result.append(Sample(index, time - offset, OK if seen else LOST, values, covariance, 4 * seen, 0.02, np.zeros((4, 2))))
-    return result
 
 
 def aligned(drive, samples, around=0.0):
@@ -49,46 +24,38 @@ def aligned(drive, samples, around=0.0):
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_clocks_are_aligned_within_2_ms(turn, seed):
-    found = aligned(turn, samples_of(turn, seed=seed))
+def test_clocks_are_aligned_within_2_ms(drive, seed):
+    found = aligned(drive, samples_of(drive, seed=seed))
     assert found.offset == pytest.approx(OFFSET, abs=0.002)
     assert found.std < 0.002
     assert "yaw" in found.parts
 
 
-def with_table(drive, change):
-    return replace(drive, run=Run(change(drive.run.table.copy()), drive.run.meta, drive.run.path, drive.run.findings))
-
-
 @pytest.mark.parametrize(("missing", "used"), [(slice(50, 52), True), (slice(50, 60), False)])
-def test_clocks_are_aligned_by_a_gyroscope_that_misses_readings(turn, missing, used):
-    def change(table):
-        table.loc[table.index[missing], "gyro_z"] = np.nan
-        return table
-
-    found = aligned(with_table(turn, change), samples_of(turn))
+def test_clocks_are_aligned_by_a_gyroscope_that_misses_readings(drive, missing, used):
+    table = drive.run.table.copy()
+    table.loc[table.index[missing], "gyro_z"] = np.nan
+    found = aligned(replace(drive, run=with_table(drive.run, table)), samples_of(drive))
     assert found.offset == pytest.approx(OFFSET, abs=0.002)
     assert ("yaw" in found.parts) == used
 
 
-def test_a_pause_of_the_log_is_told(turn):
-    samples = samples_of(turn)
+def test_a_pause_of_the_log_is_told(drive):
+    samples = samples_of(drive)
     for count, told in ((4, False), (15, True)):
-        paused = with_table(turn, lambda table, count=count: table.drop(index=table.index[100 : 100 + count]))
-        slip = measure_slip(samples, OFFSET, paused.run, turn.robot, Parameters.nominal(turn.robot))
-        said = [finding for finding in _findings(samples, slip, 0.0) if "no rows for" in finding]
+        paused = with_table(drive.run, drive.run.table.drop(index=range(100, 100 + count)))
+        said = [
+            finding for finding in _findings(samples, measured(drive, samples, run=paused), 0.0) if "no rows for" in finding
+        ]
         assert bool(said) == told
     assert "no rows for 0.32 s after 1.98 s" in said[0]
 
 
 @pytest.mark.slow
-def test_the_wheels_errors_are_correlated_as_the_covariance_says(turn):
+def test_the_wheels_errors_are_correlated_as_the_covariance_says(drive):
     """Against the errors of other draws of the frames' noise; its diagonal is that of the sigmas."""
-    draws = [
-        measure_slip(samples_of(turn, seed=seed), OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
-        for seed in range(8)
-    ]
-    truth = true_slip(turn, draws[0].time)[-1].ravel()
+    draws = [measured(drive, samples_of(drive, seed=seed)) for seed in range(8)]
+    truth = true_slip(drive, draws[0].time)[-1].ravel()
     errors = np.stack([found.slip[-1].ravel() - truth for found in draws])
     root = np.linalg.cholesky(draws[0].covariance)
     whitened = np.linalg.solve(root, (errors - errors.mean(axis=0)).T)
@@ -97,42 +64,40 @@ def test_the_wheels_errors_are_correlated_as_the_covariance_says(turn):
     assert 0.5 < np.sqrt(np.mean(whole**2)) < 1.5
     lateral = draws[0].covariance[1::2, 1::2]
     assert np.all(lateral > 0.8 * lateral[0, 0])  # all wheels are off alike
-    with_layout = measure_slip(
-        samples_of(turn), OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot), 0.0, (0.002, 0.003)
-    )
+    with_layout = measured(drive, None, 0.0, (0.002, 0.003))
     std = np.hypot(with_layout.slip_std, with_layout.slip_layout_std)[-1].ravel()
     assert np.sqrt(np.diag(with_layout.covariance)) == pytest.approx(std, rel=1e-6)
 
 
-def test_slow_motion_is_refused(turn):
+def test_slow_motion_is_refused(drive):
     """A film whose times run slower than the camera's clock did."""
-    samples = samples_of(turn)
+    samples = samples_of(drive)
     samples = [replace(sample, time=samples[0].time + 2.0 * (sample.time - samples[0].time)) for sample in samples]
     with pytest.raises(InputError, match=r"do not see the same turns.*slow motion.*--rate"):
-        aligned(turn, samples)
+        aligned(drive, samples)
 
 
 @pytest.mark.parametrize("offset", [1.2, 2.0, 3.0, -2.5])
-def test_clocks_far_apart_are_refused_and_found_around_a_guess(turn, offset):
-    samples = samples_of(turn, offset=offset)
+def test_clocks_far_apart_are_refused_and_found_around_a_guess(drive, offset):
+    samples = samples_of(drive, offset=offset)
     with pytest.raises(InputError, match="--around"):
-        aligned(turn, samples)
-    assert aligned(turn, samples, around=round(offset)).offset == pytest.approx(offset, abs=0.003)
+        aligned(drive, samples)
+    assert aligned(drive, samples, around=round(offset)).offset == pytest.approx(offset, abs=0.003)
 
 
-def test_slip_is_within_a_millimetre_and_its_sigma_is_honest(turn):
+def test_slip_is_within_a_millimetre_and_its_sigma_is_honest(drive):
     """Six draws of the frames' noise, clocks aligned anew each time, all errors over their own sigma.
 
     Lateral errors are alike for all wheels, so six independent ones are left: if sigma is right, their rms is below 0.25 or
     above 1.93 once in 500 times (chi square).
     """
-    assert np.abs(turn.slip[-1]).max() > 0.1  # there is slip to be found
+    assert np.abs(drive.slip[-1]).max() > 0.1  # there is slip to be found
     normalised = []
     for seed in range(6):
-        samples = samples_of(turn, seed=seed)
-        clocks = aligned(turn, samples)
-        found = measure_slip(samples, clocks.offset, turn.run, turn.robot, Parameters.nominal(turn.robot), clocks.std)
-        error = found.slip - true_slip(turn, found.time)
+        samples = samples_of(drive, seed=seed)
+        clocks = aligned(drive, samples)
+        found = measured(drive, samples, clocks.std, offset=clocks.offset)
+        error = found.slip - true_slip(drive, found.time)
         assert np.abs(error).max() < 1e-3
         normalised.append(error[-1] / found.slip_std[-1])
     spread = np.sqrt(np.mean(np.square(normalised), axis=(0, 1)))
@@ -140,106 +105,101 @@ def test_slip_is_within_a_millimetre_and_its_sigma_is_honest(turn):
 
 
 @pytest.mark.slow
-def test_sigma_of_slip_grows_with_what_is_known_less(turn):
+def test_sigma_of_slip_grows_with_what_is_known_less(drive):
     """Clocks count while it moves, tilts of the body and the layout of its markers always."""
-    samples, nominal = samples_of(turn), Parameters.nominal(turn.robot)
+    samples = samples_of(drive)
     tilted = [replace(s, covariance=s.covariance * np.diag([1, 1, 1, 1, 9, 9])) for s in samples]
-    plain = measure_slip(samples, OFFSET, turn.run, turn.robot, nominal)
-    late = measure_slip(samples, OFFSET, turn.run, turn.robot, nominal, 0.004)
-    rough = measure_slip(tilted, OFFSET, turn.run, turn.robot, nominal, 0.0, (0.001, 0.001))
+    plain = measured(drive, samples)
+    late = measured(drive, samples, 0.004)
+    rough = measured(drive, tilted, 0.0, (0.001, 0.001))
     fast, end = np.abs(plain.rate[:, 0]) > 0.1, -1
     assert np.median(late.slip_std[fast, :, 0]) > 2 * np.median(plain.slip_std[fast, :, 0])
     assert np.all(late.slip_std[end] < 1.6 * plain.slip_std[end])
     assert np.all(rough.slip_std[end] > 1.2 * plain.slip_std[end])
     scaled = [replace(s, pose=s.pose * [1.001, 1.001, 1, 1, 1, 1]) for s in samples]
     turned = [replace(s, pose=s.pose + np.array([0, 0, 0, 0.001, 0, 0])) for s in samples]
-    errors = [measure_slip(s, OFFSET, turn.run, turn.robot, nominal).slip[end] - plain.slip[end] for s in (scaled, turned)]
+    errors = [measured(drive, s).slip[end] - plain.slip[end] for s in (scaled, turned)]
     assert np.linalg.norm(errors, axis=0) == pytest.approx(rough.slip_layout_std[end], rel=0.15)
     assert not plain.slip_layout_std.any()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2])
-def test_paper_tests_from_poses(number, robot):
-    drive = paper_test(number, robot)
+def test_paper_tests_from_poses(number):
+    drive = paper_test(number, load_robot())
     samples = samples_of(drive)
     found = aligned(drive, samples)
     assert found.offset == pytest.approx(OFFSET, abs=0.004)
-    slip = measure_slip(samples, found.offset, drive.run, robot, Parameters.nominal(robot))
+    slip = measured(drive, samples, offset=found.offset)
     assert np.abs(slip.slip - true_slip(drive, slip.time)).max() < 1e-3
 
 
-def test_a_robot_that_stands_still_cannot_be_aligned(turn):
-    still = [s for s in samples_of(turn) if s.time + OFFSET < 0.95]
-    still = still * 3
-    time = np.arange(len(still)) / 30
-    poses = np.stack([s.pose for s in still])
-    rows = turn.run.table[turn.run.table["t"] < 0.95].reset_index(drop=True)
-    table = rows.loc[np.tile(np.arange(len(rows)), 3)].reset_index(drop=True).assign(t=np.arange(3 * len(rows)) * 0.02)
-    run = Run(table, turn.run.meta, turn.run.path)
+def test_a_robot_that_stands_still_cannot_be_aligned(drive):
+    still = 3 * [s for s in samples_of(drive) if s.time + OFFSET < 0.95]
+    still = [replace(sample, time=k / 30) for k, sample in enumerate(still)]
+    rows = drive.run.table[drive.run.table["t"] < 0.95]
+    table = rows.iloc[np.tile(np.arange(len(rows)), 3)].assign(t=np.arange(3 * len(rows)) * 0.02)
     with pytest.raises(InputError, match="clocks cannot be aligned"):
-        align(time, poses, run, turn.robot, Parameters.nominal(turn.robot))
+        aligned(replace(drive, run=with_table(drive.run, table)), still)
 
 
-def test_a_video_of_something_else_is_refused(turn):
-    late = samples_of(turn, offset=-500.0)
+def test_a_video_of_something_else_is_refused(drive):
+    late = samples_of(drive, offset=-500.0)
     with pytest.raises(InputError, match="does the video belong"):
-        aligned(turn, late)
+        aligned(drive, late)
     with pytest.raises(InputError, match="does it belong to this run"):
-        measure_slip(late, 0.0, turn.run, turn.robot, Parameters.nominal(turn.robot))
+        measured(drive, late, offset=0.0)
 
 
-def test_gaps_are_flagged(turn):
-    samples = samples_of(turn, gap=[(4.0, 4.6)])
-    found = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+def test_gaps_are_flagged(drive):
+    found = measured(drive, samples_of(drive, gap=[(4.0, 4.6)]))
     gap = (found.time > 4.2) & (found.time < 4.4)
     assert not found.covered[gap].any()
     assert found.covered[found.time < 3.8].all()
     assert found.pose_std[gap, 0].min() > 5 * np.median(found.pose_std[:, 0])
 
 
-def test_a_wild_sample_is_left_out(turn):
-    samples = samples_of(turn)
-    bad = samples[100]
-    wild = Sample(bad.index, bad.time, OK, bad.pose + np.array([0.05, 0, 0, 0, 0, 0]), bad.covariance, 4, 0.02, bad.centres)
-    found = measure_slip([*samples[:100], wild, *samples[101:]], OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+def test_a_wild_sample_is_left_out(drive):
+    samples = samples_of(drive)
+    samples[100] = replace(samples[100], pose=samples[100].pose + np.array([0.05, 0, 0, 0, 0, 0]))
+    found = measured(drive, samples)
     assert np.flatnonzero(found.outliers).tolist() == [100]
-    assert np.abs(found.slip - true_slip(turn, found.time)).max() < 1e-3
+    assert np.abs(found.slip - true_slip(drive, found.time)).max() < 1e-3
 
 
-def test_a_video_that_starts_in_mid_drive_is_told(turn):
-    samples = samples_of(turn)
+def test_a_video_that_starts_in_mid_drive_is_told(drive):
+    samples = samples_of(drive)
     for first, told in ((0, False), (60, True)):
-        slip = measure_slip(samples[first:], OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
-        assert any("already moves" in finding for finding in _findings(samples[first:], slip, 0.0)) == told
+        said = _findings(samples[first:], measured(drive, samples[first:]), 0.0)
+        assert any("already moves" in finding for finding in said) == told
 
 
-def test_a_video_that_is_cut_off_is_told(turn):
-    samples = samples_of(turn)[:30]
-    slip = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
+def test_a_video_that_is_cut_off_is_told(drive):
+    samples = samples_of(drive)[:30]
+    slip = measured(drive, samples)
     told = list(_findings(samples, slip, 0.0, 12))
     assert any("announces 42 frames, of which 30 could be decoded" in finding for finding in told)
     assert not any("announces" in finding for finding in _findings(samples, slip, 0.0))
 
 
 @pytest.mark.parametrize("origin", ["start", "floor"])
-def test_columns_are_the_pose_at_the_row(turn, origin):
-    table = camera_columns(samples_of(turn), OFFSET, turn.run, origin, np.zeros(len(samples_of(turn)), bool))
+def test_columns_are_the_pose_at_the_row(drive, origin):
+    table = camera_columns(samples_of(drive), OFFSET, drive.run, origin, np.zeros(len(samples_of(drive)), bool))
     rows = np.flatnonzero(np.isfinite(table["cam_x"]))
-    assert len(rows) == len(samples_of(turn))
-    truth = np.array([[*pose_at(turn, t).position[:2], angles(pose_at(turn, t).rotation)[0]] for t in table["t"][rows]])
+    assert len(rows) == len(samples_of(drive))
+    truth = np.array([[*pose_at(drive, t).position[:2], angles(pose_at(drive, t).rotation)[0]] for t in table["t"][rows]])
     if origin == "start":
         truth -= truth[0]  # it starts with heading 0
     found = table.loc[rows, ["cam_x", "cam_y", "cam_yaw"]].to_numpy()
     assert np.abs(found - truth).max() < 6e-4
 
 
-def test_results_are_written_and_the_run_reads_back(turn, tmp_path):
-    samples = samples_of(turn)
-    slip = measure_slip(samples, OFFSET, turn.run, turn.robot, Parameters.nominal(turn.robot))
-    table = camera_columns(samples, OFFSET, turn.run, "start", slip.outliers)
-    run = Run(table, turn.run.meta, tmp_path / "run_01.parquet")
-    analysis = VideoAnalysis(run, tuple(samples), None, OFFSET, slip, turn.robot, "start", 0.0, 3, ())
+def test_results_are_written_and_the_run_reads_back(drive, tmp_path):
+    samples = samples_of(drive)
+    slip = measured(drive, samples)
+    table = camera_columns(samples, OFFSET, drive.run, "start", slip.outliers)
+    run = Run(table, drive.run.meta, tmp_path / "run_01.parquet")
+    analysis = VideoAnalysis(run, tuple(samples), None, OFFSET, slip, drive.robot, "start", 0.0, 3, ())
     names = {path.name for path in save_video_analysis(analysis, tmp_path)}
     assert names == {"run_01.parquet", "slip.csv", "frames.csv", "summary.json", "pose.png", "slip.png"}
     again = read_run(tmp_path / "run_01.parquet")

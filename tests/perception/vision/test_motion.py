@@ -6,16 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_measure import OFFSET, samples_of
+from vision_studio import OFFSET, measured, samples_of, with_table
 
-from studies.bench.vision import pose_at, skid_turn, true_slip
-from wlr_gym.data import Run
+from studies.bench.vision import pose_at, true_slip
 from wlr_gym.perception.vision import slip
 from wlr_gym.perception.vision.motion import ImuReadings, smooth_motion
-from wlr_gym.perception.vision.slip import imu_findings, measure_slip, wrong_axes
+from wlr_gym.perception.vision.slip import imu_findings, wrong_axes
 from wlr_gym.perception.vision.tracking import OK, Sample, angles
-from wlr_gym.robot import load_robot
-from wlr_gym.robot.parameters import Parameters
 
 GRAVITY, SECONDS = 9.80665, 5.0
 SIZE = np.array([0.2, 0.1, 0.01, 0.9, 0.03, 0.02])
@@ -97,9 +94,8 @@ def test_the_covariance_of_slip_is_that_of_its_errors(with_imu):
     for seed in range(12):
         found = smoothed(seed, with_imu)
         off = found.value - truth(ROWS)
-        errors.append(
-            np.stack([off[:, 0], off[:, 1] + 0.1 * off[:, 3]], axis=1)[[120, -1]] - [off[0, 0], off[0, 1] + 0.1 * off[0, 3]]
-        )
+        moved = np.stack([off[:, 0], off[:, 1] + 0.1 * off[:, 3]], axis=1)
+        errors.append(moved[[120, -1]] - moved[0])
         stds.append(np.sqrt(np.diagonal(found.slip_covariance, axis1=1, axis2=2)[[120, -1], :2]))
         assert found.slip_covariance[-1, 0, 2] == pytest.approx(found.slip_covariance[-1, 0, 0])
     spread = rms((np.array(errors) / stds).reshape(-1, 2))
@@ -119,14 +115,9 @@ def test_mounting_of_the_imu_and_missing_readings_do_not_matter():
     assert np.all(rms((found.value - value) / found.value_std) < 1.4)
 
 
-@pytest.fixture(scope="module")
-def drive():
-    return skid_turn(load_robot())
-
-
-def measured(drive, samples=None, **columns):
-    run = Run(drive.run.table.assign(**columns), drive.run.meta, drive.run.path)
-    return measure_slip(samples or samples_of(drive), OFFSET, run, drive.robot, Parameters.nominal(drive.robot))
+def measured_with(drive, samples=None, **columns):
+    """Slip with other columns of the log."""
+    return measured(drive, samples, run=with_table(drive.run, drive.run.table.assign(**columns)))
 
 
 @pytest.mark.slow
@@ -134,7 +125,7 @@ def measured(drive, samples=None, **columns):
 def test_slip_to_the_side_is_sharper_with_the_imu(drive, monkeypatch, legs, share):
     if not legs:
         monkeypatch.setattr(slip, "leg_findings", lambda *_: ["not used"])
-    alone, both = measured(drive, **NONE), measured(drive)
+    alone, both = measured_with(drive, **NONE), measured_with(drive)
     true = true_slip(drive, both.time)
     assert np.median(both.slip_std[:, :, 1]) < share * np.median(alone.slip_std[:, :, 1])
     assert np.median(both.slip_velocity_std[:, :, 1]) < 0.95 * np.median(alone.slip_velocity_std[:, :, 1])
@@ -146,11 +137,11 @@ def test_slip_to_the_side_is_sharper_with_the_imu(drive, monkeypatch, legs, shar
 def test_an_imu_that_the_film_contradicts_pulls_nothing(drive):
     """A gyroscope that loses counts for a second; and a film whose tilt jumps."""
     lost = np.where(np.abs(drive.run["t"] - 4.5) < 0.5, 0.0, drive.run["gyro_z"])
-    assert np.array_equal(measured(drive, gyro_z=lost).pose, measured(drive, **NONE).pose)
+    assert np.array_equal(measured_with(drive, gyro_z=lost).pose, measured_with(drive, **NONE).pose)
     tilt = np.array([0, 0, 0, 0, 0.05, 0])
     jumped = [replace(s, pose=s.pose + tilt * (4 < s.time < 5)) for s in samples_of(drive)]
-    assert np.array_equal(measured(drive, jumped).pose, measured(drive, jumped, **NONE).pose)
-    assert not np.array_equal(measured(drive).pose, measured(drive, **NONE).pose)
+    assert np.array_equal(measured_with(drive, jumped).pose, measured_with(drive, jumped, **NONE).pose)
+    assert not np.array_equal(measured_with(drive).pose, measured_with(drive, **NONE).pose)
 
 
 WRONG = {
@@ -168,8 +159,8 @@ WRONG = {
 @pytest.mark.parametrize("wrong", WRONG)
 def test_a_wrong_imu_changes_nothing_and_is_a_finding(drive, wrong):
     columns = WRONG[wrong](drive.run)
-    run = Run(drive.run.table.assign(**columns), drive.run.meta, drive.run.path)
-    assert np.array_equal(measured(drive, **columns).pose, measured(drive, **NONE).pose)
+    run = with_table(drive.run, drive.run.table.assign(**columns))
+    assert np.array_equal(measured_with(drive, **columns).pose, measured_with(drive, **NONE).pose)
     assert list(imu_findings(samples_of(drive), OFFSET, run, drive.robot))
 
 
@@ -177,7 +168,7 @@ def test_an_axis_of_the_accelerometer_that_is_wrong_is_named(drive):
     """With what the film shows instead and when: the start at 1 s; of a right one nothing is said."""
 
     def found(**columns):
-        run = Run(drive.run.table.assign(**columns), drive.run.meta, drive.run.path)
+        run = with_table(drive.run, drive.run.table.assign(**columns))
         return {(channel, shown): time for channel, shown, time in wrong_axes(samples_of(drive), OFFSET, run, drive.robot)}
 
     assert not found()
@@ -189,7 +180,7 @@ def test_an_axis_of_the_accelerometer_that_is_wrong_is_named(drive):
 def test_one_missing_reading_does_not_matter(drive):
     missing = drive.run["gyro_z"].copy()
     missing[100] = math.nan
-    found, whole, alone = measured(drive, gyro_z=missing), measured(drive), measured(drive, **NONE)
+    found, whole, alone = measured_with(drive, gyro_z=missing), measured_with(drive), measured_with(drive, **NONE)
     assert np.abs(found.pose - whole.pose).max() < 0.05 * np.abs(alone.pose - whole.pose).max()
 
 
@@ -201,7 +192,7 @@ def test_sigmas_hold_in_gaps_of_the_film(drive, with_imu):
     for seed in range(6):
         width = rng.uniform(0.5, 4.0)
         start = rng.uniform(0.8, 8.0 - width)
-        found = measured(drive, samples_of(drive, seed=seed, gap=((start, start + width),)), **({} if with_imu else NONE))
+        found = measured_with(drive, samples_of(drive, seed=seed, gap=((start, start + width),)), **({} if with_imu else NONE))
         gap = (found.time > start) & (found.time < start + width)
         true = [pose_at(drive, t) for t in found.time[gap]]
         true = np.unwrap(np.stack([np.concatenate([pose.position, angles(pose.rotation)]) for pose in true]), axis=0)

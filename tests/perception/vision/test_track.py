@@ -9,9 +9,8 @@ from vision_studio import Studio, hand, pose_of, wrapped
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.perception.markers.camera import Camera
-from wlr_gym.perception.markers.pose import TargetPose
-from wlr_gym.perception.scene import ScenePose, rotation_of
-from wlr_gym.perception.vision.tracking import LOST, MOVED, OK, PARTIAL, Tracker, VideoFrame, _mirrored, locate_floor, track
+from wlr_gym.perception.scene import ScenePose
+from wlr_gym.perception.vision.tracking import LOST, MOVED, OK, PARTIAL, Tracker, VideoFrame, locate_floor, track
 
 
 @pytest.fixture(scope="module")
@@ -63,16 +62,6 @@ def test_after_a_jump_the_markers_are_not_taken_for_their_mirror_image(studio, t
         sample = tracker(replace(studio.frame(pose, 4 * shown), index=index, time=index / 30))
         assert abs(wrapped(sample.pose[5])) < 0.03
         assert np.abs(sample.pose[:3] - pose.position).max() < 1e-3
-
-
-def test_the_mirrored_pose_has_the_normal_mirrored_at_the_line_of_sight():
-    turn, place = rotation_of(0.4, 0.15) @ np.diag([1.0, -1.0, -1.0]), np.array([0.3, 0.1, 1.5])
-    found = TargetPose(turn, place, np.eye(6), np.ones(4, bool), 0.0, 1.0)
-    mirrored, same = _mirrored(found)
-    sight = place / np.linalg.norm(place)
-    assert mirrored[:, 2] == pytest.approx(2 * (turn[:, 2] @ sight) * sight - turn[:, 2])
-    assert mirrored.T @ mirrored == pytest.approx(np.eye(3))
-    assert same is place
 
 
 def test_a_hidden_marker_gives_a_flagged_pose(studio, tracker):
@@ -142,18 +131,18 @@ def test_a_dark_image_is_lost(studio, tracker):
     assert tracker(VideoFrame(0, 0.0, np.zeros((720, 1280), np.uint8))).status == LOST
 
 
-def test_wrong_image_size_is_refused(studio):
-    with pytest.raises(InputError, match=r"frame 0: 640 x 480 px, but the camera was calibrated for 1280 x 720"):
-        track([VideoFrame(0, 0.0, np.zeros((480, 640), np.uint8))], studio.camera, studio.body, studio.floor)
-
-
-def test_too_few_floor_markers_are_refused(studio):
-    frame = studio.frame(moving(0), 0)
-    frame.image[:360, :640] = 128
-    with pytest.raises(InputError, match=r"no floor frame in the first 1 frames: 3 of the 4 markers of 'floor' seen"):
-        track([frame], studio.camera, studio.body, studio.floor)
-
-
-def test_no_frames_are_refused(studio):
-    with pytest.raises(InputError, match="no frames"):
-        track([], studio.camera, studio.body, studio.floor)
+@pytest.mark.parametrize(
+    ("shown", "message"),
+    [
+        (None, "no frames"),
+        ((480, 640), "frame 0: 640 x 480 px, but the camera was calibrated for 1280 x 720"),
+        ((720, 1280), "no floor frame in the first 1 frames: 3 of the 4 markers of 'floor' seen"),
+    ],
+)
+def test_films_without_a_floor_are_refused(studio, shown, message):
+    frames = [] if shown is None else [VideoFrame(0, 0.0, np.zeros(shown, np.uint8))]
+    if shown == (720, 1280):
+        frames = [studio.frame(moving(0), 0)]
+        frames[0].image[:360, :640] = 128
+    with pytest.raises(InputError, match=message):
+        track(frames, studio.camera, studio.body, studio.floor)
