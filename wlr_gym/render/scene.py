@@ -230,7 +230,8 @@ class Scene:
             text = (places[:, 0] < 0.48 * width) & ((places[:, 1] < 0.27 * height) | (places[:, 1] > 0.76 * height))
             good = inside & ~text & (np.linalg.norm(places - robot, axis=1) > clear)
             if good.any():
-                notes.append((f"µ {area.mu:.2g}", marks.pair(places[np.argmax(good)])))
+                column, row = places[np.argmax(good)]
+                notes.append((f"µ {area.mu:.2g}", (float(column), float(row))))
         return notes
 
 

@@ -295,13 +295,8 @@ def areas(parameters: Parameters, row: int, around: Array) -> list[Area]:
         high = np.minimum([box[1], box[3]], around[:2] + REACH)
         if (low < high).all():
             mu = float(parameters["patch.mu"][row, index]) * float(share)
-            found.append(Area(pair(low), pair(high), mu, LAYER * (index + 1)))
+            found.append(Area((float(low[0]), float(low[1])), (float(high[0]), float(high[1])), mu, LAYER * (index + 1)))
     return found
-
-
-def pair(values: Array) -> tuple[float, float]:
-    """Return the first two numbers."""
-    return float(values[0]), float(values[1])
 
 
 def spots(stage: Stage, parameters: Parameters, row: int) -> list[Spot]:

@@ -131,6 +131,12 @@ def solve_pose(
     return None
 
 
+def solved_again(seen: dict[int, Detection], target: Target, camera: Camera, found: TargetPose) -> TargetPose:
+    """The pose from other markers than those of ``found``, which stays where they do not fit."""
+    again = solve_pose(seen, target, camera, found.rotation, found.position)
+    return again if again is not None and again.residual < LARGEST_RESIDUAL else found
+
+
 def solved_floor(seen: Mapping[int, Detection], floor: Target, camera: Camera, start: TargetPose) -> TargetPose | None:
     """The floor's pose, with the tolerance of its markers' places in the weights and in the covariance."""
     std = floor.tolerance / start.position[2]  # in undistorted coordinates; a marker's circles share it

@@ -170,12 +170,16 @@ def look(robot: Any, sensors: Any, r: Any) -> None:
         ux = wy * z - wz * y + leg_rate * (leg_z + rim_z) + wheel_rate * rim_z
         uy = wz * x - wx * z
         uz = wx * y - wy * x - leg_rate * (leg_x + rim_x) - wheel_rate * rim_x
-        r.point[i, 0] = hx * x + hz * z
-        r.point[i, 1] = r.left[0] * x + r.left[1] * y + r.left[2] * z
-        r.point[i, 2] = nx * x + ny * y + nz * z
-        r.rolling[i, 0] = -(hx * ux + hz * uz)
-        r.rolling[i, 1] = -(r.left[0] * ux + r.left[1] * uy + r.left[2] * uz)
-        r.lift[i] = -(nx * ux + ny * uy + nz * uz)
+        r.point[i, 0], r.point[i, 1], r.point[i, 2] = _along_floor(r, x, y, z)
+        ahead, aside, up = _along_floor(r, ux, uy, uz)
+        r.rolling[i, 0], r.rolling[i, 1], r.lift[i] = -ahead, -aside, -up
+
+
+@njit(cache=True, nogil=True)
+def _along_floor(r: Any, x: float, y: float, z: float) -> Any:
+    """Return a vector of the body frame along heading, left and normal."""
+    h, left, n = r.heading, r.left, r.normal
+    return h[0] * x + h[2] * z, left[0] * x + left[1] * y + left[2] * z, n[0] * x + n[1] * y + n[2] * z
 
 
 @njit(cache=True, nogil=True)
@@ -188,12 +192,7 @@ def _centre_of_mass(robot: Any, r: Any) -> Any:
         x += assembly * robot.hip[i, 0] + moment * r.leg[i, 0]
         y += assembly * robot.hip[i, 1]
         z += assembly * robot.hip[i, 2] - moment * r.leg[i, 1]
-    x, y, z = x / robot.mass, y / robot.mass, z / robot.mass
-    return (
-        r.heading[0] * x + r.heading[2] * z,
-        r.left[0] * x + r.left[1] * y + r.left[2] * z,
-        r.normal[0] * x + r.normal[1] * y + r.normal[2] * z,
-    )
+    return _along_floor(r, x / robot.mass, y / robot.mass, z / robot.mass)
 
 
 @njit(cache=True, nogil=True)
@@ -308,11 +307,10 @@ def leak_noise(robot: Any, square: Any) -> Any:
 def turn(robot: Any, r: Any) -> None:
     """Turn floor normal and heading with the gyroscope."""
     before, dt = r.yaw_rate, robot.period
-    wx, wy, wz = r.rate[0], r.rate[1], r.rate[2]
     for k in range(3):
         r.last_rate[k] = r.rate[k]
         r.rate[k] = r.seen[SENSOR.gyro + k]
-    mx, my, mz = (0.5 * dt * (r.rate[0] + wx), 0.5 * dt * (r.rate[1] + wy), 0.5 * dt * (r.rate[2] + wz))
+    mx, my, mz = _mean_rate(r, dt)
     nx, ny, nz = r.normal[0], r.normal[1], r.normal[2]
     set_normal(r, nx - (my * nz - mz * ny), ny - (mz * nx - mx * nz), nz - (mx * ny - my * nx))
     r.yaw_rate = r.normal[0] * r.rate[0] + r.normal[1] * r.rate[1] + r.normal[2] * r.rate[2] - r.gyro_bias
@@ -326,6 +324,13 @@ def turn(robot: Any, r: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _mean_rate(r: Any, factor: float) -> Any:
+    """Return the mean angular velocity over the step, body frame, times a factor."""
+    w, last = r.rate, r.last_rate
+    return 0.5 * factor * (w[0] + last[0]), 0.5 * factor * (w[1] + last[1]), 0.5 * factor * (w[2] + last[2])
+
+
+@njit(cache=True, nogil=True)
 def set_normal(r: Any, x: float, y: float, z: float) -> None:
     scale = 1.0 / math.sqrt(x * x + y * y + z * z)
     r.normal[0], r.normal[1], r.normal[2] = x * scale, y * scale, z * scale
@@ -335,24 +340,20 @@ def set_normal(r: Any, x: float, y: float, z: float) -> None:
 def measure_force(r: Any) -> None:
     """Turn the accelerometer's reading into the heading frame: ``r.last_force``."""
     x, y, z = r.seen[SENSOR.accelerometer], r.seen[SENSOR.accelerometer + 1], r.seen[SENSOR.accelerometer + 2]
-    r.last_force[0] = r.heading[0] * x + r.heading[2] * z
-    r.last_force[1] = r.left[0] * x + r.left[1] * y + r.left[2] * z
-    r.last_force[2] = r.normal[0] * x + r.normal[1] * y + r.normal[2] * z
+    r.last_force[0], r.last_force[1], r.last_force[2] = _along_floor(r, x, y, z)
 
 
 @njit(cache=True, nogil=True)
 def sense_force(robot: Any, r: Any) -> None:
     """Mean specific force over the step, how much it changed along the floor, and friction demand."""
-    x, y, z = r.last_force[0], r.last_force[1], r.last_force[2]
+    last = (r.last_force[0], r.last_force[1], r.last_force[2])
     measure_force(r)
-    old, new = 0.5 - robot.lag, 0.5 + robot.lag
-    r.force[0] = old * x + new * r.last_force[0]
-    r.force[1] = old * y + new * r.last_force[1]
-    r.force[2] = old * z + new * r.last_force[2]
+    for k in range(3):
+        r.force[k] = (0.5 - robot.lag) * last[k] + (0.5 + robot.lag) * r.last_force[k]
     along = math.sqrt((r.force[0] - r.leak[0]) ** 2 + (r.force[1] - r.leak[1]) ** 2)
     demand = along / max(r.force[2], 0.2 * robot.gravity)
     r.demand += (1.0 - math.exp(-robot.period / _SMOOTH)) * (demand - r.demand)
-    r.shaken = math.sqrt((r.last_force[0] - x) ** 2 + (r.last_force[1] - y) ** 2)
+    r.shaken = math.sqrt((r.last_force[0] - last[0]) ** 2 + (r.last_force[1] - last[1]) ** 2)
 
 
 @njit(cache=True, nogil=True)
@@ -663,8 +664,7 @@ def _seen_velocity(robot: Any, x: float, y: float, r: Any) -> Any:
     height = (n[0] * lens[0] + n[1] * lens[1] + n[2] * lens[2] - floor) / n[2]
     c, s = math.cos(r.lens[1]), math.sin(r.lens[1])
     x, y = (1.0 + r.lens[0]) * (c * x - s * y), (1.0 + r.lens[0]) * (s * x + c * y)
-    wx, wy = 0.5 * (r.rate[0] + r.last_rate[0]), 0.5 * (r.rate[1] + r.last_rate[1])
-    wz = 0.5 * (r.rate[2] + r.last_rate[2])
+    wx, wy, wz = _mean_rate(r, 1.0)
     bx = height * (x + wy) - (wy * lens[2] - wz * lens[1]) - rise * n[0]
     by = height * (y - wx) - (wz * lens[0] - wx * lens[2]) - rise * n[1]
     along = bx / r.heading[0]

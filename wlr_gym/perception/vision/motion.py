@@ -384,8 +384,7 @@ def smooth_motion(
         slipping: slip velocities (K, 4, 2) for values and rates (K, 6) at the rows.
         imu: None = the camera alone. legs: what they say at the rows; None = nothing.
     """
-    poses, std = _unwrapped(samples), _std(samples)
-    outliers = _outliers(poses, std, time)
+    poses, std, outliers = _signals(samples, time)
     kept = np.isfinite(poses[:, 0]) & ~outliers
     first, last = time[kept][[0, -1]]
     inside = np.flatnonzero((imu.time > first) & (imu.time < last)) if imu is not None else np.zeros(0, np.int64)
@@ -393,7 +392,7 @@ def smooth_motion(
     order = np.argsort(moments, kind="stable")
     moments = moments[order]
     frames, shown, read = np.split(np.argsort(order, kind="stable"), np.cumsum([kept.sum(), len(rows)]))
-    near = _each_alone(poses, std, time, outliers, moments)
+    near = _each_alone(poses, std, outliers, time, moments)
     at = np.zeros((len(moments), _SIZE))  # near enough to be linear about
     for part, name in ((_VALUE, "value"), (_RATE, "rate"), (_ACCELERATION, "acceleration")):
         at[:, part] = np.stack([getattr(signal, name) for signal in near], axis=1)
@@ -435,34 +434,27 @@ def smooth_motion(
 
 def without_outliers(samples: Sequence[Sample], time: Array) -> list[Sample]:
     """The samples that do not contradict their neighbours."""
-    kept = ~_outliers(_unwrapped(samples), _std(samples), time)
-    return [sample for sample, fine in zip(samples, kept, strict=True) if fine]
+    outliers = _signals(samples, time)[2]
+    return [sample for sample, wrong in zip(samples, outliers, strict=True) if not wrong]
 
 
 def smoothed_poses(samples: Sequence[Sample], time: Array, at: Array) -> list[Smoothed]:
     """Each of the six coordinates alone at the times ``at`` (K,), without outliers."""
-    poses, std = _unwrapped(samples), _std(samples)
-    return _each_alone(poses, std, time, _outliers(poses, std, time), at)
+    return _each_alone(*_signals(samples, time), time, at)
 
 
-def _each_alone(poses: Array, std: Array, time: Array, outliers: NDArray[np.bool_], at: Array) -> list[Smoothed]:
+def _each_alone(poses: Array, std: Array, outliers: NDArray[np.bool_], time: Array, at: Array) -> list[Smoothed]:
     kept = np.where(outliers[:, None], np.nan, poses)
     return [smooth(time, kept[:, k], std[:, k], at) for k in range(6)]
 
 
-def _outliers(poses: Array, std: Array, time: Array) -> NDArray[np.bool_]:
-    return np.any([smooth(time, poses[:, k], std[:, k], time[:1], _JUMP[k]).outliers for k in range(6)], axis=0)
-
-
-def _std(samples: Sequence[Sample]) -> Array:
-    return np.sqrt(np.stack([np.diag(sample.covariance) for sample in samples]))
-
-
-def _unwrapped(samples: Sequence[Sample]) -> Array:
-    poses = np.stack([sample.pose for sample in samples])
+def _signals(samples: Sequence[Sample], time: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Poses (F, 6) with a continuous yaw, their 1 sigma, and which are outliers."""
+    poses, std = np.stack([s.pose for s in samples]), np.sqrt(np.stack([np.diag(s.covariance) for s in samples]))
     known = np.isfinite(poses[:, 3])
     poses[known, 3] = np.unwrap(poses[known, 3])
-    return poses
+    alone = [smooth(time, poses[:, k], std[:, k], time[:1], _JUMP[k]) for k in range(6)]
+    return poses, std, np.any([signal.outliers for signal in alone], axis=0)
 
 
 class _Measurements:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import Detection
-from wlr_gym.perception.markers.pose import LARGEST_RESIDUAL, MINIMUM_MARKERS, TargetPose, solve_pose, solved_floor
+from wlr_gym.perception.markers.pose import MINIMUM_MARKERS, TargetPose, solve_pose, solved_again, solved_floor
 from wlr_gym.perception.markers.targets import Target
 from wlr_gym.perception.vision.adjustment import LONGEST_STEP, Adjustment, TargetView, adjust, at_frame_time, velocity_between
 from wlr_gym.perception.vision.tracking import (
@@ -433,8 +433,7 @@ def _solved(
         seen = sample.seen
         if readout:
             seen = at_frame_time(TargetView(seen, found.rotation, found.position, speed), target, camera.height, readout)
-        again = solve_pose(seen, target, camera, found.rotation, found.position)
-        found = again if again is not None and again.residual < LARGEST_RESIDUAL else found
+        found = solved_again(seen, target, camera, found)
     pose, covariance = pose_in_floor(found, floor, moving)
     return replace(
         sample, status=OK if found.used.all() else PARTIAL, pose=pose, covariance=covariance, residual=found.residual,

@@ -29,6 +29,7 @@ from wlr_gym.perception.markers.pose import (
     find_target,
     sheet_fault,
     solve_pose,
+    solved_again,
     solved_floor,
 )
 from wlr_gym.perception.markers.targets import Target
@@ -154,11 +155,9 @@ class Tracker:
         (before, first), (now, last) = self._track[0], self._track[-1]
         if not before < now < before + LONGEST_STEP:
             return found
-        speed = velocity_between(first, last, now - before)
-        view = TargetView(seen, found.rotation, found.position, speed)
+        view = TargetView(seen, found.rotation, found.position, velocity_between(first, last, now - before))
         moved = at_frame_time(view, self._stated, self.camera.height, self.camera.readout or 0.0)
-        again = solve_pose(moved, self._stated, self.camera, found.rotation, found.position)
-        return again if again is not None and again.residual < LARGEST_RESIDUAL else found
+        return solved_again(moved, self._stated, self.camera, found)
 
     def _search(self, image: Image) -> tuple[TargetPose | None, dict[int, Detection]]:
         """Look around where the body was, then everywhere."""
@@ -387,8 +386,7 @@ _BLANK, _BRIGHT = 12.0, 240.0
 class PoseFinder:
     """Turn frames of a live camera into samples, in the order in which they come.
 
-    Args:
-        camera: its lens. body, floor: targets.
+    ``camera``: its lens. ``body``, ``floor``: targets.
     """
 
     def __init__(self, camera: Camera, body: Target, floor: Target) -> None:
@@ -399,11 +397,7 @@ class PoseFinder:
         self._last: Image | None = None
 
     def __call__(self, frame: VideoFrame) -> Sample:
-        """Process one frame.
-
-        Raises:
-            InputError: another size than the camera was calibrated for.
-        """
+        """Process one frame."""
         check_size(frame.image, self.camera, "camera")
         last, self._last = self._last, frame.image
         if last is not None and np.array_equal(last, frame.image):

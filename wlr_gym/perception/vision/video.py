@@ -170,8 +170,7 @@ def _read_times(path: Path) -> list[float]:
 class VideoFile:
     """A video that gets its name when it is whole. A context manager: after an error, what was there before stays.
 
-    Args:
-        path: of the file. code: four letters of the codec. rate: Hz.
+    ``code``: four letters of the codec. ``rate``: Hz.
     """
 
     def __init__(self, path: Path, code: str, rate: float) -> None:
@@ -328,11 +327,7 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
 
 
 def open_device(device: int | str, camera: Camera) -> Any:
-    """Return a camera's ``cv2.VideoCapture``, asked for pictures of the size it was calibrated with.
-
-    Raises:
-        InputError: it cannot be opened.
-    """
+    """Return a camera's ``cv2.VideoCapture``, asked for pictures of the size it was calibrated with."""
     import cv2
 
     capture = cv2.VideoCapture(device)
