@@ -55,7 +55,7 @@ class Smoothed:
     """A signal at the requested times.
 
     Attributes:
-        value, rate, acceleration: (K,). value_std, rate_std: 1 sigma.
+        value, rate, acceleration: (K,).
         outliers: (T,) samples left out.
         density: spectral density of the jerk that was found, unit^2/s^5.
     """
@@ -63,8 +63,6 @@ class Smoothed:
     value: Array
     rate: Array
     acceleration: Array
-    value_std: Array
-    rate_std: Array
     outliers: NDArray[np.bool_]
     density: float
 
@@ -101,9 +99,8 @@ def smooth(time: ArrayLike, values: ArrayLike, std: ArrayLike | float, at: Array
     _smooth_back(moments, density, states, spreads)
     rows, outliers = places[len(t) :], np.zeros(len(time), np.bool_)
     outliers[known] = rejected[places[: len(t)]]
-    deviations = np.sqrt(np.maximum(spreads[rows][:, [0, 1], [0, 1]], 0.0))
     value, rate, acceleration = states[rows].T
-    return Smoothed(value + middle, rate, acceleration, deviations[:, 0], deviations[:, 1], outliers, density)
+    return Smoothed(value + middle, rate, acceleration, outliers, density)
 
 
 @inner_kernel
@@ -163,29 +160,22 @@ def _filter(
 
 
 def _smooth_back(time: Array, density: float, states: Array, spreads: Array) -> None:
-    """Rauch, Tung and Striebel: let filtered states (N, 3) and covariances hear of all later ones."""
+    """Rauch, Tung and Striebel: let filtered states (N, 3) hear of all later ones."""
     step, before = np.diff(time)[:, None, None], spreads[:-1]
     matrix = np.eye(3) + step * np.eye(3, k=1) + 0.5 * step**2 * np.eye(3, k=2)
     ahead = matrix @ before @ matrix.transpose(0, 2, 1) + density * _SHARES * step**_POWERS
     gain = np.linalg.solve(np.where(step > 0, ahead, np.eye(3)), matrix @ before).transpose(0, 2, 1)
     gain = np.where(step > 0, gain, np.eye(3))
     states[:-1] -= (gain @ matrix @ states[:-1, :, None])[..., 0]
-    spreads[:-1] -= gain @ ahead @ gain.transpose(0, 2, 1)
-    _add_later(gain, states, spreads)
+    _add_later(gain, states)
 
 
 @njit(cache=True, nogil=True)
-def _add_later(gain: Any, states: Any, spreads: Any) -> None:
-    half = np.empty((3, 3))
+def _add_later(gain: Any, states: Any) -> None:
     for n in range(gain.shape[0] - 1, -1, -1):
-        g, later = gain[n], spreads[n + 1]
         for i in range(3):
             for j in range(3):
-                states[n, i] += g[i, j] * states[n + 1, j]
-                half[i, j] = g[i, 0] * later[0, j] + g[i, 1] * later[1, j] + g[i, 2] * later[2, j]
-        for i in range(3):
-            for j in range(3):
-                spreads[n, i, j] += half[i, 0] * g[j, 0] + half[i, 1] * g[j, 1] + half[i, 2] * g[j, 2]
+                states[n, i] += gain[n, i, j] * states[n + 1, j]
 
 
 # --- what legs say ------------------------------------------------------------------------------------------------------
@@ -211,12 +201,11 @@ class LegReadings:
     """What the legs say.
 
     Attributes:
-        time: (K,) s. values: (K, 3) height, pitch, roll on a plane. by_wheel: (K, 3, 4) change with the floor under each wheel.
+        values: (K, 3) height, pitch, roll on a plane. by_wheel: (K, 3, 4) change with the floor under each wheel.
         by_zero: (K, 3, 4) with the legs' zeros. noise: (K, 3, 3) of a row. wander: (K, 4) m2/s, of the floor under each wheel.
         prior: (OPEN,) 1 sigma of what is left open.
     """
 
-    time: Array
     values: Array
     by_wheel: Array
     by_zero: Array
@@ -248,7 +237,7 @@ def leg_readings(time: Array, joints: tuple[Array, Array], robot: Robot, paramet
     way = rolled + _SPRINGY * np.abs(rate[:, LEG_SLICE] * parameters["leg.length"])
     known = robot.tolerances.get("joint_zero")
     prior = np.repeat([_CONSTANT_STD, UNEVEN, _SLOPE_STD, _ZERO if known is None else known.legs], _OPENS)
-    return LegReadings(time, values, by_wheel, by_zero, noise, way * UNEVEN**2 / length, prior)
+    return LegReadings(values, by_wheel, by_zero, noise, way * UNEVEN**2 / length, prior)
 
 
 def repeated(parameters: Parameters, count: int) -> Parameters:
