@@ -138,7 +138,7 @@ def _analyse(
     from wlr_gym.perception.vision.video import AnnotatedVideo, Frames
 
     frames = Frames(options.video, options.rate, options.times, options.seconds)
-    writer = AnnotatedVideo(options.out / "annotated.mp4", body) if options.annotate else nullcontext()
+    writer = AnnotatedVideo(options.out / "annotated.mp4", body, frames) if options.annotate else nullcontext()
     length = min(float(np.ptp(measured["t"])), options.seconds or math.inf)  # a film is about as long as its run
     began: list[float] = []
     with writer as video, progress(console) as tell:

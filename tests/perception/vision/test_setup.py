@@ -8,6 +8,8 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ from wlr_gym.perception.markers.targets import load_target
 from wlr_gym.perception.scene import Facet, Look, Renderer, ScenePose, rotation_of
 from wlr_gym.perception.vision.sheets import Board, board_page, target_pages, write_pages
 from wlr_gym.perception.vision.tracking import Sample, VideoFrame
-from wlr_gym.perception.vision.video import AnnotatedVideo, Frames, annotate, film
+from wlr_gym.perception.vision.video import AnnotatedVideo, Frames, VideoFile, annotate, film
 
 TRUE = Camera(width=640, height=480, focal=(620.0, 615.0), centre=(325.0, 236.0), distortion=(-0.2, 0.05, 0.001, -0.002, 0.0))
 
@@ -209,7 +211,11 @@ NOWHERE = Sample(0, 0.0, "lost", np.full(6, np.nan), np.full((6, 6), np.nan), 0,
 def test_an_annotated_video_is_whole_or_what_it_was(fails, count, tmp_path):
     path = tmp_path / "annotated.avi"
     path.write_bytes(b"earlier")
-    with pytest.raises(ZeroDivisionError) if fails else nullcontext(), AnnotatedVideo(path, load_target("body")) as video:
+    source: Any = SimpleNamespace(rate=30.0)
+    with (
+        pytest.raises(ZeroDivisionError) if fails else nullcontext(),
+        AnnotatedVideo(path, load_target("body"), source) as video,
+    ):
         for k in range(count):
             video.add(VideoFrame(k, k / 30, np.zeros((48, 64), np.uint8)), NOWHERE)
         assert path.read_bytes() == b"earlier"
@@ -221,14 +227,21 @@ def test_an_annotated_video_is_whole_or_what_it_was(fails, count, tmp_path):
 @pytest.mark.parametrize("rate", [12.5, 29.97, 60.0, 200 / 3])
 @pytest.mark.parametrize("name", ["annotated.avi", "annotated.mp4"])
 def test_an_annotated_video_plays_at_the_cameras_rate(rate, name, tmp_path):
+    """That of the times, of which one is missing, or that which the video states."""
     import cv2
 
-    with AnnotatedVideo(tmp_path / name, load_target("body")) as video:
-        for k in range(25):
-            video.add(VideoFrame(k, 7.0 + (k + (k > 4)) / rate, np.zeros((48, 64), np.uint8)), NOWHERE)  # the fifth was dropped
-    written = cv2.VideoCapture(str(tmp_path / name))
-    assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(rate, abs=0.01)
-    assert len(list(Frames(str(tmp_path / name)))) == 25
+    with VideoFile(tmp_path / "film.avi", "MJPG", rate) as video:
+        for _ in range(25):
+            video.write(np.zeros((48, 64), np.uint8))
+    (tmp_path / "times.csv").write_text("\n".join(f"{7.0 + (k + (k > 4)) / rate:.9f}" for k in range(25)))
+    for times in (None, tmp_path / "times.csv"):
+        source = Frames(str(tmp_path / "film.avi"), times=times)
+        with AnnotatedVideo(tmp_path / name, load_target("body"), source) as video:
+            for frame in source:
+                video.add(frame, NOWHERE)
+        written = cv2.VideoCapture(str(tmp_path / name))
+        assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(rate, abs=0.01)
+        assert len(list(Frames(str(tmp_path / name)))) == 25
 
 
 @pytest.mark.parametrize("hidden", [None, 0, 3])

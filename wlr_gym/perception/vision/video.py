@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from queue import Full, Queue
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,6 @@ from wlr_gym.perception.vision.tracking import LOST, MOVED, OK, PARTIAL, Sample,
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 _INEXACT = 0.005  # of the number of frames; where it is not stored, it is computed from the duration
 _COLOURS = {OK: (60, 180, 60), PARTIAL: (0, 165, 255), LOST: (40, 40, 220), MOVED: (200, 60, 200)}  # blue, green, red
-_FRAMES_FOR_RATE = 10
 
 
 class Frames:
@@ -49,6 +48,7 @@ class Frames:
     Attributes:
         announced: how many frames there should be; 0 = not known, or not yet read from.
         missing: how many frames a video announces that could not be decoded: it is cut off or damaged. Known at its end.
+        rate: Hz, as given, or of the times; of a video as it states it, known from the first frame on.
 
     Raises:
         InputError: no such file, not a video, no frames, or another number of frames than of times.
@@ -57,6 +57,7 @@ class Frames:
     def __init__(self, source: str, rate: float | None = None, times: Path | None = None, seconds: float | None = None) -> None:
         require_package("cv2", "vision")
         self.announced = self.missing = 0
+        self.rate = rate or 0.0
         self._frames = self._read(source, rate, times, seconds)
 
     def __iter__(self) -> Iterator[VideoFrame]:
@@ -67,6 +68,8 @@ class Frames:
 
     def _read(self, source: str, rate: float | None, times: Path | None, seconds: float | None) -> Iterator[VideoFrame]:
         stamps = None if times is None else _read_times(times)
+        if stamps is not None and len(stamps) > 1:
+            self.rate = 1 / float(np.median(np.diff(stamps)))
         count, first, cut = 0, 0.0, False
         for index, (stamp, image) in enumerate(self._images(source)):
             if stamps is not None and index >= len(stamps):
@@ -100,6 +103,7 @@ class Frames:
         if not video.isOpened():
             raise InputError(f"{path}: cannot be read as a video; expected a format that OpenCV reads (AVI, MP4, MKV)")
         rate, announced = _plausible(video.get(cv2.CAP_PROP_FPS)), video.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.rate = self.rate or rate
         self.announced = max(round(announced), 0) if math.isfinite(announced) else 0
         index, before = 0, -math.inf
         while (read := video.read())[0]:
@@ -121,7 +125,7 @@ class Frames:
         files.sort(key=lambda path: ([int(part) if k % 2 else part for k, part in enumerate(parts[path])], path.name))
         if not files:
             raise InputError(f"{folder}: no images ({', '.join(IMAGES)})")
-        self.announced = len(files)
+        self.announced, self.rate = len(files), self.rate or 30.0
         for index, path in enumerate(files):
             image = read_image(path)
             if image is None:
@@ -174,12 +178,11 @@ class VideoFile:
     """
 
     def __init__(self, path: Path, code: str, rate: float) -> None:
-        self.path, self._code = path, code
-        self._rate = round(rate, 2)  # finer ones are more than MPEG-4's clock can take
+        self.path, self.rate, self._code = path, rate, code
         self._unfinished = path.with_name(f".{path.stem}.unfinished{path.suffix}")
         self._writer = None
 
-    def __enter__(self) -> VideoFile:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, fault: type[BaseException] | None, *_: object) -> None:
@@ -197,54 +200,29 @@ class VideoFile:
 
         if self._writer is None:
             code, size = cv2.VideoWriter.fourcc(*self._code), (image.shape[1], image.shape[0])
-            self._writer = cv2.VideoWriter(str(self._unfinished), code, self._rate, size, image.ndim == 3)
+            rate = round(self.rate, 2)  # finer ones are more than MPEG-4's clock can take
+            self._writer = cv2.VideoWriter(str(self._unfinished), code, rate, size, image.ndim == 3)
             if not self._writer.isOpened():
                 raise InputError(f"{self.path}: cannot be written as a video")
         self._writer.write(image)
 
 
-class AnnotatedVideo:
-    """Writes frames with what was found in them, at the rate at which they were filmed. A context manager.
+class AnnotatedVideo(VideoFile):
+    """Frames with what was found in them, at the rate at which they were filmed.
 
     Args:
-        path: of an ``.mp4`` or ``.avi`` file. body: the markers on the robot.
+        path: of an ``.mp4`` or ``.avi`` file. body: the markers on the robot. source: of the frames.
     """
 
-    def __init__(self, path: Path, body: Target) -> None:
-        self.path, self.body = path, body
-        self._file: VideoFile | None = None
+    def __init__(self, path: Path, body: Target, source: Frames) -> None:
+        super().__init__(path, "mp4v" if path.suffix == ".mp4" else "MJPG", 0.0)
+        self.body, self._source = body, source
         self._trail: list[tuple[int, int]] = []
-        self._waiting: list[tuple[float, NDArray[np.uint8]]] = []  # until the rate is known
-
-    def __enter__(self) -> AnnotatedVideo:
-        return self
-
-    def __exit__(self, fault: type[BaseException] | None, *rest: object) -> None:
-        if fault is None:
-            self._start()
-        if self._file is not None:
-            self._file.__exit__(fault, *rest)
 
     def add(self, frame: VideoFrame, sample: Sample) -> None:
         """Append one frame."""
-        image = annotate(frame.image, sample, self.body, self._trail)
-        if self._file is not None:
-            self._file.write(image)
-            return
-        self._waiting.append((frame.time, image))
-        if len(self._waiting) == _FRAMES_FOR_RATE:
-            self._start()
-
-    def _start(self) -> None:
-        """Open the file, with the rate of the frames so far, and write them."""
-        if self._file is not None or not self._waiting:
-            return
-        steps = np.diff([time for time, _ in self._waiting])
-        rate = 1 / float(np.median(steps)) if len(steps) else 30.0
-        self._file = VideoFile(self.path, "mp4v" if self.path.suffix == ".mp4" else "MJPG", rate)
-        for _, image in self._waiting:
-            self._file.write(image)
-        self._waiting = []
+        self.rate = self._source.rate
+        self.write(annotate(frame.image, sample, self.body, self._trail))
 
 
 def annotate(image: Image, sample: Sample, body: Target, trail: list[tuple[int, int]]) -> NDArray[np.uint8]:
