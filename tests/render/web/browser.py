@@ -104,16 +104,6 @@ class Browser:
         for kind in ("keyDown", "keyUp"):
             self.send("Input.dispatchKeyEvent", type=kind, key=key, code=code, windowsVirtualKeyCode=number)
 
-    def frame_times(self, count=60):
-        """Return ms between the frames that the browser draws."""
-        return self.run(
-            f"""new Promise(done => {{
-                const times = [];
-                const step = now => {{ times.push(now); times.length > {count} ? done(times) : requestAnimationFrame(step); }};
-                requestAnimationFrame(step);
-            }}).then(times => times.slice(1).map((t, k) => t - times[k]))"""
-        )
-
     def picture(self, path):
         """Write a picture of the page."""
         Path(path).write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))

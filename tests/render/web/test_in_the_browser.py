@@ -28,8 +28,6 @@ def test_a_run_is_watched_paused_and_sought_in_the_browser(tmp_path):
         with Browser(player.address.url) as browser:
             browser.wait("a straight line")
             browser.wait("x (m)")  # a plot
-            times = browser.frame_times(10)
-            print(f"ms between frames, median of 10: {np.median(times):.0f}")
             picture = tmp_path / "page.png"
             browser.picture(picture)
             assert len(np.unique(np.asarray(Image.open(picture).convert("RGB")).reshape(-1, 3), axis=0)) > 200
