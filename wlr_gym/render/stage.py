@@ -389,6 +389,7 @@ def _draw(geom: mujoco.MjvGeom, mark: Mark) -> None:
 
 
 def _start(geom: mujoco.MjvGeom, kind: str, size: Sequence[float], position: ArrayLike, colour: Colour) -> None:
-    shape, turn, paint = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), np.eye(3).ravel(), np.array([*colour, 1.0], np.float32)
-    mujoco.mjv_initGeom(geom, shape, np.array(size, np.float64), np.array(position, np.float64), turn, paint)
+    shape, paint = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), np.array([*colour, 1.0], np.float32)
+    sizes, place = np.array(size, np.float64), np.array(position, np.float64)
+    mujoco.mjv_initGeom(geom, shape, sizes, place, np.eye(3).ravel(), paint)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value

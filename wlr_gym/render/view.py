@@ -146,7 +146,8 @@ def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, 
 def directions(camera: FollowCamera, yaw: float = 0.0) -> tuple[Array, Array]:
     """Return where a camera looks and what is up in its picture, both (3,), for a robot that heads along ``yaw`` (rad)."""
     azimuth = camera.azimuth + (yaw if camera.turns else 0.0)
-    flat, rise, c, s = math.cos(camera.elevation), math.sin(camera.elevation), math.cos(azimuth), math.sin(azimuth)
+    flat, rise = math.cos(camera.elevation), math.sin(camera.elevation)
+    c, s = math.cos(azimuth), math.sin(azimuth)
     return np.array([flat * c, flat * s, rise]), np.array([-rise * c, -rise * s, flat])
 
 

@@ -277,16 +277,15 @@ def calibrate_film(
     size, found = _find_corners(wanted, board)
     middles = range(0, len(found), min(3, every))
     views = {k: view for k in middles if (view := found[k]) is not None}
-    neighbours = {
-        k: (before, after)
-        for k in views
-        if 0 < k < len(found) - 1 and (before := found[k - 1]) is not None and (after := found[k + 1]) is not None
-    }
     camera = plain = _calibrated(list(views.values()), len(middles), size, board)
     told = Readout() if readout is None else Readout(readout, 0.0)
     for _ in range(_TURNS):
-        motions = {k: board_motion(before, views[k], after, camera) for k, (before, after) in neighbours.items()}
-        moving = {k: motion for k, motion in motions.items() if motion is not None}
+        moving = {}
+        for k, view in views.items():
+            before, after = (found[i] if 0 <= i < len(found) else None for i in (k - 1, k + 1))
+            motion = board_motion(before, view, after, camera) if before and after else None
+            if motion is not None:
+                moving[k] = motion
         last = told
         told = readout_of([(views[k], motion) for k, motion in moving.items()], camera) if readout is None else told
         if readout is None and not (abs(told.value) < LONGEST and told.std < _LOOSEST_STD):

@@ -333,7 +333,8 @@ def _least_squares(
 @njit(cache=True, nogil=True)
 def _expected(centre: Any, rotation: Any, radius: float, camera: Any) -> Any:
     """Image (6,) of a circle with that centre in the camera frame; NaN too near or behind the camera."""
-    ellipse, (x, y, z) = np.full(6, math.nan), (centre[0], centre[1], centre[2])
+    ellipse = np.full(6, math.nan)
+    x, y, z = centre[0], centre[1], centre[2]
     if z >= 2.0 * radius:
         u, v = distort(camera, x / z, y / z)
         ru, rv = distort(camera, x / z + 1e-5, y / z)

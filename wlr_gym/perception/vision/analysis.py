@@ -202,7 +202,8 @@ def camera_columns(
     values = np.column_stack([place[:, :2], poses[:, 3], place[:, 2], poses[:, 4]]) + late[:, None] * rates[:, [0, 1, 3, 2, 4]]
     if origin == "start":
         x, y, yaw = values[time <= time[0] + _START, :3].mean(axis=0)
-        c, s, (dx, dy) = math.cos(yaw), math.sin(yaw), (values[:, :2] - (x, y)).T
+        c, s = math.cos(yaw), math.sin(yaw)
+        dx, dy = values[:, 0] - x, values[:, 1] - y
         values[:, :3] = np.column_stack([c * dx + s * dy, c * dy - s * dx, values[:, 2] - yaw])
     order = np.argsort(-np.abs(late))  # of two frames near one row the nearer is written last
     order = order[inside[order]]

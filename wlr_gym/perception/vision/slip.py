@@ -116,7 +116,8 @@ def imu_differences(samples: Sequence[Sample], offset: float, run: Run, robot: R
     x, y, z = force.T
     for k, (axis, tilt) in enumerate((("pitch", np.arctan2(-x, np.hypot(y, z))), ("roll", np.arctan2(y, z))), start=1):
         apart = (film[:, k] - np.interp(time, t, tilt))[rests]
-        if len(apart) >= _TOGETHER and (off := float(abs(np.median(apart)))) > max(LEVEL_ERROR, SIGMAS * float(std[k])):
+        off = float(abs(np.median(apart))) if len(apart) >= _TOGETHER else 0.0
+        if off > max(LEVEL_ERROR, SIGMAS * float(std[k])):
             yield TurnDifference(axis, float(time[rests][len(apart) // 2]), off, level=True)
 
 

@@ -297,7 +297,8 @@ def pose_in_floor(body: TargetPose, floor: TargetPose, moving: bool = False) -> 
     to_floor, apart = floor.rotation.T, body.position - floor.position
     pose = np.concatenate([to_floor @ apart, angles(to_floor @ body.rotation)])
     yaw, pitch = pose[3], pose[4]
-    (c, s), cosine = (math.cos(yaw), math.sin(yaw)), max(0.1, math.cos(pitch))
+    c, s = math.cos(yaw), math.sin(yaw)
+    cosine = max(0.1, math.cos(pitch))
     # a small turn w about the floor's axes changes yaw, pitch and roll by this matrix times w
     rates = np.array([[c * math.tan(pitch), s * math.tan(pitch), 1.0], [-s, c, 0.0], [c / cosine, s / cosine, 0.0]])
     jacobian = np.zeros((6, 6))

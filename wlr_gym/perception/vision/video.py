@@ -277,9 +277,11 @@ def film(number: int, folder: Path, camera: Camera, seconds: float | None = None
 
     capture = open_device(number, camera)
     queue: Queue[tuple[float, Image] | str] = Queue(_BACKLOG)
-    stop, times, fault = threading.Event(), list[float](), ""
+    stop = threading.Event()
     thread = threading.Thread(target=_grab, args=(capture, queue, stop), daemon=True)
     rate = _plausible(capture.get(cv2.CAP_PROP_FPS))
+    times: list[float] = []
+    fault = ""
     try:
         with _stopped_by_interrupt(stop), VideoFile(folder / "film.avi", "FFV1", rate) as video:
             thread.start()
