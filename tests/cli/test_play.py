@@ -19,7 +19,6 @@ from wlr_gym.learning.evaluation.film import Journey, commands, drive, film, fil
 from wlr_gym.policy import make_policy
 from wlr_gym.render.teleop import RESET, UP, Script
 from wlr_gym.render.view import View
-from wlr_gym.render.viewer import Viewer
 
 
 @pytest.fixture
@@ -210,10 +209,8 @@ def test_keys_drive_the_robot_until_the_window_is_closed(monkeypatch):
         windows.append(Window(model, data, on_key, {1: UP, 2: UP, 30: RESET}, 40))
         return windows[-1]
 
-    def new_viewer(options, robot, on_key):
-        return Viewer(robot, play_module._view(options), on_key, open_window)
-
-    play_module.show(options, core, make_policy("pid", core.contract()), driver, new_viewer)
+    monkeypatch.setattr("wlr_gym.render.viewer.open_window", open_window)
+    play_module.show(options, core, make_policy("pid", core.contract()), driver)
     texts = windows[0].texts
     assert len(texts) == 40
     assert "t 0.00 s" in texts[0]

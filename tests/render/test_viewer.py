@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.render import viewer as viewer_module
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP, Gamepad, Keyboard, Script
 from wlr_gym.render.view import View
-from wlr_gym.render.viewer import Pace, Viewer, open_window
+from wlr_gym.render.viewer import Viewer, open_window
 
 RANGES = {"linear_velocity_x": (-0.1, 0.2), "yaw_rate": (-0.5, 0.5)}
 
@@ -50,7 +50,7 @@ class FakeWindow:
 
 
 @pytest.fixture
-def opened(robot):
+def opened(robot, monkeypatch):
     """A viewer with a fake window and a clock that only sleeping moves: (viewer, windows, time)."""
     windows, now = [], [100.0]
 
@@ -61,7 +61,10 @@ def opened(robot):
     def sleep(seconds):
         now[0] += seconds
 
-    return Viewer(robot, View(), open=open_fake, pace=Pace(lambda: now[0], sleep)), windows, now
+    monkeypatch.setattr(viewer_module, "open_window", open_fake)
+    monkeypatch.setattr(viewer_module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(viewer_module.time, "sleep", sleep)
+    return Viewer(robot, View()), windows, now
 
 
 def test_pose_text_and_marks_go_into_the_window(opened, parameters):

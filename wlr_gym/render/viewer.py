@@ -43,20 +43,19 @@ def open_window(model: mujoco.MjModel, data: mujoco.MjData, on_key: KeyCallback 
 
 
 class Pace:
-    """Waits for the next tick, in real time; ``clock`` and ``sleep`` are what time it is, and how to wait (tests)."""
+    """Waits for the next tick, in real time."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
-        self._clock, self._sleep = clock, sleep
+    def __init__(self) -> None:
         self._next = -np.inf
 
     def wait(self, period: float) -> None:
         """Wait until ``period`` s after the last tick; after a hold-up of more than a few, continue from now."""
-        now = self._clock()
+        now = time.monotonic()
         if now > self._next + 5 * period:
             self._next = now
         self._next += period
         if self._next > now:
-            self._sleep(self._next - now)
+            time.sleep(self._next - now)
 
 
 class Viewer:
@@ -68,20 +67,12 @@ class Viewer:
     Args:
         robot: supplies the sizes that are no parameters. view: what to show; the size is the window's own affair.
         on_key: called with GLFW's key code, from the window's thread.
-        open: how the window is opened (tests). pace: waits for the next tick (tests).
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        view: View | None = None,
-        on_key: KeyCallback | None = None,
-        open: Callable[..., Any] = open_window,
-        pace: Pace | None = None,
-    ) -> None:
+    def __init__(self, robot: Robot, view: View | None = None, on_key: KeyCallback | None = None) -> None:
         self.robot = robot
         self.view: View = view or View()
-        self._on_key, self._open, self._pace = on_key, open, pace or Pace()
+        self._on_key, self._pace = on_key, Pace()
         self._stage: Stage | None = None
         self._window: Any = None
 
@@ -116,7 +107,7 @@ class Viewer:
         self._stage = stage = self._stage or Stage(self.robot, parameters, row, self.view.size)
         stage.pose(truth, parameters, row)
         if self._window is None:
-            self._window = self._open(stage.model, stage.data, self._on_key)
+            self._window = open_window(stage.model, stage.data, self._on_key)
             start, eye = CAMERAS[self.view.camera], self._window.cam
             eye.type = mujoco.mjtCamera.mjCAMERA_FREE
             eye.distance, eye.elevation = 1.2 * magnification(self.robot) * start.distance, np.degrees(start.elevation)

@@ -25,7 +25,7 @@ def test_a_run_is_watched_paused_and_sought_in_the_browser(tmp_path):
     thread = threading.Thread(target=player.run, args=(over.is_set,))
     thread.start()
     try:
-        with Browser(player.address.url) as browser:
+        with Browser(f"http://localhost:{player.server.get_port()}") as browser:
             browser.wait("a straight line")
             browser.wait("x (m)")  # a plot
             picture = tmp_path / "page.png"

@@ -2,6 +2,8 @@
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false
 # (What stands on a page is looked up in viser by name; stand-ins have only what is used.)
 
+from typing import Any
+
 import numpy as np
 import pytest
 from standing import truth_of
@@ -30,7 +32,7 @@ class NoPace:
 
 @pytest.fixture(scope="module")
 def server():
-    opened, _ = open_server("localhost", PORT)
+    opened = open_server("localhost", PORT)
     yield opened
     close_server(opened)
 
@@ -98,7 +100,8 @@ def test_the_floor_has_areas_and_pads_of_other_friction(server, parameters):
 def live():
     """A page of a running plant, the keys that it has handed on, and its pace."""
     pressed, pace = [], NoPace()
-    viewer = WebViewer(ROBOT, View(forces=True), pressed.append, port=PORT + 100, pace=pace)
+    viewer: Any = WebViewer(ROBOT, View(forces=True), pressed.append, port=PORT + 100)
+    viewer._pace = pace
     yield viewer, pressed, pace
     viewer.close()
 
@@ -214,9 +217,10 @@ def test_another_run_brings_its_own_length_and_channels(player):
     assert drawn == ["x (m)", "length (m)"]
 
 
-def test_a_player_sends_thirty_updates_a_second_and_ends_when_told(player):
+def test_a_player_sends_thirty_updates_a_second_and_ends_when_told(player, monkeypatch):
     pace, asked = NoPace(), iter([False] * 30 + [True])
-    player.run(lambda: next(asked), pace)
+    monkeypatch.setattr("wlr_gym.render.web.player.Pace", lambda: pace)
+    player.run(lambda: next(asked))
     assert len(pace.periods) == 30
     assert pace.periods[0] == pytest.approx(1.0 / 30.0)
     assert player.recording.closed

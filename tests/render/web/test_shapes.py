@@ -9,7 +9,7 @@ pytest.importorskip("viser", minversion="1.1", reason="needs the extra web")
 from wlr_gym.base.errors import InputError
 from wlr_gym.render.stage import Stage
 from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, up_direction
-from wlr_gym.render.web.page import Address, Curve, aligned, eye, floor_pose, open_server, thinned
+from wlr_gym.render.web.page import Curve, aligned, eye, floor_pose, how_to_open, open_server, thinned
 from wlr_gym.render.web.player import bodies
 from wlr_gym.robot import WHEELS, load_robot
 from wlr_gym.robot.parameters import Parameters
@@ -106,14 +106,13 @@ def test_curves_of_different_times_share_one_axis_and_have_no_holes():
 
 def test_the_way_through_ssh_is_printed_as_the_login_tells_it(monkeypatch):
     monkeypatch.setenv("SSH_CONNECTION", "10.0.0.5 5555 192.168.7.2 2222")
-    address = Address("localhost", 8081)
-    here, there = address.lines()
+    here, there = how_to_open("localhost", 8081).splitlines()
     assert "http://localhost:8081" in here
     assert "ssh -p 2222 -N -L 8081:localhost:8081 " in there
     assert "@192.168.7.2" in there
-    assert Address("0.0.0.0", 80).url == "http://localhost:80"
+    assert "http://localhost:80 " in how_to_open("0.0.0.0", 80)
     monkeypatch.setenv("SSH_CONNECTION", "10.0.0.5 5555 192.168.7.2 22")
-    assert "-p" not in address.lines()[1]
+    assert "-p" not in how_to_open("localhost", 8081)
 
 
 def test_an_address_of_another_machine_and_a_port_that_is_none_are_refused():

@@ -30,36 +30,24 @@ _FARTHER = 1.3  # times the distance of pictures: panels stand at both sides
 TEXTS = 6.0  # updates of texts and sliders per second
 
 
-@dataclass(frozen=True)
-class Address:
-    """Where a page is served: name or address that it listens on, and port."""
-
-    host: str
-    port: int
-
-    @property
-    def url(self) -> str:
-        """What to open on this machine."""
-        shown = "localhost" if self.host in ("", "0.0.0.0", "::") else self.host
-        return f"http://{shown}:{self.port}"
-
-    def lines(self) -> list[str]:
-        """Return how to open the page, here and through ssh: that is told by ``SSH_CONNECTION``, as sshd sets it."""
-        try:
-            user = getpass.getuser()
-        except (OSError, KeyError):  # no name for this user id
-            user = "USER"
-        here = os.environ.get("SSH_CONNECTION", "").split()
-        machine = here[2] if len(here) == 4 else socket.gethostname()
-        port = f" -p {here[3]}" if len(here) == 4 and here[3] != "22" else ""
-        return [
-            f"open {self.url} in a browser; Ctrl-C ends",
-            f"from another machine: ssh{port} -N -L {self.port}:localhost:{self.port} {user}@{machine}, then the same",
-        ]
+def how_to_open(host: str, port: int) -> str:
+    """Return how to open a page that is served there, here and through ssh: sshd tells that by ``SSH_CONNECTION``."""
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError):  # no name for this user id
+        user = "USER"
+    shown = "localhost" if host in ("", "0.0.0.0", "::") else host
+    here = os.environ.get("SSH_CONNECTION", "").split()
+    machine = here[2] if len(here) == 4 else socket.gethostname()
+    at = f" -p {here[3]}" if len(here) == 4 and here[3] != "22" else ""
+    return (
+        f"open http://{shown}:{port} in a browser; Ctrl-C ends\n"
+        f"from another machine: ssh{at} -N -L {port}:localhost:{port} {user}@{machine}, then the same"
+    )
 
 
-def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> tuple[viser.ViserServer, Address]:
-    """Start a server and return it with its address.
+def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> viser.ViserServer:
+    """Start a server.
 
     Args:
         host: name or address to listen on; the default can be reached from this machine, and through ssh, only.
@@ -94,7 +82,7 @@ def open_server(host: str = HOST, port: int = PORT, label: str = "wlr_gym") -> t
     scene.configure_environment_map(None)
     scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 160), intensity=2.2)
     scene.add_light_directional("/sun", position=(-1.0, -1.5, 4.0), intensity=1.6)
-    return server, Address(host, int(server.get_port()))
+    return server
 
 
 def close_server(server: viser.ViserServer) -> None:

@@ -241,7 +241,8 @@ class _Page:
 
     def __init__(self, label: str, view: View, host: str, port: int) -> None:
         self.view = view
-        self.server, self.address = page.open_server(host, port, label)
+        self.server = page.open_server(host, port, label)
+        self._address = page.how_to_open(host, int(self.server.get_port()))
         position, look_at = page.eye(CAMERAS[view.camera])
         self.server.initial_camera.position = tuple(position)
         self.server.initial_camera.look_at = tuple(look_at)
@@ -295,7 +296,7 @@ class WebViewer(_Page):
     Args:
         robot: supplies the sizes that are no parameters. view: what to show; the size is the browser's own affair.
         on_key: called with the key codes of :mod:`wlr_gym.render.teleop`, from a thread of the server; None = nobody drives.
-        host, port: where the page is served, see :func:`wlr_gym.render.web.page.open_server`. pace: of the ticks (tests).
+        host, port: where the page is served, see :func:`wlr_gym.render.web.page.open_server`.
     """
 
     def __init__(
@@ -305,10 +306,9 @@ class WebViewer(_Page):
         on_key: KeyCallback | None = None,
         host: str = HOST,
         port: int = PORT,
-        pace: Pace | None = None,
     ) -> None:
         super().__init__("wlr play", view or View(forces=True), host, port)
-        self._pace = pace or Pace()
+        self._pace = Pace()
         self._figure = Figure(self.server, "robot", robot)
         self._text: Any = self.server.gui.add_html("")
         if on_key is not None:
@@ -316,7 +316,7 @@ class WebViewer(_Page):
         self._look = page.ViewControls(self.server, self.view)
         self._past: deque[tuple[float, NDArray[np.float64]]] = deque()  # time and truth
         self._plots = page.Plots(self.server, page.plot_panel(self.server), _TITLES, _FIRST)
-        print("\n".join(self.address.lines()), flush=True)
+        print(self._address, flush=True)
 
     def show(
         self,
@@ -447,7 +447,7 @@ class Player(_Page):
         self._time, self._drawn, self._plotted = 0.0, -1.0, -np.inf
         self._add_controls(names, first)
         self._add_figures()
-        print("\n".join(self.address.lines()), flush=True)
+        print(self._address, flush=True)
 
     # ---- time -------------------------------------------------------------------------------------------------------
 
@@ -467,9 +467,9 @@ class Player(_Page):
             later = self._time + seconds * float(self._speed.value)
             self.seek(later if self._time < self.recording.length else 0.0)
 
-    def run(self, stop: Callable[[], bool] = lambda: False, pace: Pace | None = None) -> None:
-        """Play until ``stop``, asked before each update, says so; ``pace`` waits for the next one (tests)."""
-        pace, last = pace or Pace(), clock.monotonic()
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Play until ``stop``, asked before each update, says so."""
+        pace, last = Pace(), clock.monotonic()
         try:
             while not stop():
                 now = clock.monotonic()
