@@ -18,6 +18,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -292,8 +293,8 @@ def _kicks(centres: Array, times: Array, scale: float) -> Iterator[Kick]:
             yield Kick(marker, float(times[k]), scale * float(away[k, marker]))
 
 
-def _odd_one(before: NDArray[np.complex128], after: NDArray[np.complex128]) -> tuple[int, float]:
-    """The marker without which the others only shift, turn and grow together, and how far (px) it leaves them."""
+def _odd_one(before: NDArray[Any], after: NDArray[Any]) -> tuple[int, float]:
+    """The marker, of complex places, without which the others only shift, turn and grow; and how far (px) it leaves them."""
     best, odd, step = math.inf, 0, 0.0
     for marker in range(len(before)):
         others = np.arange(len(before)) != marker
