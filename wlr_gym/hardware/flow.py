@@ -35,38 +35,24 @@ FROZEN = 40
 
 @dataclass(frozen=True)
 class FlowReading:
-    """Optical flow at a control step.
+    """Optical flow at a control step."""
 
-    Attributes:
-        flow: (2,) rad/s along body x and y, the last valid one: v_x/h - w_y, v_y/h + w_x.
-        quality: surface quality, 0 to 1; 0 = no valid reading in this control step.
-        age: s since the end of the valid one's interval.
-        is_new: whether this control step brought a valid one.
-        trouble: why there is none; empty = there is, or none was due.
-        note: what is odd about it; empty = nothing.
-    """
-
-    flow: Array
-    quality: float
-    age: float
-    is_new: bool
-    trouble: str = ""
-    note: str = ""
+    flow: Array  #: (2,) rad/s along body x and y, the last valid one: v_x/h - w_y, v_y/h + w_x
+    quality: float  #: surface quality, 0 to 1; 0 = no valid reading in this control step
+    age: float  #: s since the end of the valid one's interval
+    is_new: bool  #: this control step brought a valid one
+    trouble: str = ""  #: why there is none; empty = there is, or none was due
+    note: str = ""  #: what is odd about it; empty = nothing
 
 
 @dataclass
 class FlowStatistics:
-    """What came since the sensor was opened.
+    """What came since the sensor was opened."""
 
-    Attributes:
-        readings: valid ones. lost: frames missing between those received, or polls that failed. errors: broken frames.
-        refused: reason, without its numbers -> readings that were not valid.
-    """
-
-    readings: int = 0
-    lost: int = 0
-    errors: int = 0
-    refused: dict[str, int] = field(default_factory=dict)
+    readings: int = 0  #: valid ones
+    lost: int = 0  #: frames missing between those received
+    errors: int = 0  #: broken frames
+    refused: dict[str, int] = field(default_factory=dict)  #: reason, without its numbers -> readings that were not valid
 
     def refuse(self, trouble: str) -> None:
         """Count a reading that is not valid."""
@@ -102,21 +88,14 @@ class FlowConversion:
 
 
 class CountedMotion(NamedTuple):
-    """What the chip counted from one of its frames to a later one.
+    """What the chip counted from one of its frames to a later one."""
 
-    Attributes:
-        interval: s from one frame to the other.
-        x, y: counts along the chip's axes.
-        quality, shutter: registers SQUAL and Shutter at the end.
-        end: s, our clock.
-    """
-
-    interval: float
-    x: int
+    interval: float  #: s from one frame to the other
+    x: int  #: counts along the chip's axis
     y: int
-    quality: int
-    shutter: int
-    end: float
+    quality: int  #: register SQUAL at the end
+    shutter: int  #: register Shutter at the end
+    end: float  #: s, our clock
 
 
 class FlowStream(FrameStream):

@@ -138,19 +138,13 @@ LEAST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class FlowFit:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        calibration: for the hardware file.
-        scale_sigma, yaw_sigma: 1 sigma of its scale and its mounting (rad).
-        way: m that was driven. windows: how many were compared.
-    """
-
-    calibration: FlowCalibration
-    scale_sigma: float
-    yaw_sigma: float
-    way: float
-    windows: int
+    calibration: FlowCalibration  #: for the hardware file
+    scale_sigma: float  #: 1 sigma
+    yaw_sigma: float  #: rad, 1 sigma of the mounting
+    way: float  #: m that was driven
+    windows: int  #: how many were compared
 
 
 def calibrate_flow(run: Run, robot: Robot, known: FlowCalibration, distance: float | None = None) -> FlowFit:

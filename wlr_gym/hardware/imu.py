@@ -35,38 +35,23 @@ class ImuGoneError(ConnectionError):
 
 @dataclass(frozen=True)
 class ImuReading:
-    """One reading of gyroscope and accelerometer, calibrated, body frame.
+    """One reading of gyroscope and accelerometer, calibrated, body frame."""
 
-    Attributes:
-        gyro: (3,) rad/s.
-        accelerometer: (3,) m/s2, specific force (+9.81 on z at rest).
-        temperature: degC, of the chip.
-        age: s since the sensor was read; grows when nothing new comes.
-    """
-
-    gyro: Array
-    accelerometer: Array
-    temperature: float
-    age: float
+    gyro: Array  #: (3,) rad/s
+    accelerometer: Array  #: (3,) m/s2, specific force (+9.81 on z at rest)
+    temperature: float  #: degC, of the chip
+    age: float  #: s since the sensor was read; grows when nothing new comes
 
 
 @dataclass
 class ImuStatistics:
-    """What came since the IMU was opened.
+    """What came since the IMU was opened."""
 
-    Attributes:
-        readings: good ones.
-        lost: frames missing between those received (stream), readings that failed after their retry (I2C).
-        errors: frames with a wrong CRC (stream), bus errors (I2C).
-        restarts: times the microcontroller's clock began anew.
-        unchanged: times the chip had nothing new (I2C).
-    """
-
-    readings: int = 0
-    lost: int = 0
-    errors: int = 0
-    restarts: int = 0
-    unchanged: int = 0
+    readings: int = 0  #: good ones
+    lost: int = 0  #: frames missing between those received (stream), readings that failed after their retry (I2C)
+    errors: int = 0  #: frames with a wrong CRC (stream), bus errors (I2C)
+    restarts: int = 0  #: times the microcontroller's clock began anew
+    unchanged: int = 0  #: times the chip had nothing new (I2C)
 
 
 def gyro_per_count(gyro_range: int) -> float:

@@ -31,26 +31,16 @@ from wlr_gym.robot import JOINTS, Robot
 
 @dataclass
 class Link:
-    """Connections of one robot.
-
-    Attributes:
-        servos, imu: closed at first.
-        clock: what deadlines and ages are told by.
-        flow: optical-flow sensor, closed at first; None = there is none.
-        is_serial: there are real ports, which a watchdog process can open.
-        finish: called after closing.
-        camera: above the floor; None = there is none.
-        seed: of an emulated robot's noise; None = not one of this process.
-    """
+    """Connections of one robot, closed at first."""
 
     servos: Servos
     imu: Imu
-    clock: Clock
-    is_serial: bool
-    finish: Callable[[], None] = lambda: None
-    flow: FlowStream | None = None
-    camera: CameraReader | None = None
-    seed: int | None = None
+    clock: Clock  #: what deadlines and ages are told by
+    is_serial: bool  #: there are real ports, which a watchdog process can open
+    finish: Callable[[], None] = lambda: None  #: called after closing
+    flow: FlowStream | None = None  #: optical-flow sensor; None = there is none
+    camera: CameraReader | None = None  #: above the floor; None = there is none
+    seed: int | None = None  #: of an emulated robot's noise; None = not one of this process
 
     def _devices(self) -> list[Servos | Imu | FlowStream | CameraReader]:
         return [device for device in (self.servos, self.imu, self.flow, self.camera) if device is not None]

@@ -74,19 +74,12 @@ class IndirectBlock(Block):
 
 @dataclass(frozen=True)
 class BlockReading:
-    """What one servo answered to a block read.
+    """What one servo answered to a block read."""
 
-    Attributes:
-        counts: item -> count.
-        alert: it has a hardware error (the counts are valid all the same).
-        age: s since the servo took the reading, from its own clock; 0 where the block holds no clock.
-        restarted: its clock jumped: it was rebooted, or had no power.
-    """
-
-    counts: Mapping[str, int]
-    alert: bool
-    age: float = 0.0
-    restarted: bool = False
+    counts: Mapping[str, int]  #: item -> count
+    alert: bool  #: it has a hardware error (the counts are valid all the same)
+    age: float = 0.0  #: s since the servo took the reading, from its own clock; 0 where the block holds no clock
+    restarted: bool = False  #: its clock jumped: it was rebooted, or had no power
 
 
 #: Part by which a servo's clock may run slow.
@@ -146,21 +139,14 @@ _ERROR_NAMES = {error.value: error.name.lower().replace("_", " ") + " error" for
 
 @dataclass
 class Statistics:
-    """What went over the bus since it was opened.
+    """What went over the bus since it was opened."""
 
-    Attributes:
-        missing, alerts, stale: id -> answers that did not come, that carried the alert bit, that were too old.
-        crc_errors: packets with a wrong CRC.
-        discarded: bytes thrown away because they belonged to an exchange that was given up.
-        fallbacks: fast reads that were repeated as ordinary ones.
-    """
-
-    missing: Counter[int] = field(default_factory=Counter)
-    alerts: Counter[int] = field(default_factory=Counter)
-    stale: Counter[int] = field(default_factory=Counter)
-    crc_errors: int = 0
-    discarded: int = 0
-    fallbacks: int = 0
+    missing: Counter[int] = field(default_factory=Counter)  #: id -> answers that did not come
+    alerts: Counter[int] = field(default_factory=Counter)  #: id -> answers that carried the alert bit
+    stale: Counter[int] = field(default_factory=Counter)  #: id -> answers that were too old
+    crc_errors: int = 0  #: packets with a wrong CRC
+    discarded: int = 0  #: bytes thrown away because they belonged to an exchange that was given up
+    fallbacks: int = 0  #: fast reads that were repeated as ordinary ones
 
 
 class BusGroup:

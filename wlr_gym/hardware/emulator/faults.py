@@ -68,23 +68,14 @@ _LARGEST = {"probability": 1.0, "value": math.inf, "after": math.inf, "duration"
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """One fault."""
 
-    Attributes:
-        kind: key of :data:`FAULTS`.
-        where: joints, buses, ``imu``, ``flow`` or ``camera``; empty = everywhere.
-        probability: chance per packet, for faults that hit bytes.
-        value: see :data:`FAULTS`.
-        after: s from when it was asked for until it starts.
-        duration: s it lasts.
-    """
-
-    kind: str
-    where: tuple[str, ...] = ()
-    probability: float = 1.0
-    value: float = 0.0
-    after: float = 0.0
-    duration: float = math.inf
+    kind: str  #: key of :data:`FAULTS`
+    where: tuple[str, ...] = ()  #: joints, buses, ``imu``, ``flow`` or ``camera``; empty = everywhere
+    probability: float = 1.0  #: chance per packet, for faults that hit bytes
+    value: float = 0.0  #: see :data:`FAULTS`
+    after: float = 0.0  #: s from when it was asked for until it starts
+    duration: float = math.inf  #: s it lasts
 
     def __str__(self) -> str:
         kind = FAULTS[self.kind]

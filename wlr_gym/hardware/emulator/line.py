@@ -31,17 +31,11 @@ class Emission(NamedTuple):
 
 @dataclass(frozen=True)
 class LineTiming:
-    """How long things take on the line and in the adapter.
+    """How long things take on the line and in the adapter."""
 
-    Attributes:
-        wire: count 10 bits per byte at the line's baud rate, both ways, and the servos' Return Delay Time.
-        turnaround: s a servo needs to answer, on top of its Return Delay Time.
-        usb_latency: s the adapter holds back a USB packet that is not full (latency timer: FTDI default 0.016, advised 0.001).
-    """
-
-    wire: bool = True
-    turnaround: float = 50e-6
-    usb_latency: float = 0.001
+    wire: bool = True  #: count 10 bits per byte at the line's baud rate, both ways, and the servos' Return Delay Time
+    turnaround: float = 50e-6  #: s a servo needs to answer, on top of its Return Delay Time
+    usb_latency: float = 0.001  #: s the adapter holds back a USB packet that is not full (FTDI default 0.016, advised 0.001)
 
 
 #: No time at all, for tests that step the emulator.

@@ -60,25 +60,15 @@ _SHUTTER, _LONGEST_SHUTTER = 0x0400, 0x1FFF
 
 @dataclass(frozen=True)
 class MachineOptions:
-    """How the robot is emulated.
+    """How the robot is emulated."""
 
-    Attributes:
-        backend: simulator behind it.
-        tick: s of emulated time per step; setpoints written in between act at the next one.
-        seed: of sensor noise and fault choices.
-        sensor_noise: the plant's.
-        firmware: version the servos report; fast reads need 45.
-        factory: EEPROM as out of the box (id 1, 57600 bit/s, ...) instead of what the hardware file says.
-        timing: of lines and adapters.
-    """
-
-    backend: str = "gibbs_appell"
-    tick: float = 0.001
-    seed: int = 0
-    sensor_noise: bool = True
-    firmware: int = FIRMWARE
-    factory: bool = False
-    timing: LineTiming = field(default_factory=LineTiming)
+    backend: str = "gibbs_appell"  #: simulator behind it
+    tick: float = 0.001  #: s of emulated time per step; setpoints written in between act at the next one
+    seed: int = 0  #: of sensor noise and fault choices
+    sensor_noise: bool = True  #: the plant's
+    firmware: int = FIRMWARE  #: version the servos report; fast reads need 45
+    factory: bool = False  #: EEPROM as out of the box (id 1, 57600 bit/s, ...) instead of what the hardware file says
+    timing: LineTiming = field(default_factory=LineTiming)  #: of lines and adapters
 
     def plant_options(self) -> PlantOptions:
         """Return the options of the plant behind it."""

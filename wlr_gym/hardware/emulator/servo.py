@@ -175,30 +175,20 @@ class Registers:
 
 @dataclass
 class Shaft:
-    """What the physics hands to a servo each tick.
+    """What the physics hands to a servo each tick."""
 
-    Attributes:
-        position, velocity: rad from encoder count 0, rad/s, as the encoder says.
-        true_position, true_velocity: as it is.
-        load: motor torque over stall torque, 0 to about 1.
-        voltage: V at the servo.
-        output: asks for the counts of Present Current or Present Load, and for the part of the supply on the motor, -1 to 1.
-        reference: asks where the profile generator stands: rad and rad/s.
-        offset, is_frozen: faults of the encoder: rad that it is off; it repeats its reading.
-        strength: part of the supply that reaches the motor.
-    """
-
-    position: float = 0.0
-    velocity: float = 0.0
+    position: float = 0.0  #: rad from encoder count 0, as the encoder says
+    velocity: float = 0.0  #: rad/s, as the encoder says
     true_position: float = 0.0
     true_velocity: float = 0.0
-    load: float = 0.0
-    voltage: float = 12.0
+    load: float = 0.0  #: motor torque over stall torque, 0 to about 1
+    voltage: float = 12.0  #: V at the servo
+    #: Asks for the counts of Present Current or Present Load, and for the part of the supply on the motor, -1 to 1.
     output: Callable[[], tuple[int, float]] = lambda: (0, 0.0)
-    reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)
-    offset: float = 0.0
-    is_frozen: bool = False
-    strength: float = 1.0
+    reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)  #: asks where the profile generator stands: rad, rad/s
+    offset: float = 0.0  #: rad that the encoder is off: a fault
+    is_frozen: bool = False  #: the encoder repeats its reading: a fault
+    strength: float = 1.0  #: part of the supply that reaches the motor
 
     @property
     def is_well(self) -> bool:
@@ -216,30 +206,19 @@ class Shaft:
 
 @dataclass(frozen=True)
 class MotorDrive:
-    """What the firmware asks of the motor: SI units, encoder frame.
+    """What the firmware asks of the motor: SI units, encoder frame."""
 
-    Attributes:
-        on: torque.
-        mode: Operating Mode.
-        goal_position, goal_velocity: rad, rad/s.
-        goal_current: A; limit of the current in current-based position mode.
-        goal_pwm: part of the supply; limit of the output in every mode but PWM mode.
-        position_gain: V/rad on the position error.
-        velocity_gain, velocity_integral_gain: V s/rad on the velocity error, V/rad on its integral.
-        profile_velocity, profile_acceleration: rad/s, rad/s2; 0 = none.
-    """
-
-    on: bool
-    mode: int
-    goal_position: float
-    goal_velocity: float
-    goal_current: float
-    goal_pwm: float
-    position_gain: float
-    velocity_gain: float
-    velocity_integral_gain: float
-    profile_velocity: float
-    profile_acceleration: float
+    on: bool  #: torque
+    mode: int  #: Operating Mode
+    goal_position: float  #: rad
+    goal_velocity: float  #: rad/s
+    goal_current: float  #: A; limit of the current in current-based position mode
+    goal_pwm: float  #: part of the supply; limit of the output in every mode but PWM mode
+    position_gain: float  #: V/rad on the position error
+    velocity_gain: float  #: V s/rad on the velocity error
+    velocity_integral_gain: float  #: V/rad on the integral of the velocity error
+    profile_velocity: float  #: rad/s; 0 = none
+    profile_acceleration: float  #: rad/s2; 0 = none
 
 
 class EncoderFrame:

@@ -59,28 +59,18 @@ def error_names(bits: int) -> list[str]:
 
 
 class Counts(SettingsModel):
-    """What a count of a servo's registers is.
+    """What a count of a servo's registers is."""
 
-    Attributes:
-        turn: counts of position per turn.
-        velocity, acceleration: rpm, rpm per minute.
-        full_pwm: counts of the whole supply.
-        current, load: A; share of the whole output.
-        voltage: V.
-        position_p_gain, velocity_p_gain, velocity_i_gain: counts of the gain that give a PWM count per count of the error
-            (of its sum over cycles of 1 ms).
-    """
-
-    turn: int
-    velocity: float
-    acceleration: float
-    full_pwm: int
-    current: float
-    load: float
-    voltage: float
-    position_p_gain: float
-    velocity_p_gain: float
-    velocity_i_gain: float
+    turn: int  #: counts of position per turn
+    velocity: float  #: rpm
+    acceleration: float  #: rpm per minute
+    full_pwm: int  #: counts of the whole supply
+    current: float  #: A
+    load: float  #: share of the whole output
+    voltage: float  #: V
+    position_p_gain: float  #: counts of the gain that give a PWM count per count of the error
+    velocity_p_gain: float  #: as the one before
+    velocity_i_gain: float  #: as the one before, per count of the error's sum over cycles of 1 ms
 
 
 class DataSheet(SettingsModel):
@@ -99,27 +89,17 @@ class DataSheet(SettingsModel):
 
 @dataclass(frozen=True)
 class Item:
-    """One row of a control table.
+    """One row of a control table."""
 
-    Attributes:
-        name: spelled as in the e-manual, lower case with underscores.
-        address, size: bytes.
-        signed: two's complement.
-        writable: False = read only.
-        default: count after a reset; a string names the item it is copied from; None = the servo sets it.
-        low, high: bounds of a write in counts; a string names the item that is the bound, with ``-`` for its negative.
-        quantity: unit of a count: see :meth:`ControlTable.units`, ``degC``, ``ms``, ``2us``; None = a plain number.
-    """
-
-    name: str
+    name: str  #: spelled as in the e-manual, lower case with underscores
     address: int
-    size: int
-    signed: bool
-    writable: bool
-    default: Bound = None
-    low: Bound = None
+    size: int  #: bytes
+    signed: bool  #: two's complement
+    writable: bool  #: False = read only
+    default: Bound = None  #: count after a reset; a string names the item it is copied from; None = the servo sets it
+    low: Bound = None  #: bound of a write in counts; a string names the item that is the bound, with ``-`` for its negative
     high: Bound = None
-    quantity: str | None = None
+    quantity: str | None = None  #: unit: see :meth:`ControlTable.units`, ``degC``, ``ms``, ``2us``; None = a plain number
 
     @property
     def in_eeprom(self) -> bool:
@@ -144,25 +124,15 @@ class Item:
 
 @dataclass(frozen=True)
 class ControlTable:
-    """Control table of one servo model.
+    """Control table of one servo model."""
 
-    Attributes:
-        model: its name.
-        model_number: what a ping answers.
-        operating_modes: values Operating Mode takes.
-        items: by name, in order of address.
-        counts: what they are.
-        data_sheet: of the motor.
-        supply: V that gains in V hold for: PWM is a part of the supply; the data sheet's, unless :meth:`at` says another.
-    """
-
-    model: str
-    model_number: int
-    operating_modes: tuple[int, ...]
-    items: Mapping[str, Item]
-    counts: Counts
-    data_sheet: DataSheet
-    supply: float
+    model: str  #: its name
+    model_number: int  #: what a ping answers
+    operating_modes: tuple[int, ...]  #: values Operating Mode takes
+    items: Mapping[str, Item]  #: by name, in order of address
+    counts: Counts  #: what they are
+    data_sheet: DataSheet  #: of the motor
+    supply: float  #: V that gains in V hold for: PWM is a part of it; the data sheet's, unless :meth:`at` says another
 
     def __getitem__(self, name: str) -> Item:
         if name not in self.items:
