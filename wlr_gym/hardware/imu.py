@@ -211,6 +211,8 @@ def open_bus(path: str) -> I2cBus:
         InputError: it is not there, cannot be opened, or another program of this library has it.
     """
     require_package("smbus2", "robot")
+    import fcntl
+
     import smbus2
 
     try:
@@ -219,8 +221,6 @@ def open_bus(path: str) -> I2cBus:
         hint = "switch I2C on in the system's settings and join the group 'i2c'"
         raise InputError(f"IMU bus {path}: cannot be opened: {error}; {hint}") from None
     try:
-        import fcntl
-
         fcntl.flock(bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed
     except OSError as error:
         if error.errno in TAKEN:

@@ -12,7 +12,6 @@ import errno
 import os
 import select
 import struct
-import time
 from collections.abc import Callable
 from functools import partial
 from itertools import islice
@@ -291,8 +290,8 @@ class FrameStream:
         path: str,
         baud_rate: int,
         name: str,
-        clock: Callable[[], float] = time.monotonic,
-        make_device: Callable[[str, int, str], Device] = SerialDevice,
+        clock: Callable[[], float],
+        make_device: Callable[[str, int, str], Device],
         *,
         repeats: bool = True,
     ) -> None:
@@ -303,6 +302,7 @@ class FrameStream:
         self._begin()
 
     def _begin(self) -> None:
+        """Count from now; what a sensor's own stream counts, it adds here."""
         self.parser = self._make_parser()
         self._stream_clock = StreamClock()
         self.restarts = 0
