@@ -141,11 +141,11 @@ class FlowStream(FrameStream):
         found, now = self.statistics, self._clock()
         found.lost, found.errors = self.parser.lost, self.parser.crc_errors
         good: list[CountedMotion] = []
-        for (_, _, microseconds, *counted), end in frames:
+        for (_, _, microseconds, x, y, quality, shutter), end in frames:
             if end is None:
                 continue
             self._last_frame = now
-            motion = CountedMotion(microseconds * 1e-6, *counted, end)
+            motion = CountedMotion(microseconds * 1e-6, x, y, quality, shutter, end)
             if fault := self._fault(motion):
                 trouble = fault
             elif motion.end > now - OLDEST:
