@@ -47,7 +47,8 @@ if TYPE_CHECKING:
 
 #: Shows a text, waits for Enter, returns what was typed.
 Ask = Callable[[str], str]
-Options, Result = ParamSpec("Options"), TypeVar("Result")
+Options = ParamSpec("Options")
+Result = TypeVar("Result")
 #: Squares of a board along a side.
 _Squares = Annotated[int, Interval(least=3)]
 #: Share of the time that looking for the board takes, about; the computation of the lens takes the rest.
