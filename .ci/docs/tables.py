@@ -27,7 +27,7 @@ from studies.paper.verdicts import verdict_table
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.data.format import COLUMNS, Column
 from wlr_gym.envs.registry import ENVIRONMENTS
-from wlr_gym.envs.settings import EnvironmentOptions, Settings
+from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.envs.tasks import load_randomization, load_task
 from wlr_gym.envs.tasks.describe import (
     RANDOMIZATION_HEADER,
@@ -168,7 +168,7 @@ def keyword_table() -> list[str]:
     """Return the keywords of ``gym.make`` with their defaults: ``help(wlr_gym.EnvironmentOptions)``."""
     _, _, attributes = str(inspect.getdoc(EnvironmentOptions)).partition("Attributes:\n")
     told = dict(re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE))
-    defaults = {field.name: field.default for field in fields(Settings)}
+    defaults = {field.name: field.default for field in fields(EnvironmentOptions)}
     rows = [(f"`{name}`", f"`{defaults.get(name)!r}`", " ".join(text.split())) for name, text in told.items()]
     return _table(("keyword", "default", "what it takes"), rows)
 

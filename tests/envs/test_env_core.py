@@ -9,7 +9,7 @@ from velocity import make, make_vec
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
-from wlr_gym.envs.settings import Settings
+from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.envs.tasks.compiled_terms import (
     MATRICES,
     Scores,
@@ -333,7 +333,7 @@ def every_reward():
 
 
 def test_compiled_rewards_equal_the_same_terms_on_numpy():
-    task = make_task("velocity", Settings(task=every_reward()))
+    task = make_task("velocity", EnvironmentOptions(task=every_reward()))
     matrices = random_matrices(task)
     count = len(matrices["truth"])
     expected = expressions(task, reader(task, matrices))
@@ -358,7 +358,7 @@ def test_compiled_rewards_equal_the_same_terms_on_numpy():
 
 
 def test_compiled_computed_observations_equal_the_same_terms_on_numpy():
-    task = make_task("velocity", Settings(task=every_reward()))
+    task = make_task("velocity", EnvironmentOptions(task=every_reward()))
     matrices = random_matrices(task)
     before = matrices["computed"] = np.random.default_rng(1).normal(0, 0.1, (50, len(task.computed)))
     expected = computed_expressions(task, reader(task, matrices))
@@ -374,7 +374,7 @@ def test_compiled_computed_observations_equal_the_same_terms_on_numpy():
 
 def value_of(name, parameters=None, **truth):
     """One reward term, weighted 1 per tick, of a still robot with some true quantities set."""
-    task = make_task("velocity", Settings(task={"rewards": {name: {"weight": 50.0, **(parameters or {})}}}))
+    task = make_task("velocity", EnvironmentOptions(task={"rewards": {name: {"weight": 50.0, **(parameters or {})}}}))
     matrices = random_matrices(task, 1)
     for matrix in matrices.values():
         matrix[:] = 0.0
@@ -435,8 +435,9 @@ def test_action_rate_compares_with_the_tick_before(fake):
 
 
 def test_weights_and_parameters_compile_nothing_new():
-    base = compile_scores(make_task("velocity", Settings()))
-    changed = compile_scores(make_task("velocity", Settings(task={"rewards": {"slip": {"weight": -9.0, "speed": 0.3}}})))
+    base = compile_scores(make_task("velocity", EnvironmentOptions()))
+    options = EnvironmentOptions(task={"rewards": {"slip": {"weight": -9.0, "speed": 0.3}}})
+    changed = compile_scores(make_task("velocity", options))
     assert changed.run is base.run
     assert not np.array_equal(changed.numbers, base.numbers)
 

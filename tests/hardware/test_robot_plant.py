@@ -15,7 +15,7 @@ import wlr_gym  # noqa: F401  (registers the environments)
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.runs import read_run
 from wlr_gym.envs.core import MEASURED, measured_truth
-from wlr_gym.envs.settings import Settings
+from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.learning.evaluation import make_core, roll_out
 from wlr_gym.physics.effects import Patch
 from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
@@ -230,7 +230,7 @@ def test_what_only_a_simulator_can_do_is_refused(keywords, words):
 
 @pytest.mark.parametrize("effects", [[], (), Patch(), None])
 def test_no_effects_are_none(effects):
-    assert Settings(backend="dynamixel", hardware=EMULATED, effects=effects).is_real
+    assert EnvironmentOptions(backend="dynamixel", hardware=EMULATED, effects=effects).is_real
 
 
 def test_a_robot_is_not_scored(env):

@@ -9,7 +9,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.core import make_task
-from wlr_gym.envs.settings import Settings
+from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.envs.tasks.task import read_task
 from wlr_gym.learning.evaluation import make_core
@@ -79,11 +79,11 @@ def task_file(folder, **changes):
 def test_of_a_task_file_only_what_a_policy_is_fed_holds(tmp_path):
     rewards = read_task("velocity").rewards | {"action_rate": {"weight": -7.0}}
     task = task_file(tmp_path, sensors={"camera": 1.0}, rewards=rewards, observer={"camera": False}, control_period=0.04)
-    trained = make_task("velocity", Settings(task=task, robot=WIDE))
+    trained = make_task("velocity", EnvironmentOptions(task=task, robot=WIDE))
     write_contract(tmp_path, "do_nothing", {"environment": {"task": task}}, contract(trained, {}), {})
     assert policy_environment(tmp_path)["task"]["observer"] == {"camera": False}
     keywords = environment_for(tmp_path, {"task": {"sensors": {"camera": 0.0}}})
-    played = make_task("velocity", Settings(**keywords))
+    played = make_task("velocity", EnvironmentOptions(**keywords))
     sources.check_contract(contract(trained, {}), contract(played, {}), "here")
     assert played.config.sensors.camera == 0.0
     assert played.config.rewards["action_rate"] == read_task("velocity").rewards["action_rate"]
@@ -91,7 +91,7 @@ def test_of_a_task_file_only_what_a_policy_is_fed_holds(tmp_path):
 
 def test_a_task_file_with_other_commands_is_another_task(tmp_path):
     task = task_file(tmp_path)
-    played = make_task("path", Settings(**sources.fed_environment({"task": task})))
+    played = make_task("path", EnvironmentOptions(**sources.fed_environment({"task": task})))
     assert played.config == read_task(task)
 
 

@@ -19,7 +19,7 @@ from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.snapshot import RowStore, Snapshot, check_fit, read_rows, take_snapshot, write_snapshot
 from wlr_gym.envs.episodes import Commands, Episodes, Mask, RandomizedRobots, is_whole
 from wlr_gym.envs.observation import Actions, ObservationPipeline
-from wlr_gym.envs.settings import Settings
+from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.envs.tasks.compiled_terms import Scores, compile_computed, compile_scores, not_finite
 from wlr_gym.envs.tasks.describe import contract, describe
 from wlr_gym.envs.tasks.randomization import load_randomization
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 OPTIONS = ("command", "parameters")
 
 
-def make_task(task_name: str | Mapping[str, Any], settings: Settings) -> Task:
+def make_task(task_name: str | Mapping[str, Any], settings: EnvironmentOptions) -> Task:
     """Load the task of an environment with the user's overrides; a real robot is the one that its hardware file names."""
     robot = settings.robot
     if robot is None and settings.robot_options is not None:
@@ -75,7 +75,7 @@ class Core:
         command: (N, C). action: (N, 8). parameters: of every robot. state: where the present episodes started.
     """
 
-    def __init__(self, task_name: str | Mapping[str, Any], settings: Settings, count: int) -> None:
+    def __init__(self, task_name: str | Mapping[str, Any], settings: EnvironmentOptions, count: int) -> None:
         if not is_whole(count) or count < 1:
             raise InputError(f"num_envs = {count!r}: expected a whole number of 1 or more")
         self.settings = settings

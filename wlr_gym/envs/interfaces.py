@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +25,7 @@ from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.envs.core import OPTIONS, Core, Snapshots, read_options
 from wlr_gym.envs.episodes import Mask, own_seed, read_seed
 from wlr_gym.envs.observation import read_actions
-from wlr_gym.envs.settings import EnvironmentOptions, read_settings, task_of
+from wlr_gym.envs.settings import read_settings, task_of
 from wlr_gym.envs.tasks.task import limits_of, scales_of, succeeded, tracking_error
 from wlr_gym.render.view import has_display, require_display
 
@@ -320,7 +320,7 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):  # pyright: ignor
         *,
         render_mode: str | None = None,
         definition: Mapping[str, Any] | None = None,
-        **options: Unpack[EnvironmentOptions],
+        **options: Any,
     ) -> None:
         EzPickle.__init__(self, render_mode=render_mode, definition=definition, **options)
         check_render_mode(render_mode)
@@ -423,7 +423,7 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         definition: Mapping[str, Any] | None = None,
-        **options: Unpack[EnvironmentOptions],
+        **options: Any,
     ) -> None:
         EzPickle.__init__(
             self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Iterable, Sequence
-from typing import Any, Unpack
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +17,7 @@ from wlr_gym.envs.core import Core
 from wlr_gym.envs.episodes import Mask, read_seed
 from wlr_gym.envs.interfaces import Infos, Pictures, TaskMethods, check_render_mode, metadata, row_of, seed_robots
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.settings import EnvironmentOptions, read_settings
+from wlr_gym.envs.settings import read_settings
 
 require_package("stable_baselines3", "train")
 
@@ -54,7 +54,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         seed: int | None = None,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
-        **options: Unpack[EnvironmentOptions],
+        **options: Any,
     ) -> None:
         spec = _spec_of(env_id)
         given = dict(spec.kwargs)

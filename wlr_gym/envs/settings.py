@@ -2,43 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, TypedDict
+from types import UnionType
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
-from wlr_gym.base.errors import InputError, nearest, unknown_name
+from wlr_gym.base.errors import InputError, check_name, nearest
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
-from wlr_gym.physics.effects import Patch, Source
+from wlr_gym.physics.effects import Source
 from wlr_gym.physics.plants import REAL
 from wlr_gym.physics.plants.base import RobotOptions, read_robot_options
 from wlr_gym.render.view import View, read_view
-from wlr_gym.robot import WHEELS, Robot, RobotSource
+from wlr_gym.robot import WHEELS, RobotSource
 
 OBSERVATIONS = ("policy", "dict")
 
-#: Keyword -> types it takes, in Python and in words.
-_TYPES: dict[str, tuple[tuple[type, ...], str]] = {
-    "backend": ((str,), "a name"),
-    "robot": ((str, Path, Mapping, Robot, type(None)), "a name, a path, a mapping or a Robot"),
-    "randomization": ((str, Path, Mapping, RandomizationConfig, type(None)), "a name, a path or a mapping"),
-    "task": ((str, Path, Mapping, type(None)), "a name, a path or a mapping"),
-    "effects": ((str, Path, Mapping, list, tuple, Patch, type(None)), "a name, a path, a mapping or a list of these"),
-    "episode_length": ((Real, type(None)), "a time above 0 s"),
-    "observation": ((str,), "a name"),
-    "free_wheels": ((Iterable,), "a list of wheels, such as ['wheel_lf']"),
-    "physics_step": ((Real,), "a time above 0 s"),
-    "precision": ((str,), "a name"),
-    "threads": ((Integral,), "a whole number of 1 or more"),
-    "truth_info": ((bool,), "True or False"),
-    "view": ((Mapping, View, type(None)), "a mapping"),
-    "hardware": ((str, Path, Mapping, RobotOptions, type(None)), "a name, a path or a mapping"),
-}
 
-
-class EnvironmentOptions(TypedDict, total=False):
-    """What ``gym.make("WLR-...", ...)``, ``gym.make_vec`` and the environment classes accept.
+@dataclass(frozen=True)
+class EnvironmentOptions:
+    """What ``gym.make("WLR-...", ...)``, ``gym.make_vec`` and the environment classes accept, checked.
 
     Attributes:
         backend: which plant: ``gibbs_appell`` or ``mujoco``, or ``dynamixel``: the real robot, see ``docs/driving.md``.
@@ -66,55 +51,33 @@ class EnvironmentOptions(TypedDict, total=False):
             :class:`wlr_gym.physics.plants.base.RobotOptions` (``{"emulated": True}``).
     """
 
-    backend: str
-    plant: str
-    robot: RobotSource | None
-    randomization: str | Path | Mapping[str, Any] | None
-    task: str | Path | Mapping[str, Any] | None
-    effects: Source
-    episode_length: float | None
-    observation: str
-    free_wheels: Sequence[str]
-    physics_step: float
-    precision: str
-    threads: int
-    truth_info: bool
-    view: Mapping[str, Any] | View | None
-    hardware: str | Path | Mapping[str, Any] | RobotOptions | None
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Checked :class:`EnvironmentOptions` with their defaults."""
-
-    backend: str = "gibbs_appell"
-    robot: RobotSource | None = None
-    randomization: str | Path | Mapping[str, Any] | None = None
-    task: str | Path | Mapping[str, Any] | None = None
-    effects: Source = None
-    episode_length: float | None = None
-    observation: str = "policy"
-    free_wheels: Sequence[str] = ()
-    physics_step: float = 0.001
-    precision: str = "float64"
-    threads: int = 1
-    truth_info: bool = False
-    view: Mapping[str, Any] | View | None = None
-    hardware: str | Path | Mapping[str, Any] | RobotOptions | None = None
+    backend: Annotated[str, "a name"] = "gibbs_appell"
+    plant: Annotated[str | None, "a name"] = None
+    robot: Annotated[RobotSource | None, "a name, a path, a mapping or a Robot"] = None
+    randomization: Annotated[str | Path | Mapping[str, Any] | RandomizationConfig | None, "a name, a path or a mapping"] = None
+    task: Annotated[str | Path | Mapping[str, Any] | None, "a name, a path or a mapping"] = None
+    effects: Annotated[Source, "a name, a path, a mapping or a list of these"] = None
+    episode_length: Annotated[float | None, "a time above 0 s"] = None
+    observation: Annotated[str, "a name"] = "policy"
+    free_wheels: Annotated[Iterable[str], "a list of wheels, such as ['wheel_lf']"] = ()
+    physics_step: Annotated[float, "a time above 0 s"] = 0.001
+    precision: Annotated[str, "a name"] = "float64"
+    threads: Annotated[int, "a whole number of 1 or more"] = 1
+    truth_info: Annotated[bool, "True or False"] = False
+    view: Annotated[Mapping[str, Any] | View | None, "a mapping"] = None
+    hardware: Annotated[str | Path | Mapping[str, Any] | RobotOptions | None, "a name, a path or a mapping"] = None
 
     def __post_init__(self) -> None:
-        for keyword, (types, expected) in _TYPES.items():
+        for keyword, (types, expected) in _types().items():
             value = getattr(self, keyword)
             if (isinstance(value, bool) and bool not in types) or not isinstance(value, types):
                 raise InputError(f"{keyword} = {value!r}: expected {expected}")
-        if self.observation not in OBSERVATIONS:
-            raise unknown_name("observation", str(self.observation), OBSERVATIONS, "environment")
+        check_name("observation", self.observation, OBSERVATIONS, "environment")
         if isinstance(self.free_wheels, str):
             raise InputError(f"free_wheels = {self.free_wheels!r}: expected a list of wheels, such as ['wheel_lf']")
         object.__setattr__(self, "free_wheels", tuple(self.free_wheels))  # an iterator can be read once
         for wheel in self.free_wheels:
-            if wheel not in WHEELS:
-                raise unknown_name("wheel", str(wheel), WHEELS, "free_wheels")
+            check_name("wheel", wheel, WHEELS, "free_wheels")
         if self.episode_length is not None and not 0 < self.episode_length < float("inf"):
             raise InputError(f"episode_length = {self.episode_length!r}: expected a time above 0 s")
         if self.view is not None and read_view(self.view).path:
@@ -161,6 +124,18 @@ class Settings:
         return read_view(self.view)
 
 
+@cache
+def _types() -> dict[str, tuple[tuple[type, ...], str]]:
+    """Return keyword -> the types it takes, and these in words."""
+    wider = {float: Real, int: Integral}
+    found = {}
+    for keyword, hint in get_type_hints(EnvironmentOptions, include_extras=True).items():
+        annotated, words = get_args(hint)
+        parts = get_args(annotated) if isinstance(annotated, UnionType) else (annotated,)
+        found[keyword] = tuple(wider.get(part, get_origin(part) or part) for part in parts), words
+    return found
+
+
 #: What is no keyword of an environment -> where it belongs.
 _ELSEWHERE = {
     "num_envs": "; several at once: gymnasium.make_vec(ID, num_envs=4)",
@@ -173,7 +148,7 @@ class UnknownOptionError(InputError, TypeError):
     """An option that does not exist. Also a TypeError, worded as Python words it: that is what other libraries probe for."""
 
 
-def read_settings(options: Mapping[str, Any]) -> Settings:
+def read_settings(options: Mapping[str, Any]) -> EnvironmentOptions:
     """Return checked settings.
 
     Raises:
@@ -191,7 +166,7 @@ def read_settings(options: Mapping[str, Any]) -> Settings:
         plant = given.pop("plant")
         if given.setdefault("backend", plant) != plant:
             raise InputError(f"plant = {plant!r} and backend = {given['backend']!r}: two words for one thing, give one")
-    return Settings(**given)
+    return EnvironmentOptions(**given)
 
 
 def task_of(own: str | None, definition: Mapping[str, Any] | None) -> str | Mapping[str, Any]:
