@@ -76,9 +76,6 @@ def straight_line(text: str, names: str, kinds: Sequence[Any]) -> tuple[Any, Cal
             ``select(a > b, c, d)``, ``np.floor(a)``, ``F(number)``, and of ``math``: sqrt, exp, tanh, atan2.
         names: the intrinsic's parameters, ``"w k step"``.
         kinds: their numba types: pointers (``numbers_of``), integers for indices, and numbers in the pointers' precision.
-
-    Raises:
-        TypeError: an expression of another form.
     """
     number = next(kind.dtype for kind in kinds if isinstance(kind, types.CPointer))
     wanted = [number if isinstance(kind, types.Float) else kind for kind in kinds]

@@ -138,9 +138,6 @@ def check_ranges(options: Any, prefix: str = "--") -> None:
     Args:
         options: instance of the dataclass.
         prefix: of the names of fields in messages; behind ``--`` a name has hyphens.
-
-    Raises:
-        InputError: naming field, value and range.
     """
     for name, hint in get_type_hints(type(options), include_extras=True).items():
         value = getattr(options, name)
@@ -156,32 +153,20 @@ def _ranges(hint: Any) -> Iterator[Interval]:
 
 
 def check_name(kind: str, name: Any, valid: Iterable[str], place: str = "") -> None:
-    """Refuse a name that is not among the valid ones.
-
-    Raises:
-        InputError: listing them and naming the nearest; see :func:`wlr_gym.base.errors.unknown_name`.
-    """
+    """Refuse a name that is not among the valid ones."""
     if name not in (options := list(valid)):
         raise unknown_name(kind, str(name), options, place)
 
 
 def check_file(path: Path, place: str = "") -> None:
-    """Refuse a path at which there is no file.
-
-    Raises:
-        InputError: naming it, and what is there instead.
-    """
+    """Refuse a path at which there is no file."""
     if not path.is_file():
         found = "is a folder" if path.is_dir() else "no such file"
         raise InputError(f"{place and place + ' '}{path}: {found}; expected a file")
 
 
 def check_folder(path: Path, place: str = "", of: str = "") -> None:
-    """Refuse a path at which there is no folder; ``of`` says what it is to hold.
-
-    Raises:
-        InputError: naming it, and what is there instead.
-    """
+    """Refuse a path at which there is no folder; ``of`` says what it is to hold."""
     if not path.is_dir():
         found = "is a file" if path.is_file() else "no such folder"
         raise InputError(f"{place and place + ' '}{path}: {found}; expected a folder{of and ' of '}{of}")

@@ -1,4 +1,4 @@
-"""Write files so that a reader never sees half of one."""
+"""Write files so that a reader never sees half of one; what cannot be written, or must not be written over, is refused by name."""
 
 from __future__ import annotations
 
@@ -18,11 +18,7 @@ LOCK = ".lock"
 
 
 def make_output_folder(path: Path, option: str = "--out") -> None:
-    """Make a folder for results, if it is not there.
-
-    Raises:
-        InputError: it cannot be made, or not be written to; the message names the command's ``option``.
-    """
+    """Make a folder for results, if it is not there."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -33,11 +29,7 @@ def make_output_folder(path: Path, option: str = "--out") -> None:
 
 
 def require_output_place(path: Path) -> None:
-    """Refuse, before the work, a place where no folder for results can be made; nothing is.
-
-    Raises:
-        InputError: it is or lies in a file, or in a folder that cannot be written to.
-    """
+    """Refuse, before the work, a place where no folder for results can be made; nothing is."""
     nearest = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
     if not nearest.is_dir():
         raise InputError(f"--out {path}: {nearest} is a file; expected a folder")
@@ -50,11 +42,7 @@ def require_output_place(path: Path) -> None:
 
 @contextmanager
 def output_folder(path: Path | None) -> Iterator[None]:
-    """Make the folder of ``--out``, None = there is none; work that fails or is interrupted in here leaves no empty one.
-
-    Raises:
-        InputError: see :func:`make_output_folder`.
-    """
+    """Make the folder of ``--out``, None = there is none; work that fails or is interrupted in here leaves no empty one."""
     if path is None:
         yield
         return
@@ -70,21 +58,13 @@ def output_folder(path: Path | None) -> Iterator[None]:
 
 
 def refuse_existing(path: Path, force: bool, option: str = "--out") -> None:
-    """Refuse to write over a file or folder, unless ``--force`` is given.
-
-    Raises:
-        InputError: it is there.
-    """
+    """Refuse to write over a file or folder, unless ``--force`` is given."""
     if path.exists() and not force:
         raise InputError(f"{option} {path}: exists; choose another name, or replace it with --force")
 
 
 def require_empty(folder: Path, resume: str) -> None:
-    """Refuse a folder that something is in; ``resume`` is the command that goes on with it, empty = none does.
-
-    Raises:
-        InputError: something is in it, or it is a file.
-    """
+    """Refuse a folder that something is in; ``resume`` is the command that goes on with it, empty = none does."""
     if folder.is_file():
         raise InputError(f"{folder}: cannot be a folder: it is a file")
     if folder.is_dir() and any(folder.iterdir()):
@@ -99,9 +79,6 @@ def require_ending(path: Path, endings: Iterable[str], option: str = "--out", *,
         path: of the file. endings: lower case.
         option: what gave it.
         any_case: capitals will do, too: nothing reads it by its ending.
-
-    Raises:
-        InputError: its name ends in none of the endings.
     """
     if (path.suffix.lower() if any_case else path.suffix) not in endings:
         raise InputError(f"{option} {path}: expected a file that ends in {', '.join(endings)}")
@@ -110,11 +87,7 @@ def require_ending(path: Path, endings: Iterable[str], option: str = "--out", *,
 def check_new_file(
     path: Path, force: bool, option: str = "--out", endings: Iterable[str] = (), *, any_case: bool = False
 ) -> None:
-    """Refuse, before the work, a file that cannot be the result: see :func:`require_ending` and :func:`refuse_existing`.
-
-    Raises:
-        InputError: as these, or its folder is not there.
-    """
+    """Refuse, before the work, a file that cannot be the result: see :func:`require_ending` and :func:`refuse_existing`."""
     if endings:
         require_ending(path, endings, option, any_case=any_case)
     refuse_existing(path, force, option)
@@ -123,11 +96,7 @@ def check_new_file(
 
 
 def resumes(folder: Path, file: str) -> bool:
-    """Whether work in a folder for results resumes from its ``file``; otherwise the folder is new or empty, and is made.
-
-    Raises:
-        InputError: a folder of something else.
-    """
+    """Whether work in a folder for results resumes from its ``file``; otherwise the folder is new or empty, and is made."""
     if (folder / file).is_file():
         return True
     if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
@@ -137,20 +106,12 @@ def resumes(folder: Path, file: str) -> bool:
 
 
 def alone_in(folder: Path) -> AbstractContextManager[None]:
-    """Work in a folder that no other process works in meanwhile; see :func:`locked`.
-
-    Raises:
-        InputError: another process does.
-    """
+    """Work in a folder that no other process works in meanwhile; see :func:`locked`."""
     return locked(folder / LOCK, 0.0)
 
 
 def keep_request(path: Path, requested: Mapping[str, Any]) -> None:
-    """Write what is requested of a folder into its file; refuse, if it is there, to go on with what was requested otherwise.
-
-    Raises:
-        InputError: the first difference.
-    """
+    """Write what is requested of a folder into its file; refuse, if it is there, to go on with what was requested otherwise."""
     if path.is_file():
         check_same_request(path, json.loads(path.read_text(encoding="utf-8")), requested)
     write_json(path, requested)
@@ -161,9 +122,6 @@ def check_same_request(path: Path, there: Mapping[str, Any], requested: Mapping[
 
     Args:
         path: file that says what was requested. there: what it says. requested: now.
-
-    Raises:
-        InputError: the first difference.
     """
     for name, value in requested.items():
         if there.get(name) != value:

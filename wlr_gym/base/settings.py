@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.paths import find_config, named_by, named_in
@@ -23,6 +23,16 @@ class SettingsModel(BaseModel):
     """A record of settings: frozen, finite numbers only, unknown keys refused."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _ordered(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] > limits[1]:
+        raise ValueError("expected [low, high] with low <= high")
+    return limits
+
+
+#: Declares a pair of numbers as a range: ``Annotated[tuple[PositiveFloat, PositiveFloat], ORDERED]``.
+ORDERED = AfterValidator(_ordered)
 
 
 def overlay(base: Any, changes: Mapping[str, Any]) -> Any:
@@ -214,6 +224,7 @@ _EXPECTED = {
     "model_type": "keys and values",
     "list_type": "a list",
     "tuple_type": "a list",
+    "too_short": "at least {min_length}",
 }
 #: Letters of a value that a message shows; a longer one is cut.
 _LONGEST = 60

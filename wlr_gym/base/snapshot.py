@@ -51,11 +51,7 @@ class Snapshot:
         return (self[row] for row in range(len(self)))
 
     def __getitem__(self, rows: int | slice | Sequence[int] | NDArray[Any]) -> Snapshot:
-        """Return the snapshot of one or some of its robots, in this order; a number may come more than once.
-
-        Raises:
-            InputError: a number that is none of its robots.
-        """
+        """Return the snapshot of one or some of its robots, in this order; a number may come more than once."""
         count = len(self)
         if isinstance(rows, slice):
             rows = range(*rows.indices(count))
@@ -76,12 +72,7 @@ def take_snapshot(stores: Mapping[str, RowStore], rows: Rows, fits: Mapping[str,
 
 
 def check_fit(snapshot: Snapshot, rows: Rows, fits: Mapping[str, Any], names: Iterable[str]) -> None:
-    """Refuse a snapshot that robots ``rows`` of an environment with these settings cannot take.
-
-    Raises:
-        InputError: no snapshot, one of another environment (names the first difference) or another version of this library,
-            or another number of robots.
-    """
+    """Refuse a snapshot that robots ``rows`` of an environment with these settings cannot take."""
     if not isinstance(snapshot, Snapshot):
         raise InputError(f"set_state({type(snapshot).__name__}): expected what get_state() returned")
     for name, value in fits.items():

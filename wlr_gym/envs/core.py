@@ -152,11 +152,7 @@ class Core:
     # ---- episodes ----
 
     def seed(self, row: int, seed: int) -> None:
-        """Give a robot its seed; its next episode is its first.
-
-        Raises:
-            InputError: no whole number of 0 or more.
-        """
+        """Give a robot its seed; its next episode is its first."""
         self.episodes.seed(row, seed)
 
     def begin_episodes(self, mask: Mask, options: Mapping[str, Any] | None = None) -> None:
@@ -207,9 +203,6 @@ class Core:
     def set_progress(self, steps: float) -> None:
         """Say how many environment steps, of all robots together, a training has done: what is drawn from now on is spread as
         far as the task's curriculum says for so many steps. Without it the whole task is met.
-
-        Raises:
-            InputError: fewer than 0, or no number.
         """
         if isinstance(steps, bool) or not isinstance(steps, (int, float, np.number)) or not steps >= 0:
             raise InputError(f"steps = {steps!r}: expected 0 or more")
@@ -237,11 +230,7 @@ class Core:
         return self._finish_step(mask)
 
     def try_step(self, actions: ArrayLike) -> None:
-        """Advance plant and scores of all robots, and nothing else: for planners, which try what they may not do.
-
-        Raises:
-            InputError: wrong shape, or an action that is not finite or out of [-1, 1]; names robot and joint.
-        """
+        """Advance plant and scores of all robots, and nothing else: for planners, which try what they may not do."""
         self.actions.take(actions, self.everyone)
         self.sensors = self.plant.step(self.actions.setpoints, self.actions.torque_on)
         self._score(self.everyone, self._signals())
@@ -325,11 +314,7 @@ class Core:
         return contract(self.task, self.randomization.config.model_dump(mode="json", exclude_none=True))
 
     def shorten(self, max_episode_steps: int | None) -> None:
-        """Truncate episodes after so many control steps, if that is before the task's own limit; None and -1 leave that.
-
-        Raises:
-            InputError: no whole number of 1 or more, or -1.
-        """
+        """Truncate episodes after so many control steps, if that is before the task's own limit; None and -1 leave that."""
         if max_episode_steps is None or max_episode_steps == -1:
             return
         if not is_whole(max_episode_steps) or max_episode_steps < 1:
@@ -346,11 +331,7 @@ def _share(ramp: RampConfig | None, steps: float) -> float:
 
 
 def read_options(options: Any, valid: tuple[str, ...] = OPTIONS) -> Mapping[str, Any]:
-    """Return reset options, empty for None.
-
-    Raises:
-        InputError: not a mapping, or an option that is not in ``valid``.
-    """
+    """Return reset options, empty for None."""
     options = _mapping("options", options)
     for name in options:
         if name not in valid:
@@ -378,9 +359,6 @@ class Snapshots:
 
     Args:
         core: of the environment.
-
-    Raises:
-        InputError: a plant whose state cannot be set.
     """
 
     def __init__(self, core: Core) -> None:
@@ -470,11 +448,7 @@ def measurable(task: Task, has_camera: bool) -> tuple[Task, tuple[str, ...]]:
 
 
 def require_flow(task: Task, has_flow: bool) -> None:
-    """Refuse a task that observes optical flow on a robot without the sensor, unless it is one that does without at times.
-
-    Raises:
-        InputError: names the observation.
-    """
+    """Refuse a task that observes optical flow on a robot without the sensor, unless it is one that does without at times."""
     always = task.config.sensors.flow is None or task.config.sensors.flow >= 1.0
     for column in task.policy:
         if column.device == "flow" and always and not has_flow:

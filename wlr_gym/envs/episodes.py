@@ -66,11 +66,7 @@ class Episodes:
         self.truncated: Mask = np.zeros(count, bool)
 
     def seed(self, row: int, seed: int) -> None:
-        """Give a robot its seed; its next episode is its first.
-
-        Raises:
-            InputError: see :func:`read_seed`.
-        """
+        """Give a robot its seed; its next episode is its first."""
         self.robot_seeds[row] = _word(read_seed(seed))
         self.number[row] = -1
         self.seeded[row] = True
@@ -103,11 +99,7 @@ class Episodes:
         return {name: getattr(self, name) for name in names}
 
     def require_begun(self, what: str, rows: Rows | None = None) -> None:
-        """Refuse what needs the episodes of some robots, None = all, to have begun.
-
-        Raises:
-            gymnasium.error.ResetNeeded: one has not.
-        """
+        """Refuse what needs the episodes of some robots, None = all, to have begun."""
         if self._all_begun:
             return
         asked = np.arange(len(self.begun)) if rows is None else rows
@@ -340,9 +332,6 @@ class RandomizedRobots:
             rows: (M,) which robots.
             robot_seeds, seeds: (M,) of the robots and of their episodes.
             overrides: parameters that keep these values for the whole episode.
-
-        Raises:
-            InputError: an override out of bounds; nothing has changed then.
         """
         robots = self._draw(robot_seeds, seeds, np.full(len(rows), self.share))
         _override(robots, overrides)

@@ -222,11 +222,7 @@ class RenderModeError(InputError, TypeError):
 
 
 def check_render_mode(render_mode: str | None) -> None:
-    """Refuse a render mode that does not exist, or a window where there is no display.
-
-    Raises:
-        InputError: the message says what is valid, or what to do instead.
-    """
+    """Refuse a render mode that does not exist, or a window where there is no display."""
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise RenderModeError(f"render_mode = {render_mode!r}: expected None, 'human' or 'rgb_array'")
     if render_mode == "human":
@@ -265,11 +261,7 @@ class Pictures:
         gym.logger.warn("render() without a render mode shows nothing: make the environment with render_mode='rgb_array'")
 
     def frame(self, row: int) -> Picture:
-        """Return the picture of one robot, (H, W, 3) uint8.
-
-        Raises:
-            InputError: no OpenGL on this machine.
-        """
+        """Return the picture of one robot, (H, W, 3) uint8."""
         self.core.episodes.require_begun("render()")
         if self._scene is None:
             from wlr_gym.render import Scene

@@ -314,11 +314,7 @@ class Actions:
 
 
 def read_actions(actions: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return actions as float32 of the given shape.
-
-    Raises:
-        InputError: not numbers, or another shape.
-    """
+    """Return actions as float32 of the given shape."""
     if type(actions) is np.ndarray and actions.dtype == _FLOAT32 and actions.shape == shape:
         return actions  # as nearly always: half of the time of what follows, twice in a step
     try:

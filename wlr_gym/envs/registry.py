@@ -18,11 +18,7 @@ def title_of(task_name: str) -> str:
 
 
 def plain_id(env_id: str) -> str:
-    """Return an id without the module before it, which is imported: ``my_tasks:WLR-Climb-v0``, as for ``gym.make``.
-
-    Raises:
-        InputError: no id, or no such module.
-    """
+    """Return an id without the module before it, which is imported: ``my_tasks:WLR-Climb-v0``, as for ``gym.make``."""
     if not isinstance(env_id, str):
         raise InputError(f"environment {env_id!r}: expected an id, such as {next(iter(ENVIRONMENTS))}")
     module, colon, name = env_id.rpartition(":")
@@ -50,11 +46,7 @@ def task_name_of(env_id: str) -> str:
 
 
 def task_source_of(env_id: str) -> str | dict[str, Any]:
-    """Return the task behind an environment id: a name in ``configs/task/``, or the whole content of a registered task.
-
-    Raises:
-        InputError: no such id in this process.
-    """
+    """Return the task behind an environment id: a name in ``configs/task/``, or the whole content of a registered task."""
     import gymnasium
 
     task = task_name_of(env_id)

@@ -76,11 +76,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
             self.seed(seed)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Give robot i the seed ``seed + i`` from the next reset on; None draws one.
-
-        Raises:
-            InputError: no whole number of 0 or more.
-        """
+        """Give robot i the seed ``seed + i`` from the next reset on; None draws one."""
         return super().seed(None if seed is None else read_seed(seed))
 
     def reset(self) -> Any:
@@ -159,22 +155,14 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Set an attribute for all robots.
-
-        Raises:
-            InputError: ``indices`` leaves robots out.
-        """
+        """Set an attribute for all robots."""
         self._require_everyone(attr_name, "set", indices)
         setattr(self, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of the batch once; the result stands for every robot.
-
-        Raises:
-            InputError: ``indices`` leaves robots out.
-        """
+        """Call a method of the batch once; the result stands for every robot."""
         self._require_everyone(method_name, "call", indices)
         result = getattr(self, method_name)(*method_args, **method_kwargs)
         return [result] * self.num_envs
@@ -189,11 +177,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
 
 
 def _spec_of(environment: Any) -> EnvSpec:
-    """Return the spec of an id, which may begin with the module that registers it, or the spec itself.
-
-    Raises:
-        InputError: unknown id, or neither.
-    """
+    """Return the spec of an id, which may begin with the module that registers it, or the spec itself."""
     if isinstance(environment, EnvSpec):
         return environment
     if not isinstance(environment, str):

@@ -149,11 +149,7 @@ class UnknownOptionError(InputError, TypeError):
 
 
 def read_settings(options: Mapping[str, Any]) -> EnvironmentOptions:
-    """Return checked settings.
-
-    Raises:
-        InputError: unknown option (with the nearest valid one) or a bad value.
-    """
+    """Return checked settings."""
     valid = [*EnvironmentOptions.__annotations__, "render_mode"]
     for option in options:
         if option not in valid:
@@ -170,11 +166,7 @@ def read_settings(options: Mapping[str, Any]) -> EnvironmentOptions:
 
 
 def task_of(own: str | None, definition: Mapping[str, Any] | None) -> str | Mapping[str, Any]:
-    """Return the task of an environment class, or the one that it is given.
-
-    Raises:
-        InputError: neither, or both.
-    """
+    """Return the task of an environment class, or the one that it is given."""
     if (own is None) == (definition is None):
         raise InputError("definition: expected the task's content where the class has no task of its own, and only there")
     if definition is not None and not isinstance(definition, Mapping):

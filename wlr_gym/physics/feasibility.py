@@ -6,8 +6,9 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
@@ -57,14 +58,9 @@ class RobotFinding:
         return self.text if self.value is None else f"{self.key} = {self.value:.6g}{unit}: {self.text}"
 
 
-def fault(key: str, value: float | None, unit: str, text: str) -> RobotFinding:
-    """Return a finding that stands against using the robot."""
-    return RobotFinding("fault", key, value, unit, text)
-
-
-def warning(key: str, value: float | None, unit: str, text: str) -> RobotFinding:
-    """Return a finding that is odd."""
-    return RobotFinding("warning", key, value, unit, text)
+#: A finding that stands against using the robot, and one that is odd.
+fault = partial(RobotFinding, "fault")
+warning = partial(RobotFinding, "warning")
 
 
 # ---- the robot at rest on a level floor with its legs at given angles ------------------------------------------------
@@ -173,56 +169,34 @@ def hip_torque(robot: Robot, angle: float, load: float) -> float:
 class Capability:
     """Numbers of a robot on its own floor, in its home pose unless something else is said; see :data:`ENTRIES`."""
 
-    total_mass: float
-    com_height: float
-    wheelbase: float
-    track_width: float
-    top_speed: float
-    acceleration_of_motors: float
-    acceleration_of_grip: float
-    tipping_acceleration: float
-    tipping_deceleration: float
-    climb_of_motors: float
-    climb_of_grip: float
-    tipping_uphill: float
-    tipping_downhill: float
-    tipping_sideways: float
-    turning_torque: float
-    turning_rate: float
-    wheel_torque: float
-    holding_torque: float
-    holding_torque_at_limits: float
-    leg_torque: float
-    leg_sag: float
-    smallest_wheel_share: float
-    contact_sag: float
+    total_mass: Annotated[float, "kg", "body, legs and wheels"]
+    com_height: Annotated[float, "m", "centre of mass above the floor"]
+    wheelbase: Annotated[float, "m", "front to rear wheels"]
+    track_width: Annotated[float, "m", "left to right wheels"]
+    top_speed: Annotated[float, "m/s", "level floor, full supply, against gear friction"]
+    acceleration_of_motors: Annotated[float, "m/s2", "from standstill, by the motors' stall torque"]
+    acceleration_of_grip: Annotated[float, "m/s2", "by the floor's friction"]
+    tipping_acceleration: Annotated[float, "m/s2", "at which the front wheels lift"]
+    tipping_deceleration: Annotated[float, "m/s2", "at which the rear wheels lift"]
+    climb_of_motors: Annotated[float, "rad", "steepest slope by the motors' stall torque"]
+    climb_of_grip: Annotated[float, "rad", "steepest slope by the floor's friction"]
+    tipping_uphill: Annotated[float, "rad", "slope, nose up, on which it tips over"]
+    tipping_downhill: Annotated[float, "rad", "slope, nose down, on which it tips over"]
+    tipping_sideways: Annotated[float, "rad", "slope across, on which it tips over"]
+    turning_torque: Annotated[float, "N m", "of the most loaded wheel, to turn on the spot"]
+    turning_rate: Annotated[float, "rad/s", "fastest turn on the spot; 0: the motors are too weak"]
+    wheel_torque: Annotated[float, "N m", "stall torque of a wheel less gear friction"]
+    holding_torque: Annotated[float, "N m", "of a leg at home, to carry the body"]
+    holding_torque_at_limits: Annotated[float, "N m", "of a leg, the largest of nine poses at limits and home"]
+    leg_torque: Annotated[float, "N m", "stall torque of a leg"]
+    leg_sag: Annotated[float, "rad", "angle by which the position loop gives way under the largest holding torque"]
+    smallest_wheel_share: Annotated[float, "-", "of the weight, on the least loaded wheel in nine poses at limits and home"]
+    contact_sag: Annotated[float, "m", "of the wheels' contact springs under the weight"]
 
 
 #: Name of a number of :class:`Capability` -> unit and meaning.
 ENTRIES: dict[str, tuple[str, str]] = {
-    "total_mass": ("kg", "body, legs and wheels"),
-    "com_height": ("m", "centre of mass above the floor"),
-    "wheelbase": ("m", "front to rear wheels"),
-    "track_width": ("m", "left to right wheels"),
-    "top_speed": ("m/s", "level floor, full supply, against gear friction"),
-    "acceleration_of_motors": ("m/s2", "from standstill, by the motors' stall torque"),
-    "acceleration_of_grip": ("m/s2", "by the floor's friction"),
-    "tipping_acceleration": ("m/s2", "at which the front wheels lift"),
-    "tipping_deceleration": ("m/s2", "at which the rear wheels lift"),
-    "climb_of_motors": ("rad", "steepest slope by the motors' stall torque"),
-    "climb_of_grip": ("rad", "steepest slope by the floor's friction"),
-    "tipping_uphill": ("rad", "slope, nose up, on which it tips over"),
-    "tipping_downhill": ("rad", "slope, nose down, on which it tips over"),
-    "tipping_sideways": ("rad", "slope across, on which it tips over"),
-    "turning_torque": ("N m", "of the most loaded wheel, to turn on the spot"),
-    "turning_rate": ("rad/s", "fastest turn on the spot; 0: the motors are too weak"),
-    "wheel_torque": ("N m", "stall torque of a wheel less gear friction"),
-    "holding_torque": ("N m", "of a leg at home, to carry the body"),
-    "holding_torque_at_limits": ("N m", "of a leg, the largest of nine poses at limits and home"),
-    "leg_torque": ("N m", "stall torque of a leg"),
-    "leg_sag": ("rad", "angle by which the position loop gives way under the largest holding torque"),
-    "smallest_wheel_share": ("-", "of the weight, on the least loaded wheel in nine poses at limits and home"),
-    "contact_sag": ("m", "of the wheels' contact springs under the weight"),
+    name: get_args(hint)[1:] for name, hint in get_type_hints(Capability, include_extras=True).items()
 }
 
 
@@ -354,7 +328,8 @@ USUAL: dict[str, Usual] = {
 def odd_numbers(robot: Robot) -> Iterator[RobotFinding]:
     """Yield what no simulator takes, then what is outside the usual, then what does not fit its neighbours."""
     yield from _outside_the_table(robot)
-    yield from _unusual(robot)
+    for key in USUAL:
+        yield from unusual(key, _stated(robot, key))
     yield from _masses(robot)
     yield from _inertias(robot)
     yield from _places(robot)
@@ -374,11 +349,6 @@ def _stated(robot: Robot, key: str) -> list[float]:
     """Return the numbers at a key of the robot file."""
     stated = attrgetter(key)(robot)
     return [value for value in (stated if isinstance(stated, tuple) else (stated,)) if value is not None]
-
-
-def _unusual(robot: Robot) -> Iterator[RobotFinding]:
-    for key in USUAL:
-        yield from unusual(key, _stated(robot, key))
 
 
 def unusual(key: str, values: Sequence[float]) -> Iterator[RobotFinding]:
@@ -499,7 +469,9 @@ def examine_robot(robot: Robot) -> list[RobotFinding]:
         robot: loaded with ``check=False``: what :func:`wlr_gym.robot.load_robot` refuses is found here too.
     """
     impossible = [fault(text.partition(" ")[0], None, "", text) for text in physical_faults(robot)]
-    found = [*impossible, *odd_numbers(robot), *_motors(robot)]
+    found = [*impossible, *odd_numbers(robot)]
+    for name, motor in (("leg", robot.servo.leg), ("wheel", robot.servo.wheel)):
+        found += _motor(f"servo.{name}", motor, robot.servo.supply_voltage)
     if not any(" is missing" in one.text for one in impossible):
         found += _mechanics(robot, capability_of(robot))
     return sorted(found, key=lambda one: one.level)
@@ -636,11 +608,6 @@ def _contact(robot: Robot, can: Capability) -> Iterator[RobotFinding]:
 
 
 # ---- motors ----------------------------------------------------------------------------------------------------------
-
-
-def _motors(robot: Robot) -> Iterator[RobotFinding]:
-    for name, motor in (("leg", robot.servo.leg), ("wheel", robot.servo.wheel)):
-        yield from _motor(f"servo.{name}", motor, robot.servo.supply_voltage)
 
 
 def _motor(where: str, motor: Motor, supply: float) -> Iterator[RobotFinding]:

@@ -159,9 +159,6 @@ def profile_limits(profile_velocity: ArrayLike, profile_acceleration: ArrayLike)
 
     Returns:
         Velocity and acceleration limits, (..., 8).
-
-    Raises:
-        InputError: the last axis is not the eight joints.
     """
     velocity, acceleration = np.broadcast_arrays(
         np.asarray(profile_velocity, dtype=np.float64), np.asarray(profile_acceleration, dtype=np.float64)

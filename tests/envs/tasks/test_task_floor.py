@@ -79,13 +79,13 @@ def test_edges_left_out_lie_at_the_floors_end(robot):
     ("event", "expected"),
     [
         ({**PATCHES, "parameters": ["patch.mu", "ground.mu_x"]}, "'area' goes with 'patch.mu' only"),
-        ({**PATCHES, "area": {"length": [0.1, 0.2]}}, "and 'x_min'"),
-        ({**PATCHES, "area": {"y_min": [0, 0], "width": [-0.1, 0.2]}}, "sizes of 0 m or more"),
-        ({**PATCHES, "area": {"x_min": [1, 0]}}, r"area.x_min = \[1.0, 0.0\]: expected low <= high"),
-        ({**PATCHES, "area": {"x_min": [0, 5000]}}, "the floor ends at 1000 m"),
+        ({**PATCHES, "area": {"length": [0.1, 0.2]}}, "expected 'x_min' too"),
+        ({**PATCHES, "area": {"y_min": [0, 0], "width": [-0.1, 0.2]}}, "area.width.0 = -0.1: expected 0 or more"),
+        ({**PATCHES, "area": {"x_min": [1, 0]}}, r"area.x_min = \[1, 0\]: expected \[low, high\] with low <= high"),
+        ({**PATCHES, "area": {"x_min": [0, 5000]}}, "area.x_min.1 = 5000: expected 1000 or less"),
         ({**PATCHES, "area": {"x_mn": [0, 1]}}, "did you mean 'x_min'"),
         ({**DRIFT, "interval": None}, "goes with 'when: interval' or 'when: drift'"),
-        ({**DRIFT, "interval": [0, 1]}, "0 < low <= high"),
+        ({**DRIFT, "interval": [0, 1]}, "interval.0 = 0: expected more than 0"),
     ],
 )
 def test_bad_floors_are_refused(robot, event, expected):

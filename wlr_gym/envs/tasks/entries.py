@@ -4,22 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import stream_numbers, uniforms
-from wlr_gym.base.settings import SettingsModel
+from wlr_gym.base.settings import ORDERED, SettingsModel
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, SPECS, range_in_words, spec_of
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 Number = float | str
-Range = tuple[float, float]
+Interval = Annotated[tuple[PositiveFloat, PositiveFloat], ORDERED]
+_END = SPECS["patch.x_max"].high
+_Place = Annotated[float, Field(ge=-_END, le=_END)]
+_Size = Annotated[float, Field(ge=0.0, le=_END)]
+Edge = Annotated[tuple[_Place, _Place], ORDERED]
+Size = Annotated[tuple[_Size, _Size], ORDERED]
 
 
 #: Distribution -> the keys of an event that it reads.
@@ -40,10 +45,10 @@ class AreaConfig(SettingsModel):
         length, width: size along x and along y; left out = to the floor's end.
     """
 
-    x_min: Range | None = None
-    length: Range | None = None
-    y_min: Range | None = None
-    width: Range | None = None
+    x_min: Edge | None = None
+    length: Size | None = None
+    y_min: Edge | None = None
+    width: Size | None = None
 
 
 class EventConfig(SettingsModel):
@@ -76,7 +81,7 @@ class EventConfig(SettingsModel):
     sigmas: float = Field(default=1.0, gt=0)
     cut: float = Field(default=3.0, gt=0)
     values: tuple[float, ...] | None = None
-    interval: Range | None = None
+    interval: Interval | None = None
     area: AreaConfig | None = None
 
 
@@ -135,8 +140,6 @@ def entries_of(name: str, event: EventConfig, robot: Robot, source: str = "rando
         raise InputError(
             f"{where}: 'interval: [low, high]' (s) goes with 'when: interval' or 'when: drift', and only with them"
         )
-    if event.interval is not None and not 0 < event.interval[0] <= event.interval[1]:
-        raise InputError(f"{where}: interval = {list(event.interval)}: expected 0 < low <= high (s)")
     try:
         elements = elements_of(event)
     except InputError as error:
@@ -241,12 +244,11 @@ def _area_entries(name: str, event: EventConfig, area: AreaConfig, elements: Seq
     entries = []
     for patch in map(label_of, elements):
         for axis, size in (("x", "length"), ("y", "width")):
-            edge = _range(area, f"{axis}_min", where)
-            extent = _range(area, size, where)
-            if extent and (edge is None or extent[0] < 0):
-                raise InputError(f"{where}: area.{size} = {list(extent)}: expected sizes of 0 m or more, and '{axis}_min'")
+            edge, extent = getattr(area, f"{axis}_min"), getattr(area, size)
+            if extent and edge is None:
+                raise InputError(f"{where}: area.{size} = {list(extent)}: expected '{axis}_min' too")
 
-            def entry(element: str, operation: str, draw: str, limits: Range, patch: str = patch) -> Entry:
+            def entry(element: str, operation: str, draw: str, limits: tuple[float, float], patch: str = patch) -> Entry:
                 column = ELEMENTS.index(f"{element}[{patch}]")
                 return Entry(name, event.when, operation, column, f"area/{draw}/{patch}", "uniform", *limits, cut=event.cut)
 
@@ -257,15 +259,6 @@ def _area_entries(name: str, event: EventConfig, area: AreaConfig, elements: Seq
             if extent:
                 entries.append(entry(high, "add", size, extent))
     return entries
-
-
-def _range(area: AreaConfig, field: str, where: str) -> Range | None:
-    limits: Range | None = getattr(area, field)
-    if limits and limits[0] > limits[1]:
-        raise InputError(f"{where}: area.{field} = {list(limits)}: expected low <= high (m)")
-    if limits and max(map(abs, limits)) > SPECS["patch.x_max"].high:
-        raise InputError(f"{where}: area.{field} = {list(limits)}: the floor ends at {SPECS['patch.x_max'].high:g} m")
-    return limits
 
 
 # ---- distributions and tolerances that events draw from: quantile functions of one uniform number --------------------

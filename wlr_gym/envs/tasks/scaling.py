@@ -77,11 +77,7 @@ class Scaled:
 
 
 def check_rule(place: str, rule: str, where: str) -> None:
-    """Refuse a rule that is no product or quotient of quantities.
-
-    Raises:
-        InputError: names the rule, and the nearest quantity.
-    """
+    """Refuse a rule that is no product or quotient of quantities."""
     for name in _factors(place, rule, where):
         if name != "1" and name not in QUANTITIES:
             raise unknown_name("quantity of a robot", name, [*QUANTITIES, LEG_LIMITS], f"{where}: scaling.{place}")
@@ -126,11 +122,7 @@ def _positive(name: str, robot: Robot) -> float:
 def scaled_numbers(
     data: Mapping[str, Any], rules: Mapping[str, str], robot: Robot, reference: Robot, where: str = "task"
 ) -> list[Scaled]:
-    """Return every number that has a rule, as written for ``reference`` and for ``robot``.
-
-    Raises:
-        InputError: the task has no number at the place of a rule.
-    """
+    """Return every number that has a rule, as written for ``reference`` and for ``robot``."""
     found = []
     for place, rule in rules.items():
         before = _value_at(data, place)

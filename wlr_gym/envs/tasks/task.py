@@ -10,15 +10,15 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.paths import named_in
-from wlr_gym.base.settings import SettingsModel, overlay, parse_config, read_config
+from wlr_gym.base.settings import ORDERED, SettingsModel, overlay, parse_config, read_config
 from wlr_gym.envs.tasks.scaling import check_rule, scaled
 from wlr_gym.envs.tasks.signals import signals_of
 from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, POLICY_TERMS, PRIVILEGED_TERMS, SCALARS, ObservationTerm
@@ -53,10 +53,10 @@ class CommandsConfig(SettingsModel):
     (reset option, ``set_command``) holds at once.
     """
 
-    hold_time: tuple[float, float]
+    hold_time: Annotated[tuple[PositiveFloat, PositiveFloat], ORDERED]
     zero_probability: float = Field(default=0.0, ge=0, le=1)
     ramp: dict[str, Annotated[float, Field(gt=0)]] = Field(default={})
-    terms: dict[str, tuple[float, float]]
+    terms: dict[str, Annotated[tuple[float, float], ORDERED]]
 
 
 class LatencyConfig(SettingsModel):
@@ -65,7 +65,7 @@ class LatencyConfig(SettingsModel):
     ``interpolate`` mixes the two readings around that age; ``hold`` gives the newest reading at least that old.
     """
 
-    delay: tuple[float, float]
+    delay: Annotated[tuple[NonNegativeFloat, NonNegativeFloat], ORDERED]
     mode: Literal["interpolate", "hold"] = "interpolate"
 
 
@@ -113,16 +113,11 @@ OPTIONAL = tuple(SensorsConfig.model_fields)
 
 
 def having(sensors: Sequence[str] | None) -> dict[str, Any]:
-    """Return the keywords of an environment whose robots have these of :data:`OPTIONAL` and not the others.
-
-    Raises:
-        InputError: another name.
-    """
+    """Return the keywords of an environment whose robots have these of :data:`OPTIONAL` and not the others."""
     if sensors is None:
         return {}
     for name in sensors:
-        if name not in OPTIONAL:
-            raise unknown_name("sensor", name, OPTIONAL)
+        check_name("sensor", name, OPTIONAL)
     return {"task": {"sensors": {name: float(name in sensors) for name in OPTIONAL}}}
 
 
@@ -153,6 +148,16 @@ class SuccessConfig(SettingsModel):
     max: float | None = Field(default=None, gt=0)
     scale: float | None = Field(default=None, gt=0)
 
+    @property
+    def limits(self) -> dict[str, float]:
+        """The limits there are: ``rms`` and ``max``."""
+        return self.model_dump(include={"rms", "max"}, exclude_none=True)
+
+    @property
+    def scales(self) -> dict[str, float]:
+        """What counts as 1 in the tracking error: the limits, in place of the limit ``rms`` its scale where there is one."""
+        return self.limits | ({"rms": self.scale} if self.rms is not None and self.scale is not None else {})
+
 
 class TaskConfig(SettingsModel):
     """Contents of ``configs/task/*.yaml``.
@@ -177,9 +182,9 @@ class TaskConfig(SettingsModel):
     observer: ObserverConfig = ObserverConfig()
     sensors: SensorsConfig = SensorsConfig()
     controller: SlipGains | None = None
-    observations: dict[str, ObservationConfig]
+    observations: dict[str, ObservationConfig] = Field(min_length=1)
     privileged: dict[str, PrivilegedConfig] = Field(default={})
-    rewards: dict[str, dict[str, float]]
+    rewards: dict[str, dict[str, float]] = Field(min_length=1)
     terminations: dict[str, dict[str, float]] = Field(default={})
     measures: dict[str, dict[str, float]] = Field(default={})
     success: dict[str, SuccessConfig] = Field(default={})
@@ -213,8 +218,7 @@ def read_task(
     for group in SCALARS:
         _check_scalars(group, getattr(config, group), where)
     for name in config.success:
-        if name not in config.measures:
-            raise unknown_name("measure", name, config.measures, f"{where}: success")
+        check_name("measure", name, config.measures, f"{where}: success")
     _check_commands(config, where)
     for place, rule in config.scaling.items():
         check_rule(place, rule, where)
@@ -247,35 +251,18 @@ def _check_names(data: Mapping[str, Any], where: str) -> None:
     for group, registry in _TERMS.items():
         names = data.get(group)
         for name in names if isinstance(names, Mapping) else ():
-            if name not in registry:
-                raise unknown_name(_CALLED[group], str(name), registry, where)
+            check_name(_CALLED[group], name, registry, where)
 
 
 def _check_ranges(config: TaskConfig, where: str) -> None:
-    ranges = {"commands.hold_time": config.commands.hold_time}
-    for name, limits in config.commands.terms.items():
-        if name not in COMMANDS:
-            raise unknown_name("command", name, COMMANDS, where)
-        ranges[f"commands.terms.{name}"] = limits
+    for name, (low, high) in config.commands.terms.items():
+        check_name("command", name, COMMANDS, where)
         term = COMMANDS[name]
-        if limits[0] < term.least or limits[1] > term.most:
+        if low < term.least or high > term.most:
             expected = term.words(term.least, term.most)
-            raise InputError(f"{where}: commands.terms.{name} = {list(limits)}: expected {expected}")
+            raise InputError(f"{where}: commands.terms.{name} = {[low, high]}: expected {expected}")
     for name in config.commands.ramp:
-        if name not in config.commands.terms:
-            raise unknown_name("command", name, config.commands.terms, f"{where}: commands.ramp")
-    for device, latency in config.latency.items():
-        ranges[f"latency.{device}.delay"] = latency.delay
-        if latency.delay[0] < 0:
-            raise InputError(f"{where}: latency.{device}.delay = {list(latency.delay)}: a reading cannot be younger than 0 s")
-    for field, (low, high) in ranges.items():
-        if low > high:
-            raise InputError(f"{where}: {field} = [{low:g}, {high:g}]: expected [low, high] with low <= high")
-    if config.commands.hold_time[0] <= 0:
-        raise InputError(f"{where}: commands.hold_time = {list(config.commands.hold_time)}: expected times above 0 s")
-    for group in ("observations", "rewards"):
-        if not getattr(config, group):
-            raise InputError(f"{where}: {group} is empty: a task needs at least one term there")
+        check_name("command", name, config.commands.terms, f"{where}: commands.ramp")
     steps = config.episode_length / config.control_period
     if not math.isclose(steps, round(steps), abs_tol=1e-6) or round(steps) < 1:
         length, period = config.episode_length, config.control_period
@@ -288,8 +275,7 @@ def _check_scalars(group: str, chosen: Mapping[str, Mapping[str, float]], where:
     for name, values in chosen.items():
         valid = required | set(registry[name].parameters)
         for key in values:
-            if key not in valid:
-                raise unknown_name(f"parameter of {kind} '{name}'", key, valid, where)
+            check_name(f"parameter of {kind} '{name}'", key, valid, where)
         for key in required - set(values):
             raise InputError(f"{where}: {kind} '{name}' lacks '{key}'")
         for key, (low, high) in registry[name].ranges.items():
@@ -450,11 +436,7 @@ def fed_as(file: str | Path, source: str | Path | Mapping[str, Any], robot: Robo
 
 
 def build_task(config: TaskConfig, robot: Robot) -> Task:
-    """Resolve a checked task for a robot.
-
-    Raises:
-        InputError: the task has optical flow, the robot has not.
-    """
+    """Resolve a checked task for a robot."""
     if config.sensors.flow and robot.sensors.flow is None:
         raise InputError(
             f"sensors.flow = {config.sensors.flow:g}: robot '{robot.name}' has no optical-flow sensor; expected a robot "
@@ -536,38 +518,16 @@ Which = tuple[str, str]
 FALL = 10.0
 
 
-class Bounds(Protocol):
-    """What success asks of a measure, as :class:`wlr_gym.envs.tasks.task.SuccessConfig`."""
-
-    @property
-    def rms(self) -> float | None: ...
-    @property
-    def max(self) -> float | None: ...
-    @property
-    def scale(self) -> float | None: ...
-
-
-def limits_within(bounds: Bounds) -> dict[str, float]:
-    """Return the limits of success of a measure: ``rms`` and ``max``, those there are."""
-    return {kind: limit for kind, limit in (("rms", bounds.rms), ("max", bounds.max)) if limit is not None}
-
-
-def scales_within(bounds: Bounds) -> dict[str, float]:
-    """Return what counts as 1 in the tracking error: the limits, in place of the limit ``rms`` its scale where there is one."""
-    limits = limits_within(bounds)
-    return limits | ({"rms": bounds.scale} if "rms" in limits and bounds.scale is not None else {})
-
-
 def limits_of(config: TaskConfig) -> dict[Which, float]:
     """Return the limits of success of a task, in the order of its measures, SI units."""
     chosen = [(name, config.success[name]) for name in config.measures if name in config.success]
-    return {(name, kind): limit for name, bounds in chosen for kind, limit in limits_within(bounds).items()}
+    return {(name, kind): limit for name, bounds in chosen for kind, limit in bounds.limits.items()}
 
 
 def scales_of(config: TaskConfig) -> dict[Which, float]:
     """Return what counts as 1 in the tracking error of a task, in the order of its measures, SI units."""
     chosen = [(name, config.success[name]) for name in config.measures if name in config.success]
-    return {(name, kind): scale for name, bounds in chosen for kind, scale in scales_within(bounds).items()}
+    return {(name, kind): scale for name, bounds in chosen for kind, scale in bounds.scales.items()}
 
 
 def tracking_error(scales: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Array:

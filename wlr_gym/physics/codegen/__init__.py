@@ -6,6 +6,6 @@ On nodes it builds an expression graph with shared sub-expressions, which :func:
 """
 
 from wlr_gym.physics.codegen.compilation import emit, load_module, source_of, straight_line_source
-from wlr_gym.physics.codegen.ops import Graph, Node, hoist, live_nodes
+from wlr_gym.physics.codegen.ops import Graph, Inputs, Node, hoist, inputs_of
 
-__all__ = ["Graph", "Node", "emit", "hoist", "live_nodes", "load_module", "source_of", "straight_line_source"]
+__all__ = ["Graph", "Inputs", "Node", "emit", "hoist", "inputs_of", "load_module", "source_of", "straight_line_source"]

@@ -37,6 +37,17 @@ class Graph:
         return self.node("input", name)
 
 
+class Inputs(dict[str, Any]):
+    """Lanes of a trace: what is known, and for every other name that is asked for an input of the graph."""
+
+    def __init__(self, graph: Graph, known: Mapping[str, Any] | None = None) -> None:
+        super().__init__(known or {})
+        self._graph = graph
+
+    def __missing__(self, name: str) -> Node:
+        return self._graph.input(name)
+
+
 class Node:
     """One scalar expression. Arithmetic with numbers folds constants and drops neutral terms."""
 
@@ -248,6 +259,11 @@ def saturation(x: Value) -> Value:
 def live_nodes(roots: Iterable[Operand]) -> list[Node]:
     """Return every node the roots depend on, operands before users."""
     return ordered(roots, lambda node: list(node.operands))
+
+
+def inputs_of(roots: Iterable[Operand]) -> set[str]:
+    """Return the names of the inputs that the roots depend on."""
+    return {node.operands[0] for node in live_nodes(roots) if node.op == "input"}
 
 
 def ordered(roots: Iterable[Operand], children: Callable[[Node], list[Operand]]) -> list[Node]:

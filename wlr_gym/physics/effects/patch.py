@@ -315,9 +315,6 @@ def parse_formula(entry: Mapping[str, Any], where: tuple[str, ...], place: str) 
         entry: mapping of :data:`KEYS`.
         where: its places, of :data:`wlr_gym.physics.plants.forces.COORDINATES`.
         place: start of every message.
-
-    Raises:
-        InputError: see :func:`wlr_gym.physics.plants.forces.make_force`.
     """
     from wlr_gym.physics.plants.forces import make_force
 

@@ -75,11 +75,7 @@ def _class_of(backend: str) -> Any:
 
 
 def robot_file(hardware: RobotOptions) -> str | None:
-    """Return the robot file that a real robot's hardware file names; None = none.
-
-    Raises:
-        InputError: a hardware file that cannot be read, or is wrong.
-    """
+    """Return the robot file that a real robot's hardware file names; None = none."""
     return importlib.import_module("wlr_gym.hardware.config").load_hardware(hardware.hardware).robot
 
 

@@ -342,9 +342,6 @@ def hold_where_off(setpoints: Array, torque_on: NDArray[np.bool_], present: Arra
         setpoints: (N, 8).
         torque_on: (N, 8).
         present: (N, 8) setpoints that keep each joint as it is: leg readings (rad), zero wheel speeds.
-
-    Raises:
-        InputError: wrong shape.
     """
     for name, value in (("setpoints", setpoints), ("torque_on", torque_on)):
         if np.shape(value) != present.shape:
@@ -475,11 +472,7 @@ class RobotOptions:
 
 
 def read_robot_options(given: object) -> RobotOptions:
-    """Return options from options, the name or path of a hardware file, a mapping of fields, or None.
-
-    Raises:
-        InputError: something else, or an unknown field.
-    """
+    """Return options from options, the name or path of a hardware file, a mapping of fields, or None."""
     if given is None or isinstance(given, RobotOptions):
         return given or RobotOptions()
     if isinstance(given, str | Path):

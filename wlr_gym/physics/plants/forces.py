@@ -8,15 +8,14 @@ held over the step. What a formula may remember, :data:`MEMORY`, the kernel move
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.physics.codegen import Graph, emit, load_module, ops
+from wlr_gym.physics.codegen import Graph, Inputs, emit, inputs_of, load_module, ops
 from wlr_gym.physics.codegen.expression import (
     Expression,
     Unit,
@@ -328,9 +327,8 @@ def compile_forces(forces: Sequence[Force], precision: str = "float64") -> Force
 def force_source(forces: Sequence[Force], precision: str) -> str:
     """Return the kernel's source. Only numbers and operations of the checked trees reach it, never the user's text."""
     owner = Graph()
-    lanes = _GraphInputs(owner)
     count = len(force_values(forces))
-    found = generalised_forces(forces, lanes, [owner.input(f"value_{n}") for n in range(count)])
+    found = generalised_forces(forces, Inputs(owner), [owner.input(f"value_{n}") for n in range(count)])
     row = {name: f"inputs[{k}, k]" for k, name in enumerate(INPUTS)}
     row |= {f"value_{n}": f"values[{n}, k]" for n in range(count)} | {name: f"memory[{m}, k]" for m, name in enumerate(MEMORY)}
     place = {name: k for k, name in enumerate(COORDINATES)}
@@ -342,7 +340,8 @@ def force_source(forces: Sequence[Force], precision: str) -> str:
         lambda value: f"F({value!r})",
         fused=True,
     )
-    for j in (j for j in range(8) if f"wind_up_{j}" in lanes.asked):
+    read = inputs_of(found.values())
+    for j in (j for j in range(8) if f"wind_up_{j}" in read):
         wound = row[f"wind_up_{j}"]
         body += [
             f"        way = {row[f'joint_velocity_{j}']} * (step / F({WIND_UP!r}))",
@@ -351,21 +350,3 @@ def force_source(forces: Sequence[Force], precision: str) -> str:
     body.append(f"        {row['time']} += step")
     head = ["@njit(cache=True, nogil=True, error_model='numpy')", "def evaluate(inputs, values, memory, generalised, step):"]
     return "\n".join([f"F = np.{precision}", "", *head, "    for k in range(inputs.shape[1]):", *body, ""])
-
-
-class _GraphInputs(Mapping[str, Any]):
-    """All inputs and memories as nodes of a graph, made when they are asked for."""
-
-    def __init__(self, owner: Graph) -> None:
-        self._owner = owner
-        self.asked: set[str] = set()
-
-    def __getitem__(self, name: str) -> Any:
-        self.asked.add(name)
-        return self._owner.input(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter((*INPUTS, *MEMORY))
-
-    def __len__(self) -> int:
-        return len(INPUTS) + len(MEMORY)

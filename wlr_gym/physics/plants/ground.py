@@ -1,12 +1,14 @@
 """Friction under a wheel, defined once for every simulator: grip, patches of floor, slip weakening, tyre creep.
 
 Scalar source over lanes (see :mod:`wlr_gym.physics.plants.drive`), traced by each simulator into its own kernel. :func:`pack`
-fills the parameter lanes from the table. Families of effects that change what is traced: ``ground`` (patches, weakening),
-``creep`` and ``rolling_resistance``; without the first two friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
+fills the parameter lanes from the table, :func:`pack_body` those of what else acts on a robot from without. Families of
+effects that change what is traced: ``ground`` (patches, weakening), ``creep`` and ``rolling_resistance``; without the first two
+friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +16,8 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value
+from wlr_gym.physics.model.dynamics import gravity_in_floor
+from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
 
@@ -55,8 +59,31 @@ def pack(parameters: Parameters) -> dict[str, Array]:
         "rest_depth": load[:, None] / parameters["ground.normal_stiffness"],
     }
     lanes = {f"{name}{i}": wheel[name][:, i] for name in WHEEL_LANES for i in range(4)}
-    lanes |= {f"patch_{name}{k}": parameters[f"patch.{name}"][:, k] for name in _PATCH_FIELDS for k in _PATCH_NUMBERS}
+    return lanes | {f"patch_{name}{k}": parameters[f"patch.{name}"][:, k] for name in _PATCH_FIELDS for k in _PATCH_NUMBERS}
+
+
+#: Parameter lanes of the body: gravity, pulls, the inertial sensors' low-pass, and half the body's size.
+BODY_LANES = (
+    "gravity_x", "gravity_y", "gravity_z", "external_x", "external_y", "tether_stiffness", "anchor_x", "anchor_y", "low_pass",
+    "half_size_x", "half_size_y", "half_size_z",
+)  # fmt: skip
+
+
+def pack_body(parameters: Parameters, robot: Robot, step: float) -> dict[str, Array]:
+    """Return the lanes BODY_LANES, each (N,); ``step`` in s."""
+    lanes = by_column("gravity_", "xyz", gravity_in_floor(parameters))
+    lanes |= by_column("external_", "xy", parameters["external_force"]) | by_column(
+        "anchor_", "xy", parameters["tether.anchor"]
+    )
+    lanes |= by_column("half_size_", "xyz", np.tile(0.5 * np.array(robot.body.size), (len(parameters), 1)))
+    lanes["tether_stiffness"] = parameters["tether.stiffness"]
+    lanes["low_pass"] = 1.0 - np.exp(-2.0 * np.pi * parameters["imu.bandwidth"] * step)
     return lanes
+
+
+def by_column(name: str, labels: Iterable[object], columns: Array) -> dict[str, Array]:
+    """Return the columns of a matrix (N, K) as lanes: name with label -> (N,)."""
+    return {f"{name}{label}": columns[:, k] for k, label in enumerate(labels)}
 
 
 def families(parameters: Parameters) -> set[str]:

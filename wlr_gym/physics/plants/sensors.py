@@ -533,9 +533,6 @@ class SensorModel:
         Args:
             raw: (N, RAW_LAYOUT.width) truth at the tick's end, float64, C order.
             out: (N, SENSOR_LAYOUT.width), float64, C order. Threads may work on disjoint ranges at the same time.
-
-        Raises:
-            InputError: wrong shapes.
         """
         self._require(raw, out)
         end = self.count if stop is None else stop

@@ -44,11 +44,7 @@ class ScalarTerm:
 
 
 def refuse_another(function: Function, present: Function | None) -> None:
-    """Refuse a term whose name is taken by another one; the same one may come again, as its module is imported anew.
-
-    Raises:
-        InputError: naming both modules.
-    """
+    """Refuse a term whose name is taken by another one; the same one may come again, as its module is imported anew."""
     if present is None or (present.__module__, present.__qualname__) != (function.__module__, function.__qualname__):
         where = "the library" if present is None else present.__module__
         raise InputError(f"term '{function.__name__}' of {function.__module__}: {where} has one of that name; give it another")

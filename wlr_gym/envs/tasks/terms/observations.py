@@ -11,6 +11,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 from wlr_gym.envs.tasks.scaling import QUANTITIES
 from wlr_gym.envs.tasks.signals import (
@@ -33,27 +34,18 @@ from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
 # ---- commands a task can ask the robot to follow ---------------------------------------------------------------------
 
 
-def _speed(robot: Robot) -> float:
-    """Speed (m/s) that the wheels turn at without load."""
-    return QUANTITIES["top_speed"].of(robot)
-
-
 def _forward(robot: Robot) -> tuple[float, float]:
-    return -_speed(robot), _speed(robot)
+    speed = QUANTITIES["top_speed"].of(robot)
+    return -speed, speed
 
 
 def _turning(robot: Robot) -> tuple[float, float]:
     """On the spot, rolling."""
-    fastest = 2.0 * _speed(robot) / QUANTITIES["track_width"].of(robot)
+    fastest = 2.0 * QUANTITIES["top_speed"].of(robot) / QUANTITIES["track_width"].of(robot)
     return -fastest, fastest
 
 
-def _legs(robot: Robot) -> tuple[float, float]:
-    return robot.leg_limits
-
-
-def _leg_rate(robot: Robot) -> tuple[float, float]:
-    return 0.0, robot.servo.leg.no_load_speed
+_legs = attrgetter("leg_limits")
 
 
 @dataclass(frozen=True)
@@ -103,7 +95,14 @@ COMMANDS = {
         CommandTerm("front_leg_second", "rad", "joint", "front leg angle after the sweep", reach=_legs),
         CommandTerm("rear_leg_first", "rad", "joint", "rear leg angle before the sweep", reach=_legs),
         CommandTerm("rear_leg_second", "rad", "joint", "rear leg angle after the sweep", reach=_legs),
-        CommandTerm("leg_rate", "rad/s", "joint", "rate of the legs in the sweep", least=0.0, reach=_leg_rate),
+        CommandTerm(
+            "leg_rate",
+            "rad/s",
+            "joint",
+            "rate of the legs in the sweep",
+            least=0.0,
+            reach=lambda robot: (0.0, robot.servo.leg.no_load_speed),
+        ),
         CommandTerm(
             "climb_speed", "m/s", "body", "forward velocity of the body origin while climbing", least=0.0, reach=_forward
         ),

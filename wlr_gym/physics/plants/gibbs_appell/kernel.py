@@ -8,7 +8,7 @@ robots beside it, or on the number of threads.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -19,18 +19,19 @@ from numpy.typing import NDArray
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import (
     Graph,
+    Inputs,
     Node,
     compilation,
     emit,
     hoist,
-    live_nodes,
+    inputs_of,
     load_module,
     ops,
     source_of,
     straight_line_source,
 )
 from wlr_gym.physics.model import equations
-from wlr_gym.physics.model.dynamics import gravity_in_floor, inertial_constants
+from wlr_gym.physics.model.dynamics import inertial_constants
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import gauss, kinematics
@@ -55,23 +56,11 @@ Array = NDArray[np.float64]
 # ---- the parameter table as numbers that the kernel reads: once per change, float64, before any cast -----------------
 
 
-_CORNER_LANES = (
-    *ASSEMBLY,
-    "length",
-    "radius",
-    "zero_offset",
-    "stiffness",
-    "damping",
-    "look_ahead",
-    "rolling",
-)
-_SCALAR_LANES = (
-    *PLATFORM, "gravity_x", "gravity_y", "gravity_z", "external_x", "external_y", "tether_stiffness", "anchor_x", "anchor_y",
-    "low_pass", "half_size_x", "half_size_y", "half_size_z",
-)  # fmt: skip
+_CORNER_LANES = (*ASSEMBLY, "length", "radius", "zero_offset", "stiffness", "damping", "look_ahead", "rolling")
 #: Names of the kernel's parameter lanes, in storage order.
 PARAMETER_LANES: tuple[str, ...] = (
-    *_SCALAR_LANES,
+    *PLATFORM,
+    *ground.BODY_LANES,
     *(f"{name}{i}" for name in _CORNER_LANES for i in range(4)),
     *drive.DRIVE_LANES,
     *ground.GROUND_LANES,
@@ -84,26 +73,12 @@ def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
     ``step`` (s) is needed for the exponentially fitted damping weights, the impulse bounds of gear friction and the
     sensors' low-pass.
     """
-    count = len(parameters)
-    lanes: dict[str, Array] = {}
     inertia = inertial_constants(parameters)
     moved = [inertia["armature_leg"] + inertia["second_moment"] + inertia["leg_iyy"]]
     moved += [inertia["armature_wheel"] + inertia["wheel_spin"]]
-    lanes |= drive.pack(parameters, robot, step, np.hstack(moved)) | ground.pack(parameters)
     armature = drive.joint_armature(parameters)
     inertia["armature_leg"], inertia["armature_wheel"] = armature[:, LEG_SLICE], armature[:, WHEEL_SLICE]
-    lanes["platform_mass"] = inertia["platform_mass"]
-    _spread(lanes, inertia["platform_first_moment"], [f"platform_moment_{a}" for a in "xyz"])
-    _spread(lanes, inertia["platform_inertia"], [f"platform_inertia_{a}" for a in ("xx", "yy", "zz", "xy", "xz", "yz")])
-    _spread(lanes, gravity_in_floor(parameters), [f"gravity_{a}" for a in "xyz"])
-    _spread(lanes, parameters["external_force"], ["external_x", "external_y"])
-    lanes["tether_stiffness"] = parameters["tether.stiffness"]
-    _spread(lanes, parameters["tether.anchor"], ["anchor_x", "anchor_y"])
-    lanes["low_pass"] = 1.0 - np.exp(-2.0 * np.pi * parameters["imu.bandwidth"] * step)
-    for axis, size in zip("xyz", robot.body.size, strict=True):
-        lanes[f"half_size_{axis}"] = np.full(count, 0.5 * size)
-    corners: dict[str, Array] = {name: inertia[name] for name in ASSEMBLY}
-    corners |= {
+    corners = {name: inertia[name] for name in ASSEMBLY} | {
         "length": parameters["leg.length"],
         "radius": parameters["wheel.radius"],
         "zero_offset": parameters["joint.zero_offset"],
@@ -112,14 +87,16 @@ def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
         "look_ahead": damper_look_ahead(parameters, step),
         "rolling": parameters["ground.rolling_resistance"],
     }
-    for name in _CORNER_LANES:
-        _spread(lanes, corners[name], [f"{name}{i}" for i in range(4)])
+    lanes = (
+        {"platform_mass": inertia["platform_mass"]}
+        | ground.by_column("platform_moment_", "xyz", inertia["platform_first_moment"])
+        | ground.by_column("platform_inertia_", ("xx", "yy", "zz", "xy", "xz", "yz"), inertia["platform_inertia"])
+        | ground.pack_body(parameters, robot, step)
+        | drive.pack(parameters, robot, step, np.hstack(moved))
+        | ground.pack(parameters)
+    )
+    lanes |= {f"{name}{i}": corners[name][:, i] for name in _CORNER_LANES for i in range(4)}
     return np.stack([lanes[name] for name in PARAMETER_LANES], axis=1)
-
-
-def _spread(lanes: dict[str, Array], columns: Array, names: list[str]) -> None:
-    for k, name in enumerate(names):
-        lanes[name] = columns[:, k]
 
 
 def damper_look_ahead(parameters: Parameters, step: float) -> Array:
@@ -141,33 +118,16 @@ WIDTH = {"float64": 8, "float32": 16}
 _FIXED = frozenset(INPUTS + PARAMETER_LANES + ("step",))
 
 
-class _Lanes(Mapping[str, Any]):
-    """Lanes as graph inputs, except those already known to be plain numbers or parameters."""
-
-    def __init__(self, owner: Graph, known: Mapping[str, Any] | None = None) -> None:
-        self._owner = owner
-        self._known = dict(known or {})
-
-    def __getitem__(self, name: str) -> Any:
-        return self._known[name] if name in self._known else self._owner.input(name)
-
-    def __iter__(self) -> Iterator[str]:
-        raise TypeError("lanes are read by name")
-
-    def __len__(self) -> int:
-        raise TypeError("lanes are read by name")
-
-
 def trace(features: frozenset[str], precision: str) -> dict[str, dict[str, Any]]:
     """Trace all blocks: name -> outputs. ``prepare`` holds what depends on parameters and inputs alone."""
     if precision == "float32":
         features |= {SINGLE}
     owner = Graph()
-    lanes = _Lanes(owner)
+    lanes = Inputs(owner)
     step, time = owner.input("step"), owner.input("time")
     setup = gauss.kick_setup(lanes, time, step, features)
     known = {name: value for name, value in setup.items() if _is_known(value) and name not in STORED}
-    inner = _Lanes(owner, known)
+    inner = Inputs(owner, known)
     blocks = {
         "setup": {name: value for name, value in setup.items() if name not in known},
         "sweep": gauss.kick_sweep(inner, features),
@@ -194,14 +154,14 @@ def _is_known(value: Any) -> bool:
 
 
 def _without_unread(outputs: dict[str, Any], *readers: dict[str, Any]) -> dict[str, Any]:
-    read = {node.operands[0] for block in readers for node in live_nodes(block.values()) if node.op == "input"}
+    read = {name for block in readers for name in inputs_of(block.values())}
     return {name: value for name, value in outputs.items() if name in read or name in STORED}
 
 
 @cache
 def outputs() -> tuple[str, ...]:
     """Return the names of what is shown of a state, in storage order."""
-    return tuple(source.observe(_Lanes(Graph()), 1.0, frozenset()))
+    return tuple(source.observe(Inputs(Graph()), 1.0, frozenset()))
 
 
 _SCALARS = ("step", "time", "duration")
@@ -223,7 +183,7 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
 
     lines = [f"F = np.{precision}", ""]
     for block, outputs in blocks.items():
-        used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
+        used = inputs_of(outputs.values())
         scalars = [name for name in _SCALARS if name in used]
         body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True, compact=True)
         lines += [

@@ -98,9 +98,6 @@ class GibbsAppellPlant(Simulator):
         options: step size, precision, threads.
         forces: formula forces that act beside what the parameters say.
         sweeps: passes over the friction rows per substep.
-
-    Raises:
-        InputError: a physically impossible robot, bad options.
     """
 
     capabilities = Capabilities("gibbs_appell", has_truth=True, can_set_state=True, real_time=False)
@@ -276,11 +273,7 @@ class GibbsAppellPlant(Simulator):
         self._chunks = self._shared_out(-(-count // self._width))
 
     def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
-
-        Raises:
-            InputError: wrong shape or a non-finite setpoint of a motor that is on.
-        """
+        """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`."""
         inputs = (
             *self._take_setpoints(setpoints, torque_on, self._torque_on),
             self._torque_on,

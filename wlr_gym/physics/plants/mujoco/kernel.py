@@ -7,7 +7,7 @@ itself.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -15,8 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics import servo
-from wlr_gym.physics.codegen import Graph, compilation, emit, live_nodes, load_module, ops, source_of, straight_line_source
-from wlr_gym.physics.model.dynamics import gravity_in_floor
+from wlr_gym.physics.codegen import (
+    Graph,
+    Inputs,
+    compilation,
+    emit,
+    inputs_of,
+    load_module,
+    ops,
+    source_of,
+    straight_line_source,
+)  # fmt: skip
 from wlr_gym.physics.plants import base, drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import kinematics
@@ -34,13 +43,9 @@ _CORNER_LANES = (
     "hip_x", "hip_y", "hip_z", "length", "radius", "zero_offset", "stiffness", "damping", "rolling", "wheel_spin",
     "contact_lightness_x", "contact_lightness_y",
 )  # fmt: skip
-_SCALAR_LANES = (
-    "gravity_x", "gravity_y", "gravity_z", "external_x", "external_y", "tether", "anchor_x", "anchor_y", "low_pass",
-    "half_size_x", "half_size_y", "half_size_z",
-)  # fmt: skip
 #: Names of the kernel's parameter lanes, in storage order.
 PARAMETER_LANES: tuple[str, ...] = (
-    *_SCALAR_LANES,
+    *ground.BODY_LANES,
     *(f"{name}{i}" for name in _CORNER_LANES for i in range(4)),
     *(f"joint_armature{j}" for j in range(8)),
     *drive.DRIVE_LANES,
@@ -50,15 +55,6 @@ PARAMETER_LANES: tuple[str, ...] = (
 
 def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
     """Return the kernel's parameter lanes, shape (N, len(PARAMETER_LANES)); ``step`` in s."""
-    count = len(parameters)
-    lanes: dict[str, Array] = {}
-    _spread(lanes, gravity_in_floor(parameters), [f"gravity_{a}" for a in "xyz"])
-    _spread(lanes, parameters["external_force"], ["external_x", "external_y"])
-    _spread(lanes, parameters["tether.anchor"], ["anchor_x", "anchor_y"])
-    lanes["tether"] = parameters["tether.stiffness"]
-    lanes["low_pass"] = 1.0 - np.exp(-2.0 * np.pi * parameters["imu.bandwidth"] * step)
-    for axis, size in zip("xyz", robot.body.size, strict=True):
-        lanes[f"half_size_{axis}"] = np.full(count, 0.5 * size)
     lightness_x, lightness_y = contact_lightness(parameters)
     signs = np.array(CORNER_SIGNS)
     hip = parameters["hip.position"]
@@ -76,16 +72,14 @@ def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
         "contact_lightness_x": np.repeat(lightness_x[:, None], 4, axis=1),
         "contact_lightness_y": np.repeat(lightness_y[:, None], 4, axis=1),
     }
-    for name in _CORNER_LANES:
-        _spread(lanes, corners[name], [f"{name}{i}" for i in range(4)])
-    _spread(lanes, drive.joint_armature(parameters), [f"joint_armature{j}" for j in range(8)])
-    lanes |= drive.pack(parameters, robot, step, moved_inertia(parameters)) | ground.pack(parameters)
+    lanes = (
+        ground.pack_body(parameters, robot, step)
+        | ground.by_column("joint_armature", range(8), drive.joint_armature(parameters))
+        | drive.pack(parameters, robot, step, moved_inertia(parameters))
+        | ground.pack(parameters)
+    )
+    lanes |= {f"{name}{i}": corners[name][:, i] for name in _CORNER_LANES for i in range(4)}
     return np.stack([lanes[name] for name in PARAMETER_LANES], axis=1)
-
-
-def _spread(lanes: dict[str, Array], columns: Array, names: list[str]) -> None:
-    for k, name in enumerate(names):
-        lanes[name] = columns[:, k]
 
 
 def moved_inertia(parameters: Parameters) -> Array:
@@ -171,26 +165,10 @@ _ROWS = (*_FLAT, *(f"{name}{i}" for name in _PER_WHEEL for i in CORNERS))
 _SCALARS = ("step", "time", "duration")
 
 
-class _Lanes(Mapping[str, Any]):
-    """All lanes as inputs of a graph."""
-
-    def __init__(self, owner: Graph) -> None:
-        self._owner = owner
-
-    def __getitem__(self, name: str) -> Any:
-        return self._owner.input(name)
-
-    def __iter__(self) -> Iterator[str]:
-        raise TypeError("lanes are read by name")
-
-    def __len__(self) -> int:
-        raise TypeError("lanes are read by name")
-
-
 def trace() -> dict[str, dict[str, Any]]:
     """Trace all blocks: name -> outputs."""
     owner = Graph()
-    lanes = _Lanes(owner)
+    lanes = Inputs(owner)
     step = owner.input("step")
     return {
         "drift": source.drift(lanes, owner.input("duration")),
@@ -211,7 +189,7 @@ def kernel_source() -> str:
     rows = [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(_ROWS)]
     lines = []
     for block, outputs in blocks.items():
-        used = {node.operands[0] for node in live_nodes(outputs.values()) if node.op == "input"}
+        used = inputs_of(outputs.values())
         scalars = [name for name in _SCALARS if name in used]
         own = {"observe": ["truth", "raw"], "features": ["inputs"]}.get(block, [])
         places = _PLACES | {"observe": observed, "features": named}.get(block, {})

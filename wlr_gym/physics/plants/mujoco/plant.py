@@ -43,9 +43,6 @@ class MujocoPlant(Simulator):
         count: number of robots.
         options: step size, threads.
         forces: formula forces that act on every robot.
-
-    Raises:
-        InputError: a physically impossible robot, bad options.
     """
 
     capabilities = Capabilities("mujoco", has_truth=True, can_set_state=True, real_time=False)
@@ -146,11 +143,7 @@ class MujocoPlant(Simulator):
         self._force_values = np.ascontiguousarray(values.T)
 
     def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
-        """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`.
-
-        Raises:
-            InputError: wrong shape or a non-finite setpoint of a motor that is on.
-        """
+        """Advance one control tick; see :meth:`wlr_gym.physics.plants.base.Plant.step`."""
         for target, values in zip(self._inputs, self._take_setpoints(setpoints, torque_on, self._inputs[3]), strict=False):
             target[...] = values
         self._tick()

@@ -21,8 +21,7 @@ the motors' torques and this step's model fields, after it :func:`after` reads w
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections import ChainMap
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
@@ -95,23 +94,6 @@ CAPSULE_LEAN = math.pi / 6
 LEAST_MU = 1e-5
 
 
-class Overlay(Mapping[str, Any]):
-    """Lanes with some added or replaced."""
-
-    def __init__(self, lanes: Lanes, added: Out) -> None:
-        self._lanes = lanes
-        self._added = added
-
-    def __getitem__(self, name: str) -> Any:
-        return self._added[name] if name in self._added else self._lanes[name]
-
-    def __iter__(self) -> Iterator[str]:
-        raise TypeError("lanes are read by name")
-
-    def __len__(self) -> int:
-        raise TypeError("lanes are read by name")
-
-
 def with_engine_rates(lanes: Lanes) -> Lanes:
     """Add the quasi-velocities of the engine: body-frame velocity of the body origin, absolute leg and wheel rates."""
     body = to_body(rotation_rows(lanes), vector(lanes, "u"))
@@ -119,7 +101,7 @@ def with_engine_rates(lanes: Lanes) -> Lanes:
     for i in CORNERS:
         added[f"leg_rate{i}"] = lanes["wy"] + lanes[f"joint_rate{i}"]
         added[f"wheel_rate{i}"] = added[f"leg_rate{i}"] + lanes[f"joint_rate{FIRST_WHEEL + i}"]
-    return Overlay(lanes, added)
+    return ChainMap(added, lanes)
 
 
 def drift(lanes: Lanes, duration: Value) -> Out:
@@ -171,7 +153,7 @@ def _loads(lanes: Lanes, rows: list[Vector]) -> Out:
     """Applied generalised forces so far: external force, tether, formulas."""
     pull = [lanes["external_x"], lanes["external_y"], 0.0]
     for k, a in enumerate("xy"):
-        pull[k] = pull[k] - lanes["tether"] * (lanes[f"p{a}"] - lanes[f"anchor_{a}"])
+        pull[k] = pull[k] - lanes["tether_stiffness"] * (lanes[f"p{a}"] - lanes[f"anchor_{a}"])
     in_body = vector(lanes, "formula_body_force_")
     applied: Out = {}
     for k, a in enumerate(AXES):
@@ -305,7 +287,7 @@ def after(lanes: Lanes, step: Value) -> Out:
         torque = ops.where_positive(lanes[f"half_play{j}"], friction * (1.0 / step), out[f"gear_torque{j}"])
         out[f"gear_torque{j}"] = torque + crept
     out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
-    out |= _drift_of_rotors(Overlay(lanes, out), step)
+    out |= _drift_of_rotors(ChainMap(out, lanes), step)
     push = [(lanes[f"u{a}"] - lanes[f"old_u{a}"]) * (1.0 / step) - lanes[f"gravity_{a}"] for a in AXES]
     specific_force = to_body(rotation_rows(lanes), push)
     for k, a in enumerate(AXES):
@@ -350,7 +332,7 @@ def observe(lanes: Lanes) -> Out:
     renamed |= {f"normal{i}": lanes[f"force_z{i}"] for i in CORNERS}
     renamed |= {f"gear_friction{j}": lanes[f"gear_torque{j}"] for j in range(8)}
     renamed |= {f"rolling_friction{i}": lanes[f"rolling_torque{i}"] for i in CORNERS}
-    out = engine.observe(Overlay(lanes, renamed), 1.0, FEATURES)  # impulses over a step of 1 are forces
+    out = engine.observe(ChainMap(renamed, lanes), 1.0, FEATURES)  # impulses over a step of 1 are forces
     for j in range(8):
         out[f"joint_velocity_{j}"] = out[f"raw_velocity_{j}"] = lanes[f"joint_rate{j}"]
     return out
