@@ -41,7 +41,8 @@ from wlr_gym.envs.tasks.task import ObservationColumn, Task, scales_of
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.learning.evaluation.scoring import acceptance_rows, read_acceptance
 from wlr_gym.physics.effects import EFFECTS
-from wlr_gym.physics.effects.library import coordinates, parameter_text, places
+from wlr_gym.physics.effects.effect import EffectParameter
+from wlr_gym.physics.effects.library import coordinates, places
 from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import JOINTS, load_robot
 
@@ -162,6 +163,13 @@ def adapt_table() -> list[str]:
 def decide_table() -> list[str]:
     """Return the robots of ``python -m studies.bench decide`` that were run."""
     return markdown_of_decisions(json.loads((DATA / "decide.json").read_text(encoding="utf-8"))).strip().splitlines()
+
+
+def parameter_text(name: str, parameter: EffectParameter) -> str:
+    """Return ``torque N m [0, 2]``: name, unit and prior range; in brackets if it may be left out."""
+    low, high = parameter.prior
+    text = f"{name} {parameter.unit} [{low:.3g}, {high:.3g}]"
+    return f"({text})" if parameter.optional else text
 
 
 def keyword_table() -> list[str]:

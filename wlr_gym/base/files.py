@@ -1,4 +1,4 @@
-"""Write files so that a reader never sees half of one; what cannot be written, or must not be written over, is refused by name."""
+"""Write files so that a reader never sees half of one; what cannot be written, or would be written over, is refused by name."""
 
 from __future__ import annotations
 

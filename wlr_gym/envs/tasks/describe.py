@@ -10,7 +10,7 @@ from typing import Any
 from wlr_gym.envs.tasks.entries import AreaConfig, EventConfig
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.envs.tasks.scaling import QUANTITIES, quantities_of, scaled_numbers
-from wlr_gym.envs.tasks.task import ObservationColumn, Task, TaskConfig
+from wlr_gym.envs.tasks.task import ObservationColumn, Task, TaskConfig, limits_within
 from wlr_gym.envs.tasks.terms import COMMANDS, MEASURES, REWARDS, TERMINATIONS
 from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash, servo_hash
 from wlr_gym.robot.parameter_table import spec_of
@@ -102,7 +102,7 @@ def _ramp(config: TaskConfig, command: str) -> str:
 def limits_text(config: TaskConfig, measure: str) -> str:
     """Return ``rms at most 0.02 m/s`` for a measure that success depends on."""
     bounds = config.success.get(measure)
-    limits = {} if bounds is None else bounds.limits
+    limits = {} if bounds is None else limits_within(bounds)
     unit = "" if MEASURES[measure].unit == "-" else f" {MEASURES[measure].unit}"
     return ", ".join(f"{kind} at most {limit:g}{unit}" for kind, limit in limits.items()) or "-"
 

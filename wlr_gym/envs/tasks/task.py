@@ -148,16 +148,6 @@ class SuccessConfig(SettingsModel):
     max: float | None = Field(default=None, gt=0)
     scale: float | None = Field(default=None, gt=0)
 
-    @property
-    def limits(self) -> dict[str, float]:
-        """The limits there are: ``rms`` and ``max``."""
-        return self.model_dump(include={"rms", "max"}, exclude_none=True)
-
-    @property
-    def scales(self) -> dict[str, float]:
-        """What counts as 1 in the tracking error: the limits, in place of the limit ``rms`` its scale where there is one."""
-        return self.limits | ({"rms": self.scale} if self.rms is not None and self.scale is not None else {})
-
 
 class TaskConfig(SettingsModel):
     """Contents of ``configs/task/*.yaml``.
@@ -518,16 +508,27 @@ Which = tuple[str, str]
 FALL = 10.0
 
 
+def limits_within(bounds: Any) -> dict[str, float]:
+    """Return the limits that there are, ``rms`` and ``max``, of what has them and a ``scale``, as :class:`SuccessConfig`."""
+    return {kind: limit for kind, limit in (("rms", bounds.rms), ("max", bounds.max)) if limit is not None}
+
+
+def scales_within(bounds: Any) -> dict[str, float]:
+    """Return what counts as 1 in the tracking error: the limits, in place of the limit ``rms`` its scale where there is one."""
+    limits = limits_within(bounds)
+    return limits | ({"rms": bounds.scale} if "rms" in limits and bounds.scale is not None else {})
+
+
 def limits_of(config: TaskConfig) -> dict[Which, float]:
     """Return the limits of success of a task, in the order of its measures, SI units."""
     chosen = [(name, config.success[name]) for name in config.measures if name in config.success]
-    return {(name, kind): limit for name, bounds in chosen for kind, limit in bounds.limits.items()}
+    return {(name, kind): limit for name, bounds in chosen for kind, limit in limits_within(bounds).items()}
 
 
 def scales_of(config: TaskConfig) -> dict[Which, float]:
     """Return what counts as 1 in the tracking error of a task, in the order of its measures, SI units."""
     chosen = [(name, config.success[name]) for name in config.measures if name in config.success]
-    return {(name, kind): scale for name, bounds in chosen for kind, scale in bounds.scales.items()}
+    return {(name, kind): scale for name, bounds in chosen for kind, scale in scales_within(bounds).items()}
 
 
 def tracking_error(scales: Mapping[Which, float], errors: Mapping[Which, Array], fell: Flags) -> Array:

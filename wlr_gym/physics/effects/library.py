@@ -752,13 +752,6 @@ def places(effect: Effect) -> str:
     return _PLACES.get(effect.where, ", ".join(effect.where))
 
 
-def parameter_text(name: str, parameter: EffectParameter) -> str:
-    """Return ``torque N m [0, 2]``: name, unit and prior range; in brackets if it may be left out."""
-    low, high = parameter.prior
-    text = f"{name} {parameter.unit} [{low:.3g}, {high:.3g}]"
-    return f"({text})" if parameter.optional else text
-
-
 def coordinates() -> list[tuple[list[str], str, str]]:
     """Return where a formula may act: names that act alike, their unit, and what they mean."""
     return [

@@ -204,7 +204,7 @@ class Simulator(ABC):
         """From now on nobody looks at any but the first ``count`` robots: a simulator need not move the others."""
 
     def _take_setpoints(self, setpoints: Array, torque_on: NDArray[np.bool_] | None, on: Array) -> tuple[Array, Array, Array]:
-        """Write into ``on`` (N, 8) which motors are on; return newer setpoints, older setpoints and switch time of this tick."""
+        """Write into ``on`` (N, 8) which motors are on; return newer and older setpoints and the switch time of this tick."""
         if torque_on is None:
             on.fill(1.0)
         elif self._setpoints.given:
