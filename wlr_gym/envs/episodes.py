@@ -67,7 +67,10 @@ class Episodes:
 
     def seed(self, row: int, seed: int) -> None:
         """Give a robot its seed; its next episode is its first."""
-        self.robot_seeds[row] = _word(read_seed(seed))
+        seed = read_seed(seed)
+        if seed >= 2**64:  # such as fresh entropy: robots draw from 64 bits
+            seed = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
+        self.robot_seeds[row] = seed
         self.number[row] = -1
         self.seeded[row] = True
 
@@ -128,11 +131,6 @@ def own_seed(environment: Any) -> int:
     """Return the seed of an environment's ``np_random``; one drawn from it where the user set it, as its own is not known."""
     seed = environment.np_random_seed
     return int(environment.np_random.integers(2**63)) if seed < 0 else seed
-
-
-def _word(seed: int) -> int:
-    """Return the 64 bits that a seed draws from: itself, or, of a larger one such as fresh entropy, its hash."""
-    return seed if seed < 2**64 else int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
 
 
 # ---- commands: drawn, held for a time, and followed with a limited rate of change ------------------------------------

@@ -158,12 +158,11 @@ def entries_of(name: str, event: EventConfig, robot: Robot, source: str = "rando
 
 def elements_of(event: EventConfig) -> list[str]:
     """Return the elements of the parameter table that ``event.parameters`` names, without those of its area."""
-    return [element for parameter in event.parameters for element in _elements(parameter)]
-
-
-def _elements(parameter: str) -> list[str]:
-    spec = spec_of(parameter)
-    return spec.elements if parameter == spec.name else [parameter]
+    found = []
+    for parameter in event.parameters:
+        spec = spec_of(parameter)
+        found += spec.elements if parameter == spec.name else [parameter]
+    return found
 
 
 def label_of(element: str) -> str:
