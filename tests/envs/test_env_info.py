@@ -10,12 +10,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from gymnasium.utils.env_checker import data_equivalence
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from test_env_interfaces import same_where_masked
+from velocity import DRIFT, ID, TIMED, make, make_vec
 
-import wlr_gym  # noqa: F401
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.envs.tasks import describe, load_randomization, load_task
@@ -26,7 +23,6 @@ from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions
 from wlr_gym.policy import Policy, needs_camera
 from wlr_gym.robot import CORNER_SIGNS, load_robot
 
-ID = "WLR-Velocity-v0"
 SHORT: dict[str, Any] = {"episode_length": 0.5, "randomization": "ice"}
 COUNT = 5
 
@@ -155,39 +151,8 @@ def test_only_simulators_know_the_truth() -> None:
 # --- randomisation in info, and at the contacts -----------------------------------------------------------------------
 
 
-PUSH = {
-    "parameters": ["external_force"],
-    "when": "interval",
-    "interval": [0.04, 0.2],
-    "distribution": "uniform",
-    "operation": "set",
-    "low": -2.0,
-    "high": 2.0,
-    "per": "element",
-}
-DRIFT = {
-    "parameters": ["ground.mu_x", "ground.mu_y"],
-    "when": "drift",
-    "interval": [0.5, 1.0],
-    "distribution": "uniform",
-    "operation": "scale",
-    "low": 0.5,
-    "high": 1.5,
-}
-TIMED = {"base": "nominal", "events": {"push": PUSH, "drift": DRIFT}}
-TIMED_SHORT: dict[str, Any] = {"episode_length": 0.5, "randomization": TIMED}
-
-
-def make(**keywords) -> Any:
-    return gym.make(ID, **{**TIMED_SHORT, **keywords}).unwrapped
-
-
-def make_vec(count, **keywords) -> Any:
-    return gym.make_vec(ID, num_envs=count, **{**TIMED_SHORT, **keywords})
-
-
 def test_info_tells_every_change_and_only_what_changed(fake):
-    env = make(episode_length=3.0)
+    env = make(randomization=TIMED, episode_length=3.0)
     _, info = env.reset(seed=0)
     plant = fake["plants"][-1]
     assert len(info["randomization"]) > 60
@@ -219,7 +184,8 @@ def test_a_drifting_parameter_moves_a_few_times_a_second_and_smoothly(fake):
 
 
 def test_overrides_and_effects_hold_against_drift(fake):
-    env = make(effects=[{"name": "friction_asymmetry", "where": ["wheel_rr"], "parameters": {"mu": 0.4}}], episode_length=3.0)
+    effects = [{"name": "friction_asymmetry", "where": ["wheel_rr"], "parameters": {"mu": 0.4}}]
+    env = make(randomization=TIMED, effects=effects, episode_length=3.0)
     env.reset(seed=0, options={"parameters": {"ground.mu_x[wheel_lf]": 0.1}})
     plant = fake["plants"][-1]
     seen = []
@@ -230,60 +196,7 @@ def test_overrides_and_effects_hold_against_drift(fake):
     assert np.ptp(np.array(seen)[:, 1]) > 0.01
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_vector_tells_the_same_as_a_loop_over_single_environments(fake, mode):
-    ours = make_vec(3, autoreset_mode=mode)
-    loop = SyncVectorEnv([lambda: gym.make(ID, **TIMED_SHORT)] * 3, autoreset_mode=AutoresetMode(mode))
-    assert data_equivalence(ours.reset(seed=11)[1], loop.reset(seed=11)[1], exact=True)
-    stagger = np.array([True, False, False])
-    seen = 0
-    for step in range(80):
-        if step == 7:
-            for env in (ours, loop):
-                env.reset(options={"reset_mask": stagger.copy()})
-        action = np.zeros((3, 8), np.float32)
-        infos, expected = ours.step(action)[4], loop.step(action)[4]
-        assert set(infos) == set(expected), step
-        for key in infos:
-            assert same_where_masked(infos, expected, key), (step, key)
-        seen += "randomization" in infos
-    assert seen > 20
-
-
-def test_stable_baselines3_tells_the_same_as_a_loop_over_single_environments(fake):
-    pytest.importorskip("stable_baselines3")
-    from stable_baselines3.common.vec_env import DummyVecEnv
-
-    from wlr_gym.envs import Sb3VecEnv
-
-    ours = Sb3VecEnv(ID, 3, seed=5, **TIMED_SHORT)
-    loop = DummyVecEnv([lambda: gym.make(ID, **TIMED_SHORT)] * 3)
-    loop.seed(5)
-    ours.reset()
-    loop.reset()
-    seen = 0
-    for _ in range(60):
-        action = np.zeros((3, 8), np.float32)
-        infos, expected = ours.step(action)[3], loop.step(action)[3]
-        for one, two in zip(infos, expected, strict=True):
-            assert one.get("randomization") == two.get("randomization")
-            seen += "randomization" in one
-        assert ours.reset_infos == loop.reset_infos
-    assert seen > 20
-
-
 # ---- on the engine ----
-
-
-def test_drift_is_the_same_alone_and_in_a_batch():
-    keywords = {"randomization": {"base": "patches", "events": {"push": PUSH}}, "episode_length": 2.0}
-    vector, single = make_vec(11, **keywords), gym.make(ID, **keywords)
-    vector.reset(seed=70)
-    single.reset(seed=77)
-    for actions in np.random.default_rng(1).uniform(-1, 1, (60, 11, 8)).astype(np.float32):
-        many, one = vector.step(actions), single.step(actions[7])
-        assert np.array_equal(many[0][7], one[0])
-        assert many[1][7] == one[1]
 
 
 def drawn_friction(parameters, truth):

@@ -7,8 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-
-import wlr_gym  # noqa: F401
+from velocity import ID, TIMED
 
 pytest.importorskip("stable_baselines3")
 from stable_baselines3 import PPO
@@ -19,7 +18,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs import Sb3VecEnv
 
-ID = "WLR-Velocity-v0"
 SHORT = {"episode_length": 0.4, "randomization": "wide"}
 
 
@@ -30,15 +28,15 @@ def test_check_env_without_a_warning(fake, observation):
         check_env(gym.make(ID, observation=observation).unwrapped, warn=True)
 
 
-@pytest.mark.parametrize("observation", ["policy", "dict"])
-def test_equals_dummy_vec_env_with_the_same_seeds(fake, observation):
-    keywords = {**SHORT, "observation": observation}
+@pytest.mark.parametrize(("observation", "randomization"), [("policy", "wide"), ("dict", "wide"), ("policy", TIMED)])
+def test_equals_dummy_vec_env_with_the_same_seeds(fake, observation, randomization):
+    keywords = {"episode_length": 0.4, "observation": observation, "randomization": randomization}
     ours = Sb3VecEnv(ID, 3, seed=5, **keywords)
     loop = DummyVecEnv([lambda: gym.make(ID, **keywords)] * 3)
     loop.seed(5)
     same(ours.reset(), loop.reset())
     actions = np.random.default_rng(0).uniform(-1, 1, (70, 3, 8)).astype(np.float32)
-    ended = 0
+    ended = told = 0
     for action in actions:
         a, b = ours.step(action), loop.step(action)
         same(a[0], b[0])
@@ -46,13 +44,16 @@ def test_equals_dummy_vec_env_with_the_same_seeds(fake, observation):
         assert np.array_equal(a[2], b[2])
         for one, two, done in zip(a[3], b[3], a[2], strict=True):
             ended += bool(done)
+            told += "randomization" in one
+            assert one.get("randomization") == two.get("randomization")
             if done:
                 same(one["terminal_observation"], two["terminal_observation"])
                 assert one["TimeLimit.truncated"] == two["TimeLimit.truncated"]
                 assert one["episode_reward_terms"] == two["episode_reward_terms"]
             else:
-                assert one == {}
+                assert set(one) <= {"randomization"}
     assert ended == 9
+    assert (told > 20) == (randomization == TIMED)
     assert ours.reset_infos == loop.reset_infos
 
 
@@ -138,11 +139,6 @@ def test_a_spec_brings_its_render_mode_and_limit(fake):
         Sb3VecEnv(spec, 2, max_episode_steps=0)
 
 
-def test_step_before_reset(fake):
-    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
-        Sb3VecEnv(ID, 2, seed=0).step(np.zeros((2, 8), np.float32))
-
-
 def test_bad_input(fake):
     with pytest.raises(InputError, match="did you mean 'WLR-Velocity-v0'"):
         Sb3VecEnv("WLR-Velocty-v0", 2)
@@ -152,6 +148,8 @@ def test_bad_input(fake):
         with pytest.raises(InputError, match=f"seed = {seed}: expected a whole number of 0 or more"):
             Sb3VecEnv(ID, 2, seed=seed)  # type: ignore[arg-type]
     env = Sb3VecEnv(ID, 2, seed=0)
+    with pytest.raises(gym.error.ResetNeeded, match=r"call reset\(\) before step\(\)"):
+        env.step(np.zeros((2, 8), np.float32))
     env.reset()
     with pytest.raises(InputError, match="leg_lf of robot 1"):
         env.step(np.array([[0.0] * 8, [np.nan] * 8]))

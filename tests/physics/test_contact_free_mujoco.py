@@ -3,11 +3,10 @@
 MuJoCo's model is built from the parameters without any code of ``wlr_gym.physics.model``.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from energy import kinetic_energy, potential_energy
+from random_robots import States, mujoco, random_parameters, relative_error
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.model import dynamics
@@ -15,151 +14,61 @@ from wlr_gym.physics.plants.base import standing_state
 from wlr_gym.robot import LEGS, WHEELS, load_robot
 from wlr_gym.robot.parameters import Parameters
 
-mujoco = pytest.importorskip("mujoco")
 mjcf = pytest.importorskip("wlr_gym.physics.plants.mujoco.mjcf")
 
 COUNT = 1000
 ROBOT = load_robot()
 
 
-def random_parameters(count, seed):
-    """Robots without any symmetry, far from the nominal one; no gear friction, which is no part of the equations."""
-    rng = np.random.default_rng(seed)
-    parameters = Parameters.nominal(ROBOT, count)
-    for name in ("gravity", "body.mass", "hip.position", "leg.length", "leg.mass", "leg.com_along_leg", "wheel.radius",
-                 "wheel.mass", "wheel.spin_inertia", "wheel.transverse_inertia", "servo.armature"):  # fmt: skip
-        parameters[name] *= rng.uniform(0.4, 2.5, parameters[name].shape)
-    parameters["wheel.transverse_inertia"] = parameters["wheel.spin_inertia"] * rng.uniform(0.5, 3.0, (count, 4))
-    parameters["hip.position"][:, 2] = rng.uniform(-0.05, 0.05, count)
-    parameters["body.com_offset"] = rng.uniform(-0.1, 0.1, (count, 3))
-    parameters["body.inertia"] = body_inertia(rng, 0.03, (count,))
-    parameters["leg.inertia"] = body_inertia(rng, 1e-4, (count, 4)).reshape(count, 12)
-    parameters["payload.mass"] = rng.uniform(0.0, 3.0, count)
-    parameters["payload.position"] = rng.uniform(-0.2, 0.2, (count, 3))
-    parameters["payload.inertia"] = load_inertia(rng, 0.01, count)
-    parameters["ground.slope"] = rng.uniform(-0.6, 0.6, (count, 2))
-    parameters["servo.coulomb_friction"] = parameters["servo.viscous_friction"] = 0.0
-    parameters.validate()
-    return parameters
-
-
-def body_inertia(rng, scale, shape):
-    """Three different principal moments that a rigid body can have: sums of pairs of second moments."""
-    second = scale * rng.uniform(0.2, 2.0, (*shape, 3))
-    return second.sum(axis=-1, keepdims=True) - second
-
-
-def load_inertia(rng, scale, count):
-    """Inertias (N, 6) of bodies with second moments of mass S about their centre: trace(S) - S, xy = -S_xy."""
-    spread = rng.normal(size=(count, 3, 3))
-    second = scale * spread @ spread.transpose(0, 2, 1)
-    xx, yy, zz = (second[:, k, k] for k in range(3))
-    return np.stack([yy + zz, xx + zz, xx + yy, -second[:, 0, 1], -second[:, 0, 2], -second[:, 1, 2]], axis=1)
-
-
-@dataclass
-class Cases:
+class Cases(States):
     """One random robot in one random state per row, and what MuJoCo makes of it."""
 
-    parameters: Parameters
-    position: np.ndarray
-    quaternion: np.ndarray
-    v: np.ndarray
-    w: np.ndarray
-    joint_position: np.ndarray
-    joint_velocity: np.ndarray
-    force: np.ndarray
-    acceleration: np.ndarray
-    kinetic: np.ndarray
-    potential: np.ndarray
-    mass_matrix: np.ndarray
+    def __init__(self):
+        super().__init__(COUNT, 11)
+        self.parameters = random_parameters(COUNT, 12)
+        self.acceleration, self.energy, self.mass_matrix = (
+            np.zeros((COUNT, 14)),
+            np.zeros((COUNT, 2)),
+            np.zeros((COUNT, 14, 14)),
+        )
+        for row in range(COUNT):
+            model = mjcf.build_model(ROBOT, self.parameters, row, contacts=False)
+            model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+            data, self.acceleration[row] = self.forward(row, model)
+            self.energy[row] = data.energy
+            mujoco.mj_fullM(model, data, full := np.zeros((14, 14)))
+            order = [*range(6), *(model.joint(name).dofadr[0] for name in LEGS + WHEELS)]
+            to_floor = np.eye(14)
+            to_floor[:3, :3] = self.rotation[row]
+            self.mass_matrix[row] = to_floor.T @ full[np.ix_(order, order)] @ to_floor
 
 
 @pytest.fixture(scope="module")
 def cases():
-    rng = np.random.default_rng(11)
-    quaternion = rng.normal(size=(COUNT, 4))
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    joint_scale = np.repeat([3.0, 30.0], 4)
-    drawn = Cases(
-        parameters=random_parameters(COUNT, 12),
-        position=rng.normal(size=(COUNT, 3)),
-        quaternion=quaternion,
-        v=2.0 * rng.normal(size=(COUNT, 3)),
-        w=3.0 * rng.normal(size=(COUNT, 3)),
-        joint_position=rng.uniform(-np.pi, np.pi, (COUNT, 8)),
-        joint_velocity=joint_scale * rng.normal(size=(COUNT, 8)),
-        force=rng.normal(size=(COUNT, 14)) * np.repeat([5.0, 1.0], [6, 8]),
-        acceleration=np.zeros((COUNT, 14)),
-        kinetic=np.zeros(COUNT),
-        potential=np.zeros(COUNT),
-        mass_matrix=np.zeros((COUNT, 14, 14)),
-    )
-    rotation = dynamics.rotation_matrix(quaternion)
-    for index in range(COUNT):
-        ask_mujoco(drawn, index, rotation[index])
-    return drawn
-
-
-def ask_mujoco(cases, index, rotation):
-    """Fill in MuJoCo's answers for one row, in the coordinates of :func:`dynamics.accelerations`."""
-    model = mjcf.build_model(ROBOT, cases.parameters, index, contacts=False)
-    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    data = mujoco.MjData(model)
-    joints = [model.joint(name) for name in LEGS + WHEELS]
-    angles, rates = [joint.qposadr[0] for joint in joints], [joint.dofadr[0] for joint in joints]
-    v, w, force = cases.v[index], cases.w[index], cases.force[index]
-    data.qpos[:3], data.qpos[3:7], data.qpos[angles] = (
-        cases.position[index],
-        cases.quaternion[index],
-        cases.joint_position[index],
-    )
-    data.qvel[:3], data.qvel[3:6], data.qvel[rates] = rotation @ v, w, cases.joint_velocity[index]
-    data.qfrc_applied[:3], data.qfrc_applied[3:6], data.qfrc_applied[rates] = rotation @ force[:3], force[3:6], force[6:]
-    mujoco.mj_forward(model, data)
-    cases.acceleration[index] = [*(rotation.T @ data.qacc[:3] - np.cross(w, v)), *data.qacc[3:6], *data.qacc[rates]]
-    cases.potential[index], cases.kinetic[index] = data.energy
-    full = np.zeros((14, 14))
-    mujoco.mj_fullM(model, data, full)
-    order = [*range(6), *rates]
-    to_floor = np.eye(14)
-    to_floor[:3, :3] = rotation
-    cases.mass_matrix[index] = to_floor.T @ full[np.ix_(order, order)] @ to_floor
-
-
-def relative_error(ours, theirs):
-    """Largest difference per row over the row's largest magnitude."""
-    axes = tuple(range(1, theirs.ndim))
-    return np.abs(ours - theirs).max(axis=axes) / np.abs(theirs).max(axis=axes)
+    return Cases()
 
 
 def test_accelerations(cases):
-    ours = dynamics.accelerations(
-        cases.parameters, cases.quaternion, cases.v, cases.w, cases.joint_position, cases.joint_velocity, cases.force
-    )
-    assert relative_error(ours, cases.acceleration).max() < 1e-9
+    assert relative_error(cases.accelerations(cases.parameters), cases.acceleration) < 1e-9
 
 
 def test_mass_matrix(cases):
     """Ours is in absolute rates, MuJoCo's in joint rates: u = T u_joint."""
-    leg_rate, wheel_rate = dynamics.absolute_rates(cases.w, cases.joint_velocity)
-    ours, _ = dynamics.mass_matrix_and_bias(cases.parameters, cases.joint_position, cases.w, leg_rate, wheel_rate)
+    leg_rate, wheel_rate = dynamics.absolute_rates(cases.w, cases.rates)
+    ours, _ = dynamics.mass_matrix_and_bias(cases.parameters, cases.angles, cases.w, leg_rate, wheel_rate)
     np.testing.assert_array_equal(ours, ours.transpose(0, 2, 1))
     assert np.linalg.eigvalsh(ours).min() > 0
     to_absolute = np.eye(14)
     for leg in range(6, 10):
         to_absolute[leg, 4] = to_absolute[leg + 4, 4] = to_absolute[leg + 4, leg] = 1.0
-    assert relative_error(to_absolute.T @ ours @ to_absolute, cases.mass_matrix).max() < 1e-12
+    assert relative_error(to_absolute.T @ ours @ to_absolute, cases.mass_matrix) < 1e-12
 
 
-def test_kinetic_energy(cases):
-    ours = kinetic_energy(cases.parameters, cases.v, cases.w, cases.joint_position, cases.joint_velocity)
-    np.testing.assert_allclose(ours, cases.kinetic, rtol=1e-12)
-
-
-def test_potential_energy(cases):
-    ours = potential_energy(cases.parameters, cases.position, cases.quaternion, cases.joint_position)
-    np.testing.assert_allclose(ours, cases.potential, rtol=1e-10, atol=1e-10)
+def test_energies(cases):
+    kinetic = kinetic_energy(cases.parameters, cases.v, cases.w, cases.angles, cases.rates)
+    np.testing.assert_allclose(kinetic, cases.energy[:, 1], rtol=1e-12)
+    potential = potential_energy(cases.parameters, cases.position, cases.quaternion, cases.angles)
+    np.testing.assert_allclose(potential, cases.energy[:, 0], rtol=1e-10, atol=1e-10)
 
 
 def test_robot_stands_on_its_contact_springs_with_its_whole_weight():

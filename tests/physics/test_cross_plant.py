@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from two_plants import BACKENDS, ROBOT
+from rig import BACKENDS, ROBOT
 
 from wlr_gym.data.comparison import severe_patch
 from wlr_gym.data.excitations import EXCITATIONS, Motion, excite

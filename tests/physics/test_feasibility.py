@@ -30,13 +30,9 @@ def test_loads_and_pitch_of_the_robot_at_rest():
     offset = (0.03, 0.02, 0.04)
     robot = changed(body={"com_offset": offset})
     angles = np.array([[1.2, 1.9], [0.9, 0.9], [2.0, 1.0], [1.57, 0.8]])
-
-    def edit(parameters):
-        parameters["body.com_offset"] = offset
-
     setpoints = np.tile(HOME, (4, 1))
     setpoints[:, FRONT], setpoints[:, REAR] = angles[:, :1], angles[:, 1:]
-    truth = drive(make_plant(4, edit), 3.0, setpoints)
+    truth = drive(make_plant(4, {"body.com_offset": offset}), 3.0, setpoints)
     normal = contact_force(truth)[:, :, 2]
     for row in range(4):
         front, rear = truth.joint_position[row, FRONT].mean(), truth.joint_position[row, REAR].mean()
@@ -54,14 +50,10 @@ def test_loads_and_pitch_of_the_robot_at_rest():
 
 def test_hip_torque_on_a_floor_without_friction():
     angles = np.array([0.5, 1.0, 2.3])
-
-    def edit(parameters):
-        parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.0
-        parameters["servo.coulomb_friction"] = 0.0
-
     setpoints = np.tile(HOME, (3, 1))
     setpoints[:, :4] = angles[:, None]
-    truth = drive(make_plant(3, edit), 3.0, setpoints)
+    ice = {"ground.mu_x": 0.0, "ground.mu_y": 0.0, "servo.coulomb_friction": 0.0}
+    truth = drive(make_plant(3, ice), 3.0, setpoints)
     normal = contact_force(truth)[:, :, 2]
     for row in range(3):
         for leg in range(4):
@@ -76,12 +68,9 @@ def test_top_speed():
 
 @pytest.mark.parametrize(("mu_x", "mu_y"), [(0.6, 0.6), (0.3, 0.6), (0.8, 0.3)])
 def test_fastest_turn_on_the_spot(mu_x, mu_y):
-    def edit(parameters):
-        parameters["ground.mu_x"], parameters["ground.mu_y"] = mu_x, mu_y
-
     setpoints = HOME.copy()
     setpoints[LEFT], setpoints[RIGHT] = -FULL, FULL
-    truth = drive(make_plant(1, edit), 3.0, setpoints)
+    truth = drive(make_plant(1, {"ground.mu_x": mu_x, "ground.mu_y": mu_y}), 3.0, setpoints)
     expected = capability_of(changed(ground={"mu_x": mu_x, "mu_y": mu_y})).turning_rate
     assert truth.angular_velocity_in_body[0, 2] == pytest.approx(expected, rel=0.05)
 
@@ -90,13 +79,11 @@ def test_motors_that_are_just_too_weak_to_turn_do_not():
     """Stall torque 8 % below and above what the skid moment asks."""
     needed = CAN.turning_torque + ROBOT.servo.wheel.coulomb_friction
     torques = np.array([0.92, 1.08]) * needed
-
-    def edit(parameters):
-        parameters["servo.stall_torque"][:, 4:] = torques[:, None]
-
     setpoints = HOME.copy()
     setpoints[LEFT], setpoints[RIGHT] = -FULL, FULL
-    rate = drive(make_plant(2, edit), 4.0, setpoints).angular_velocity_in_body[:, 2]
+    rate = drive(make_plant(2, {"servo.stall_torque of wheels": torques[:, None]}), 4.0, setpoints).angular_velocity_in_body[
+        :, 2
+    ]
     assert abs(rate[0]) < 1e-3
     assert rate[1] > 1e-2
     weak, strong = (capability_of(changed(servo={"wheel": {"stall_torque": float(one)}})) for one in torques)
@@ -108,17 +95,11 @@ def test_it_tips_over_on_the_slope_that_is_said():
     """Locked joints, grippy floor, tall load: 3 degrees less and it stands, 3 degrees more and it falls."""
     offset = (0.0, 0.0, 0.15)
     can = capability_of(changed(body={"com_offset": offset}))
-    slopes = [(0, -can.tipping_downhill), (0, can.tipping_uphill), (1, can.tipping_sideways)]
-    margin = math.radians(3.0)
-
-    def edit(parameters):
-        lock(parameters)
-        parameters["body.com_offset"] = offset
-        parameters["ground.mu_x"] = parameters["ground.mu_y"] = 3.0
-        for row, (axis, slope) in enumerate(slopes * 2):
-            parameters["ground.slope"][row, axis] = slope - math.copysign(margin, slope) * (1 if row < 3 else -1)
-
-    truth = drive(make_plant(6, edit), 1.5)
+    steepest = np.array([[-can.tipping_downhill, 0.0], [can.tipping_uphill, 0.0], [0.0, can.tipping_sideways]])
+    margin = math.radians(3.0) * np.sign(steepest)
+    slopes = np.concatenate([steepest - margin, steepest + margin])
+    numbers = {"body.com_offset": offset, "ground.mu_x": 3.0, "ground.mu_y": 3.0, "ground.slope": slopes}
+    truth = drive(make_plant(6, [lock, numbers]), 1.5)
     upright = 1.0 - 2.0 * (truth.quaternion[:, 1] ** 2 + truth.quaternion[:, 2] ** 2)
     assert (upright[:3] > 0.99).all()
     assert (upright[3:] < 0.9).all()

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from rig import LEGS_DOWN, float_in_space, lift
+from rig import BACKENDS, LEGS_DOWN, drive, float_in_space, lift, lock, make_plant
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics import servo
-from wlr_gym.physics.plants import SIMULATORS, make_plant
-from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -88,31 +86,21 @@ def test_refusals(motor, words):
 
 def held(backend, robot, seconds, setpoints, edit, place=None):
     """Truth and readings of one robot after ``seconds`` of ``setpoints``."""
-    parameters = Parameters.nominal(robot)
-    edit(parameters)
-    state = standing_state(robot, parameters)
-    if place is not None:
-        place(state)
-    plant = make_plant(backend, robot, 1, PlantOptions(control_period=TICK, sensor_noise=False))
-    sensors = plant.reset(parameters=parameters, state=state)
-    for _ in range(round(seconds / TICK)):
-        sensors = plant.step(np.asarray(setpoints, np.float64)[None])
+    plant = make_plant(1, edit, place, backend=backend, robot=robot)
+    drive(plant, seconds - TICK, setpoints)
+    sensors = plant.step(np.asarray(setpoints, np.float64)[None])
     return plant.truth(), sensors
 
 
-def stuck(parameters):
-    parameters["servo.coulomb_friction"] = 50.0
-
-
-@pytest.mark.parametrize("backend", SIMULATORS)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("robot", "current"), [(NOMINAL, 12.0 / (12.0 / 5.55 * 12.0 / 7.3)), (EMANUAL, 4.4)])
 def test_energy_and_effort_of_stalled_legs(backend, robot, current):
-    truth, sensors = held(backend, robot, 0.1, np.r_[LEGS_DOWN + 1.0, np.zeros(4)], stuck)
+    truth, sensors = held(backend, robot, 0.1, np.r_[LEGS_DOWN + 1.0, np.zeros(4)], lock)
     assert truth.electrical_energy[0] == pytest.approx(4 * SUPPLY * current * TICK, rel=5e-5)  # MuJoCo's dry friction creeps
     np.testing.assert_allclose(sensors.joint_effort[0, :4], 7.3, atol=0.5 * servo.effort_counts(robot)[0])
 
 
-@pytest.mark.parametrize("backend", SIMULATORS)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("robot", "current"), [(NOMINAL, 0.0), (EMANUAL, 0.10)])
 def test_energy_of_free_wheels_at_full_speed(backend, robot, current):
     truth, sensors = held(backend, robot, 1.5, np.r_[LEGS_DOWN, np.full(4, 20.0)], float_in_space, lift)
@@ -121,24 +109,20 @@ def test_energy_of_free_wheels_at_full_speed(backend, robot, current):
     np.testing.assert_allclose(sensors.joint_effort[0, 4:], 0.0, atol=2e-3)
 
 
-@pytest.mark.parametrize("backend", SIMULATORS)
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("robot", "winding"), [(NOMINAL, 12.0**2 / 5.55 / 7.3), (EMANUAL, 12.0 / 4.4)])
 def test_supply_sags_by_the_currents(backend, robot, winding):
-    def edit(parameters):
-        stuck(parameters)
-        parameters["servo.supply_resistance"] = 0.1
-
+    edit = [lock, {"servo.supply_resistance": 0.1}]
     _, sensors = held(backend, robot, 0.2, np.r_[LEGS_DOWN + 1.0, np.zeros(4)], edit)
     assert sensors.supply_voltage[0] == pytest.approx(SUPPLY / (1.0 + 4 * 0.1 / winding), abs=0.06)
 
 
-@pytest.mark.parametrize("backend", SIMULATORS)
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_motion_is_the_same_to_the_bit(backend):
     wishes = np.random.default_rng(3).uniform([1.2] * 4 + [-5.0] * 4, [1.9] * 4 + [5.0] * 4, (25, 8))
     found = []
     for robot in (NOMINAL, EMANUAL):
-        plant = make_plant(backend, robot, 1, PlantOptions(control_period=TICK, sensor_noise=False))
-        plant.reset()
+        plant = make_plant(1, backend=backend, robot=robot)
         for wish in wishes:
             plant.step(wish[None])
         truth = plant.truth()
@@ -160,11 +144,7 @@ def test_twice_the_cycle_is_half_the_integral_gain():
 @pytest.mark.parametrize("cycle", [0.5e-3, 1e-3, 2e-3])
 def test_what_is_left_of_a_speed_step_decays_as_the_page_says(cycle):
     """docs/robot.md: rate = gain/(kd + K), of a free wheel; from it the cycle is measured."""
-
-    def edit(parameters):
-        float_in_space(parameters)
-        parameters["servo.integral_cycle"] = cycle
-
+    edit = [float_in_space, {"servo.integral_cycle": cycle}]
     wishes = np.r_[LEGS_DOWN, np.full(4, 2.0)]
     truths = [held("gibbs_appell", NOMINAL, seconds, wishes, edit, lift)[0] for seconds in (0.2, 0.4)]
     left = [2.0 - truth.joint_velocity[0, 4] for truth in truths]

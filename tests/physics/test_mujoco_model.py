@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from energy import mechanical_energy, wheel_gaps
-from two_plants import ROBOT, make
+from energy import audit
+from rig import ROBOT, make_plant
 
-from wlr_gym.physics.plants.base import Truth
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
 from wlr_gym.physics.plants.mujoco.plant import RobotBatch
 from wlr_gym.robot.parameters import Parameters
@@ -75,62 +74,25 @@ def edit(parameters):
             parameters[name][robot] = value
 
 
-def stored(parameters, truth):
-    tether = 0.5 * parameters["tether.stiffness"] * (truth.position[:, :2] ** 2).sum(axis=1)
-    return mechanical_energy(parameters, truth) + tether
-
-
 @pytest.fixture(scope="module")
-def audit():
-    """Work (N,) of every force over 3 s of random driving, by name, and the change of stored energy."""
-    count = len(EFFECTS)
-    rng = np.random.default_rng(0)
-    plant = make("mujoco", count, edit, step=STEP, period=STEP)
-    parameters = plant.parameters
-    work = {name: np.zeros(count) for name in ("motor", "gear", "viscous", "friction", "normal", "rolling")}
-    worst = {name: np.zeros(count) for name in ("gear", "friction", "rolling")}
-    done = np.zeros(count)
-    start = stored(parameters, plant.truth())
-    old = Truth(plant.truth().values.copy())
-    old_gap = wheel_gaps(parameters, old)
-    setpoints = np.zeros((count, 8))
-    for tick in range(3000):
-        if tick % 250 == 0:
-            setpoints = np.tile(np.hstack([rng.uniform(1.1, 2.0, 4), rng.uniform(-5.0, 5.0, 4)]), (count, 1))
-        plant.step(setpoints)
-        truth = plant.truth()
-        gap = wheel_gaps(parameters, truth)
-        rate = 0.5 * STEP * (truth.joint_velocity + old.joint_velocity)
-        slip = 0.5 * STEP * (truth.slip_velocity + old.slip_velocity)
-        spins = [t.angular_velocity_in_body[:, 1:2] + t.joint_velocity[:, :4] + t.joint_velocity[:, 4:] for t in (truth, old)]
-        force = truth.contact_force.reshape(count, 4, 3)
-        now = {
-            "motor": (truth.motor_torque * rate).sum(axis=1),
-            "gear": (truth.friction_torque * rate).sum(axis=1),
-            "viscous": -VISCOUS * (rate**2).sum(axis=1) / STEP,
-            "friction": (force[..., :2].reshape(count, 8) * slip).sum(axis=1),
-            "normal": (force[..., 2] * (gap - old_gap)).sum(axis=1),
-            "rolling": (truth.rolling_torque * 0.5 * STEP * (spins[0] + spins[1])).sum(axis=1),
-        }
-        for name, value in now.items():
-            work[name] += value
-        for name in worst:
-            worst[name] = np.maximum(worst[name], now[name])
-        done += np.abs(now["motor"])
-        old, old_gap = Truth(truth.values.copy()), gap
-    return stored(parameters, plant.truth()) - start, work, worst, done
+def driven():
+    """Work of every force over 3 s of random driving, all robots alike."""
+    count, rng = len(EFFECTS), np.random.default_rng(0)
+    plant = make_plant(count, edit, step=STEP, period=STEP, backend="mujoco")
+
+    def draw():
+        return np.tile(np.hstack([rng.uniform(1.1, 2.0, 4), rng.uniform(-5.0, 5.0, 4)]), (count, 1))
+
+    return audit(plant, 3000, 250, draw, VISCOUS)
 
 
-def test_energy_balance_closes_with_every_effect(audit):
-    change, work, _, done = audit
-    error = np.abs(change - sum(work.values())) / done
-    assert done.min() > 1.0
-    assert dict(zip(EFFECTS, error, strict=True)) == pytest.approx(dict.fromkeys(EFFECTS, 0.0), abs=1e-4)
+def test_energy_balance_closes_with_every_effect(driven):
+    assert driven.done.min() > 1.0
+    assert dict(zip(EFFECTS, driven.missing, strict=True)) == pytest.approx(dict.fromkeys(EFFECTS, 0.0), abs=1e-4)
 
 
 @pytest.mark.parametrize("term", ["gear", "friction", "rolling"])
-def test_no_friction_adds_energy(audit, term):
-    _, work, worst, _ = audit
-    robots = slice(1, 2) if term == "rolling" else slice(None)
-    assert work[term][robots].max() < -1e-3
-    assert worst[term].max() < 1e-5  # J per step: a slip that reverses within a step is averaged over its ends
+def test_no_friction_adds_energy(driven, term):
+    work, robots = driven.work[term], slice(1, 2) if term == "rolling" else slice(None)
+    assert work.sum(axis=0)[robots].max() < -1e-3
+    assert work.max() < 1e-5  # J per step: a slip that reverses within a step is averaged over its ends

@@ -242,24 +242,19 @@ def test_costs_by_hand():
     assert cost("track_climb_speed", climbing | {ahead: 0.02}, width=0.03) == pytest.approx(math.exp(-1.0))
 
 
-def reward(name, values, **numbers):
-    """A reward term for signals by name, zero where not given."""
-    return float(REWARDS[name].function(Signals(lambda signal: values.get(signal, 0.0)), **numbers))
-
-
 def test_large_errors_cost_the_most():
     """Ten times the error, a hundred times the cost; beyond five scales no more."""
     errors = [{"truth.linear_velocity_in_body[x]": v} for v in (0.002, 0.02, 0.1, 1.0)]
-    costs = [reward("squared_velocity_error", error) for error in errors]
+    costs = [cost("squared_velocity_error", error) for error in errors]
     assert costs == pytest.approx([0.01, 1.0, 25.0, 25.0])
     turning = {"command.yaw_rate": 0.06, "truth.angular_velocity_in_body[z]": -0.06}
-    assert reward("squared_velocity_error", turning) == pytest.approx(4.0)
+    assert cost("squared_velocity_error", turning) == pytest.approx(4.0)
 
 
 def test_what_the_observer_gets_wrong_costs():
     wrong = {"estimate.linear_velocity_in_body[x]": 0.05, "truth.linear_velocity_in_body[x]": 0.06}
-    assert reward("estimate_error", wrong, scale=0.01) == pytest.approx(1.0 / 1.125)
-    assert reward("estimate_error", {}, scale=0.01) == 0.0
+    assert cost("estimate_error", wrong, scale=0.01) == pytest.approx(1.0 / 1.125)
+    assert cost("estimate_error", {}, scale=0.01) == 0.0
 
 
 def test_a_scale_takes_the_place_of_the_limit_in_the_tracking_error_only():
@@ -318,15 +313,36 @@ GAINS = {
 TASKS = ("velocity", "path", "posture", "slope")
 
 
-def core_with_controller(task: str, count: int = 4, gains=GAINS, **more):
-    term = f"{task}_controller"
-    changes = {"latency": PROMPT, "controller": gains, "observations": {term: {}}, **more}
-    core = make_core(f"WLR-{task.title()}-v0", count, {"task": changes})
-    columns = [k for k, column in enumerate(core.task.policy) if column.term == term]
-    for row in range(count):
-        core.seed(row, row)
-    core.begin_episodes(core.everyone)
-    return core, columns
+class Controlled:
+    """Robots whose task tells them the action of the controller, and its memory, with seeds 0, 1, ..."""
+
+    def __init__(self, task: str, gains=GAINS, count=4, action=None, options=None, **keywords) -> None:
+        term = f"{task}_controller"
+        changes = {"latency": PROMPT, "controller": gains, "observations": {term: {}}, "action": action or {}}
+        self.core = make_core(f"WLR-{task.title()}-v0", count, {"task": changes, **keywords})
+        self._columns = [k for k, column in enumerate(self.core.task.policy) if column.term == term]
+        self.begin(options)
+
+    def begin(self, options=None) -> None:
+        for row in range(self.core.count):
+            self.core.seed(row, row)
+        self.core.begin_episodes(self.core.everyone, options)
+
+    @property
+    def action(self) -> np.ndarray:
+        return self.core.observation[:, self._columns[: len(JOINTS)]]
+
+    @property
+    def leaned(self) -> np.ndarray:
+        """Leg setpoints from home, rad."""
+        return self.action[:, :4] * self.core.task.actions[0].scale
+
+    @property
+    def memory(self) -> np.ndarray:
+        return self.core.observation[:, self._columns[len(JOINTS) :]]
+
+    def step(self, action=None) -> None:
+        self.core.step(self.action.copy() if action is None else action, self.core.everyone)
 
 
 def agent_of(core, gains=GAINS) -> Policy:
@@ -337,15 +353,12 @@ def agent_of(core, gains=GAINS) -> Policy:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_action_is_that_of_the_agent(task):
-    core, columns = core_with_controller(task)
-    agent = agent_of(core)
-    seen = []
+    robots = Controlled(task)
+    agent, seen = agent_of(robots.core), []
     for _ in range(150):
-        actions = agent.act(core.observation)
-        np.testing.assert_allclose(core.observation[:, columns[: len(JOINTS)]], actions, atol=2e-6)
-        seen.append(actions)
-        core.step(actions, core.everyone)
-    core.close()
+        seen.append(agent.act(robots.core.observation))
+        np.testing.assert_allclose(robots.action, seen[-1], atol=2e-6)
+        robots.step(seen[-1])
     assert np.ptp(seen, axis=0).max() > 0.1
 
 
@@ -362,44 +375,34 @@ def test_action_is_that_of_the_agent(task):
 )
 def test_legs_of_agent_and_task_agree_whatever_the_gains(changes):
     """Also where the action does not reach as far as the legs are to go, and after one robot alone begins anew."""
-    gains = GAINS | changes
-    core, columns = core_with_controller("velocity", 4, gains, action={"leg_scale": 0.15})
-    agent = agent_of(core, gains)
+    robots = Controlled("velocity", GAINS | changes, action={"leg_scale": 0.15})
+    core, second = robots.core, np.arange(4) == 1
+    agent = agent_of(core, GAINS | changes)
     for tick in range(90):
         actions = agent.act(core.observation)
-        np.testing.assert_allclose(core.observation[:, columns[: len(JOINTS)]], actions, atol=2e-6)
-        core.step(actions, core.everyone)
+        np.testing.assert_allclose(robots.action, actions, atol=2e-6)
+        robots.step(actions)
         if tick == 40:
-            second = np.arange(4) == 1
             core.begin_episodes(second)
             agent.reset(second)
-    core.close()
 
 
 def test_memory_is_of_the_episode_and_in_snapshots():
-    core, columns = core_with_controller("velocity")
-    memory = columns[len(JOINTS) :]
-    first = core.observation[:, memory].copy()
+    robots = Controlled("velocity")
+    first = robots.memory.copy()
     for _ in range(40):
-        core.step(core.observation[:, columns[: len(JOINTS)]], core.everyone)
-    assert (np.abs(core.observation[:, memory]) > np.abs(first)).any()
-    for row in range(core.count):
-        core.seed(row, row)
-    core.begin_episodes(core.everyone)
-    np.testing.assert_array_equal(core.observation[:, memory], first)
-    core.close()
+        robots.step()
+    assert (np.abs(robots.memory) > np.abs(first)).any()
+    robots.begin()
+    np.testing.assert_array_equal(robots.memory, first)
 
 
 def test_gains_are_data():
     """Another gain compiles nothing and acts."""
-    changes = {"controller": {"steering": 0.0}, "observations": {"velocity_controller": {}}}
-    core = make_core("WLR-Velocity-v0", 1, {"task": changes})
-    core.seed(0, 0)
-    core.begin_episodes(core.everyone, {"command": {"linear_velocity_x": 0.0, "yaw_rate": 0.3}})
-    columns = [k for k, column in enumerate(core.task.policy) if column.term == "velocity_controller"]
-    np.testing.assert_allclose(core.observation[0, columns[:8]], 0.0, atol=1e-6)
-    assert core.contract()["controller"]["steering"] == 0.0
-    core.close()
+    command = {"command": {"linear_velocity_x": 0.0, "yaw_rate": 0.3}}
+    robots = Controlled("velocity", {"steering": 0.0}, options=command)
+    np.testing.assert_allclose(robots.action, 0.0, atol=1e-6)
+    assert robots.core.contract()["controller"]["steering"] == 0.0
 
 
 def test_controller_needs_gains():
@@ -414,22 +417,15 @@ def test_controller_of_another_task_is_refused():
         load_task("velocity", None, {"controller": {}, "observations": {"path_controller": {}}})
 
 
+LEAN = {"legs_inward": 0.2, "lean_time": 1.0}
+
+
 def test_legs_reach_under_the_body_evenly_from_the_start():
     """As the gain says: a tenth of the way per 0.1 s of 1 s, front and rear legs towards each other, and no further."""
-    changes = {
-        "latency": PROMPT,
-        "controller": {"legs_inward": 0.2, "lean_time": 1.0},
-        "observations": {"velocity_controller": {}},
-    }
-    core = make_core("WLR-Velocity-v0", 1, {"task": changes, "randomization": "none"})
-    columns = [k for k, column in enumerate(core.task.policy) if column.term == "velocity_controller"][:4]
-    core.seed(0, 0)
-    core.begin_episodes(core.everyone)
-    leaned = []
+    robots, leaned = Controlled("velocity", LEAN, 1, randomization="none"), []
     for _ in range(60):
-        leaned.append(core.observation[0, columns] * core.task.actions[0].scale)
-        core.step(np.zeros((1, 8), np.float32), core.everyone)
-    core.close()
+        leaned.append(robots.leaned[0])
+        robots.step(np.zeros((1, 8), np.float32))
     wanted = 0.2 * np.minimum(np.arange(1, 61) * 0.02, 1.0)
     np.testing.assert_allclose(np.abs(leaned), wanted[:, None].repeat(4, axis=1), atol=1e-6)
     assert (np.sign(leaned[-1]) == [1, 1, -1, -1]).all() or (np.sign(leaned[-1]) == [1, -1, 1, -1]).all()
@@ -437,23 +433,12 @@ def test_legs_reach_under_the_body_evenly_from_the_start():
 
 def test_legs_are_not_thrown_from_where_an_episode_begins():
     """The first leg setpoints are where the legs stand; on they go at the rate of the gain."""
-    changes = {
-        "latency": PROMPT,
-        "controller": {"legs_inward": 0.2, "lean_time": 1.0},
-        "observations": {"velocity_controller": {}},
-    }
     start = {"name": "crooked", "base": "none", "initial_state": {"leg_angle": 0.1}}
-    core = make_core("WLR-Velocity-v0", 3, {"task": changes, "randomization": start})
-    columns = [k for k, column in enumerate(core.task.policy) if column.term == "velocity_controller"]
-    for row in range(3):
-        core.seed(row, row)
-    core.begin_episodes(core.everyone)
-    stand, sent = core.state.joint_position[:, :4] - core.task.robot.home.leg_angle, []
+    robots = Controlled("velocity", LEAN, randomization=start)
+    stand, sent = robots.core.state.joint_position[:, :4] - robots.core.task.robot.home.leg_angle, []
     for _ in range(100):
-        action = core.observation[:, columns[: len(JOINTS)]].copy()
-        sent.append(action[:, :4] * core.task.actions[0].scale)
-        core.step(action, core.everyone)
-    core.close()
+        sent.append(robots.leaned)
+        robots.step()
     assert np.ptp(stand) > 0.05
     assert np.abs(sent[0] - stand).max() < 0.2 * 0.02 + 0.002  # the encoder's resolution
     assert np.abs(np.diff(sent, axis=0)).max() < 0.2 * 0.02 + 1e-6
@@ -462,18 +447,11 @@ def test_legs_are_not_thrown_from_where_an_episode_begins():
 
 def test_legs_that_sweep_are_held_against_loads():
     """With the integral the servos' sag under load goes from the legs' angles; without it, it stays."""
-    errors = {}
+    errors = []
     for gain in (0.0, 2.0):
-        changes = {
-            "controller": GAINS | {"legs_inward": 0.0, "load_shift": 0.0, "leg_i": gain},
-            "observations": {"posture_controller": {}},
-        }
-        core = make_core("WLR-Posture-v0", 1, {"task": changes, "randomization": "none"})
-        columns = [k for k, column in enumerate(core.task.policy) if column.term == "posture_controller"][:8]
-        core.seed(0, 3)
-        core.begin_episodes(core.everyone)
+        gains = GAINS | {"legs_inward": 0.0, "load_shift": 0.0, "leg_i": gain}
+        robots = Controlled("posture", gains, randomization="none")
         for _ in range(190):
-            core.step(core.observation[:, columns], core.everyone)
-        errors[gain] = abs(core.measures[0, list(core.task.measures).index("leg_error")])
-        core.close()
-    assert errors[2.0] < 0.5 * errors[0.0]
+            robots.step()
+        errors.append(abs(robots.core.measures[3, robots.core.task.measures.index("leg_error")]))
+    assert errors[1] < 0.5 * errors[0]

@@ -121,10 +121,10 @@ def random_setpoints(count: int, ticks: int, seed: int = 4) -> np.ndarray:
 
 
 def rollout(
-    name: str, parameters: Parameters, setpoints: np.ndarray, seeds: np.ndarray, threads: int = 1
+    name: str, parameters: Parameters, setpoints: np.ndarray, seeds: np.ndarray, precision: str = "float64", threads: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """Truth and sensor matrices (ticks, N, columns), with sensor noise."""
-    plant = PLANTS[name].make(len(parameters), PlantOptions(threads=threads))
+    plant = PLANTS[name].make(len(parameters), PlantOptions(precision=precision, threads=threads))
     plant.reset(seeds=seeds, parameters=parameters)
     truth, sensors = [], []
     for tick in setpoints:

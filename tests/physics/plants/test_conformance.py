@@ -30,6 +30,7 @@ from wlr_gym.physics.model import dynamics
 from wlr_gym.physics.plants import BACKENDS, make_plant
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, standing_state
 from wlr_gym.physics.plants.forces import WIND_UP, make_force
+from wlr_gym.physics.plants.gibbs_appell.plant import TILES_AT_A_TIME
 from wlr_gym.physics.plants.simulator import Simulator
 from wlr_gym.robot import slip
 from wlr_gym.robot.parameters import Parameters
@@ -455,28 +456,35 @@ def test_count_must_be_a_positive_whole_number(simulator, count):
 # ---- the same bits -----------------------------------------------------------------------------------------------------
 
 
-def test_alone_or_in_a_batch(simulator):
-    count = 13
+#: Simulator, precision, and robots that fill several tiles of the engine's, the last one partly.
+BITS = pytest.mark.parametrize(
+    ("name", "precision", "count"),
+    [("gibbs_appell", "float64", 37), ("gibbs_appell", "float32", 37), ("mujoco", "float64", 13)],
+)
+
+
+@BITS
+def test_alone_or_in_a_batch(name, precision, count):
     parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 20), np.arange(count, dtype=np.uint64)
-    truth, sensors = rollout(simulator, parameters, setpoints, seeds)
+    truth, sensors = rollout(name, parameters, setpoints, seeds, precision)
     assert np.abs(truth[-1, :, :2]).max() > 1e-3
-    for row in (0, 5, 12):
+    for row in (row for row in (0, 5, 12, 15, 16, 31, 36) if row < count):
         one = [row]
-        alone = rollout(simulator, Parameters(parameters.values[one]), setpoints[:, one], seeds[one])
+        alone = rollout(name, Parameters(parameters.values[one]), setpoints[:, one], seeds[one], precision)
         np.testing.assert_array_equal(alone[0][:, 0], truth[:, row])
         np.testing.assert_array_equal(alone[1][:, 0], sensors[:, row])
     shuffled = np.random.default_rng(0).permutation(count)
-    again = rollout(simulator, Parameters(parameters.values[shuffled]), setpoints[:, shuffled], seeds[shuffled])
+    again = rollout(name, Parameters(parameters.values[shuffled]), setpoints[:, shuffled], seeds[shuffled], precision)
     np.testing.assert_array_equal(again[0], truth[:, shuffled])
     np.testing.assert_array_equal(again[1], sensors[:, shuffled])
 
 
-def test_on_two_threads_and_again(simulator):
-    count = 64
+@BITS
+def test_on_two_threads_and_again(name, precision, count):
+    count = 64 if name == "mujoco" else 16 * TILES_AT_A_TIME * 3 + 5
     parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 5), np.arange(count, dtype=np.uint64)
-    once = rollout(simulator, parameters, setpoints, seeds)
-    again = rollout(simulator, parameters, setpoints, seeds)
-    threaded = rollout(simulator, parameters, setpoints, seeds, threads=2)
+    once, again = (rollout(name, parameters, setpoints, seeds, precision) for _ in range(2))
+    threaded = rollout(name, parameters, setpoints, seeds, precision, threads=2)
     for a, b, c in zip(once, again, threaded, strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
@@ -513,8 +521,9 @@ def test_stalled_motors_turn_electrical_energy_into_heat(simulator):
     motor = ROBOT.servo.wheel
     current = motor.stall_torque / (12.0 / motor.no_load_speed)
     electrical = 4 * 12.0 * current * 0.02
-    np.testing.assert_allclose(plant.truth().electrical_energy, electrical, rtol=1e-4)
-    assert np.abs(plant.truth().mechanical_energy).max() < 1e-4 * electrical
+    creep = 1e-5 if simulator == "gibbs_appell" else 1e-4  # MuJoCo's dry friction gives way a little
+    np.testing.assert_allclose(plant.truth().electrical_energy, electrical, rtol=creep)
+    assert np.abs(plant.truth().mechanical_energy).max() < creep * electrical
 
 
 def test_truth_shows_the_forces_that_hold_the_robot_up(simulator):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulators import ROBOT, random_setpoints
+from simulators import ROBOT, random_setpoints, rollout
 
 import wlr_gym
 from wlr_gym.base import compiled
@@ -58,27 +58,24 @@ def test_unknown_precision_is_refused_with_the_nearest():
         ({"physics_step": 0.03}, r"physics_step 0.03 s must be in"),
         ({"physics_step": 0.003}, "does not divide the control period"),
         ({"threads": 0}, "threads = 0, expected 1 or more"),
+        ({"threads": 1.5}, "threads"),
+        ({"physics_step": "a"}, "physics_step"),
+        ({"precision": 64}, "precision"),
     ],
 )
-def test_impossible_options_are_refused(options, message):
+def test_options_that_cannot_be_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         PlantOptions(**options)
 
 
 def test_options_are_numbers_of_any_kind():
-    """The kinds that ``Settings`` takes; a step in single precision is another number than it looks."""
+    """The kinds that ``EnvironmentOptions`` takes; a step in single precision is another number than it looks."""
     kinds: Any = {"control_period": Fraction(1, 50), "physics_step": np.float64(0.002), "threads": np.int64(2)}
     options = PlantOptions(**kinds)
     assert options == PlantOptions(physics_step=0.002, threads=2)
     assert [type(getattr(options, name)) for name in kinds] == [float, float, int]
     with pytest.raises(InputError, match=r"physics_step 0\.00100000004\d+ s does not divide"):
         PlantOptions(physics_step=np.float32(0.001))  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("options", [{"threads": 1.5}, {"physics_step": "a"}, {"precision": 64}])
-def test_options_of_the_wrong_kind_are_refused(options):
-    with pytest.raises(InputError, match=next(iter(options))):
-        PlantOptions(**options)
 
 
 # ---- single precision over hours and kilometres: it follows double precision as well as at the start -----------------
@@ -205,48 +202,6 @@ def random_parameters(count, seed=3):
     return parameters
 
 
-def rollout(parameters, setpoints, seeds, precision="float64", threads=1):
-    """Truth and sensor matrices (ticks, N, columns)."""
-    count = len(parameters)
-    plant = GibbsAppellPlant(ROBOT, count, PlantOptions(precision=precision, threads=threads))
-    plant.reset(seeds=seeds, parameters=parameters)
-    truth, sensors = [], []
-    for tick in setpoints:
-        sensors.append(plant.step(tick).values.copy())
-        truth.append(plant.truth().values.copy())
-    plant.close()
-    return np.array(truth), np.array(sensors)
-
-
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_alone_or_in_a_batch(precision):
-    count = 37
-    parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 20), np.arange(count, dtype=np.uint64)
-    truth, sensors = rollout(parameters, setpoints, seeds, precision)
-    assert np.abs(truth[-1, :, :2]).max() > 1e-3
-    for row in (0, 5, 15, 16, 31, 36):
-        one = [row]
-        alone = rollout(Parameters(parameters.values[one]), setpoints[:, one], seeds[one], precision)
-        np.testing.assert_array_equal(alone[0][:, 0], truth[:, row])
-        np.testing.assert_array_equal(alone[1][:, 0], sensors[:, row])
-    shuffled = np.random.default_rng(0).permutation(count)
-    again = rollout(Parameters(parameters.values[shuffled]), setpoints[:, shuffled], seeds[shuffled], precision)
-    np.testing.assert_array_equal(again[0], truth[:, shuffled])
-    np.testing.assert_array_equal(again[1], sensors[:, shuffled])
-
-
-@pytest.mark.parametrize("precision", ["float64", "float32"])
-def test_on_two_threads_and_again(precision):
-    count = 16 * TILES_AT_A_TIME * 3 + 5
-    parameters, setpoints, seeds = random_parameters(count), random_setpoints(count, 5), np.arange(count, dtype=np.uint64)
-    once = rollout(parameters, setpoints, seeds, precision)
-    again = rollout(parameters, setpoints, seeds, precision)
-    threaded = rollout(parameters, setpoints, seeds, precision, threads=2)
-    for a, b, c in zip(once, again, threaded, strict=True):
-        np.testing.assert_array_equal(a, b)
-        np.testing.assert_array_equal(a, c)
-
-
 def test_two_threads_are_really_used():
     count = 16 * TILES_AT_A_TIME
     plant = GibbsAppellPlant(ROBOT, count, PlantOptions(threads=2))
@@ -258,7 +213,9 @@ def test_two_threads_are_really_used():
 
 def test_float32_follows_float64():
     parameters, setpoints, seeds = random_parameters(16), random_setpoints(16, 25), np.arange(16, dtype=np.uint64)
-    double, single = (rollout(parameters, setpoints, seeds, precision)[0][-1] for precision in ("float64", "float32"))
+    double, single = (
+        rollout("gibbs_appell", parameters, setpoints, seeds, precision)[0][-1] for precision in ("float64", "float32")
+    )
     error = np.abs(double[:, :3] - single[:, :3]).max()
     assert error < 1e-5
     assert not np.array_equal(double, single)
@@ -270,7 +227,7 @@ def test_golden_rollout():
     Compared to 1e-8 m, not bit by bit: the kernel is strict IEEE arithmetic, but numpy's exp and sin, which prepare its
     constants, differ by a rounding from one kind of processor to the next.
     """
-    truth, _ = rollout(random_parameters(8), random_setpoints(8, 100), np.arange(8, dtype=np.uint64))
+    truth, _ = rollout("gibbs_appell", random_parameters(8), random_setpoints(8, 100), np.arange(8, dtype=np.uint64))
     golden = json.loads(GOLDEN.read_text())
     expected = np.array([[float.fromhex(number) for number in row] for row in golden["position_and_quaternion"]])
     np.testing.assert_allclose(truth[-1, :, :7], expected, atol=1e-8, rtol=0)
