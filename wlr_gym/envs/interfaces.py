@@ -37,7 +37,18 @@ class TaskMethods:
     """Commands and descriptions, for a class that holds a ``core``."""
 
     core: Core
+    pictures: Pictures
+    metadata: dict[str, Any]
+    _infos: Infos
     _spec: EnvSpec | None = None
+
+    def _open(self, task: str | Mapping[str, Any], options: Mapping[str, Any], count: int, render_mode: str | None) -> None:
+        """Make the core of ``count`` robots, and what shows and tells of it."""
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.core = Core(task, read_settings(options), count)
+        self.metadata = metadata(self.core.task.config.control_period)
+        self.pictures, self._infos = Pictures(self.core, render_mode), Infos(self.core)
 
     @cached_property
     def _snapshots(self) -> Snapshots:
@@ -315,12 +326,7 @@ class WlrEnv(TaskMethods, gym.Env[Any, np.ndarray], EzPickle):  # pyright: ignor
         **options: Any,
     ) -> None:
         EzPickle.__init__(self, render_mode=render_mode, definition=definition, **options)
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
-        self.core = Core(task_of(self.task_name, definition), read_settings(options), 1)
-        self.metadata = metadata(self.core.task.config.control_period)
-        self.pictures: Pictures = Pictures(self.core, render_mode)
-        self._infos = Infos(self.core)
+        self._open(task_of(self.task_name, definition), options, 1, render_mode)
         self.observation_space = self.core.observation_space
         self.action_space = self.core.action_space
         self._everyone = self.core.everyone
@@ -426,13 +432,9 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
             definition=definition,
             **options,
         )
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
         self.autoreset_mode: AutoresetMode = _read_mode(autoreset_mode)
-        self.core = Core(task_of(self.task_name, definition), read_settings(options), num_envs)
-        self.metadata = {**metadata(self.core.task.config.control_period), "autoreset_mode": self.autoreset_mode}
-        self.pictures: Pictures = Pictures(self.core, render_mode)
-        self._infos = Infos(self.core)
+        self._open(task_of(self.task_name, definition), options, num_envs, render_mode)
+        self.metadata["autoreset_mode"] = self.autoreset_mode
         self.num_envs = self.core.count
         self.core.shorten(max_episode_steps)
         self.single_observation_space = self.core.observation_space
@@ -608,92 +610,58 @@ def _merge(infos: dict[str, Any], others: dict[str, Any]) -> None:
 
 # ---- the shipped tasks; a task of your own needs no class: see register_task -----------------------------------------
 
-# Each takes the keywords of wlr_gym.envs.settings.EnvironmentOptions. What an environment observes, rewards and measures is
-# data: ``describe()`` prints its tables, ``wlr envs ID`` and docs/environments.md show them. Vector classes name Gymnasium's
-# class among their bases a second time: skrl recognises an environment by its direct bases.
+# Each takes the keywords of wlr_gym.envs.settings.EnvironmentOptions. What a task is at length, and its versions, stands in its
+# file, configs/task/NAME.yaml; ``describe()`` prints the tables of what it observes, rewards and measures, ``wlr envs ID`` and
+# docs/environments.md show them. Vector classes name Gymnasium's class among their bases a second time: skrl recognises an
+# environment by its direct bases.
 
 
 # pyright: reportIncompatibleVariableOverride=false
 
 
 class VelocityEnv(WlrEnv):
-    """Follow commands of forward velocity and yaw rate that change a few times within an episode.
+    """Follow commands of forward velocity and yaw rate that change a few times within an episode."""
 
-    The robot turns on skids, so it cannot turn without slip; what it can learn is to slip no more than the turn needs, on
-    floors from slippery to grippy, which it must tell apart from wheel speeds, motor currents and the IMU.
-
-    Version history of ``WLR-Velocity-v0``:
-
-    - v0: first version
-    """
-
-    task_name: ClassVar[str | None] = "velocity"
+    task_name = "velocity"
 
 
 class VelocityVectorEnv(WlrVectorEnv, VectorEnv):
     """A batch of robots on the task of :class:`VelocityEnv`."""
 
-    task_name: ClassVar[str | None] = "velocity"
+    task_name = "velocity"
 
 
 class PathEnv(WlrEnv):
-    """Follow a line, an S-curve or a circle on the floor at a commanded speed, with the least lateral error.
+    """Follow a line, an S-curve or a circle on the floor at a commanded speed, with the least lateral error."""
 
-    Where the robot is against its path it knows from its own estimate: odometry and gyroscope drift as wheels slip, which
-    turning on skids makes them do, and the camera holds the estimate where there is one. Reward and measures use the true pose.
-
-    Version history of ``WLR-Path-v0``:
-
-    - v0: first version
-    """
-
-    task_name: ClassVar[str | None] = "path"
+    task_name = "path"
 
 
 class PathVectorEnv(WlrVectorEnv, VectorEnv):
     """A batch of robots on the task of :class:`PathEnv`."""
 
-    task_name: ClassVar[str | None] = "path"
+    task_name = "path"
 
 
 class PostureEnv(WlrEnv):
-    """Drive straight on while the legs sweep from one posture to another: the two tests of the paper as a task.
+    """Drive straight on while the legs sweep from one posture to another: the two tests of the paper as a task."""
 
-    First the legs go from home to the first posture; from 4 s on they sweep to the second one, each axle its own way. Legs that
-    turn drag their wheels along and load them unevenly, and where the floor grips the wheels unevenly that turns the robot
-    aside. The paper's tests are front legs at 30 degrees while rear legs go from 30 to 150, and front legs from 30 to 150 while
-    rear legs go from 150 to 30.
-
-    Version history of ``WLR-Posture-v0``:
-
-    - v0: first version
-    """
-
-    task_name: ClassVar[str | None] = "posture"
+    task_name = "posture"
 
 
 class PostureVectorEnv(WlrVectorEnv, VectorEnv):
     """A batch of robots on the task of :class:`PostureEnv`."""
 
-    task_name: ClassVar[str | None] = "posture"
+    task_name = "posture"
 
 
 class SlopeEnv(WlrEnv):
-    """Climb a slope at a commanded speed, straight on, then hold.
+    """Climb a slope at a commanded speed, straight on, then hold."""
 
-    Friction and slope are drawn together: the slope is 1.5 to 12 degrees less than the steepest one that the floor's friction
-    could hold, atan(mu). The world frame is the floor's; it is gravity that leans. Near the limit every wheel must carry its
-    share: wheels that spin, or fight each other, use up what holds the robot.
-
-    Version history of ``WLR-Slope-v0``:
-
-    - v0: first version
-    """
-
-    task_name: ClassVar[str | None] = "slope"
+    task_name = "slope"
 
 
 class SlopeVectorEnv(WlrVectorEnv, VectorEnv):
     """A batch of robots on the task of :class:`SlopeEnv`."""
 
-    task_name: ClassVar[str | None] = "slope"
+    task_name = "slope"

@@ -7,7 +7,7 @@ turned into setpoints of the joints.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -282,7 +282,7 @@ class Actions:
         torque_on: (N, 8) whether the motors are on; None = all.
     """
 
-    def __init__(self, columns: Sequence[ActionColumn], count: int, free_wheels: Sequence[str]) -> None:
+    def __init__(self, columns: Sequence[ActionColumn], count: int, free_wheels: Iterable[str]) -> None:
         self._scaling = np.array([(c.centre, c.scale, c.low, c.high) for c in columns], SCALING)
         self.action, self.previous, self.setpoints = np.zeros((3, count, len(columns)))
         self._buffers = (self.action, self.previous, self.setpoints)

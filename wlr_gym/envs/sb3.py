@@ -13,11 +13,9 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
-from wlr_gym.envs.core import Core
 from wlr_gym.envs.episodes import Mask, read_seed
-from wlr_gym.envs.interfaces import Infos, Pictures, TaskMethods, check_render_mode, metadata, row_of, seed_robots
+from wlr_gym.envs.interfaces import TaskMethods, row_of, seed_robots
 from wlr_gym.envs.registry import task_name_of
-from wlr_gym.envs.settings import read_settings
 
 require_package("stable_baselines3", "train")
 
@@ -62,15 +60,11 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         render_mode = its_mode if render_mode is None else render_mode
         steps = spec.max_episode_steps if max_episode_steps is None else max_episode_steps
         EzPickle.__init__(self, spec, num_envs, seed=seed, max_episode_steps=steps, render_mode=render_mode, **options)
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
-        self.core = Core(definition or task_name_of(spec.id), read_settings(given | options), num_envs)
+        self._open(definition or task_name_of(spec.id), given | options, num_envs, render_mode)
         self.core.shorten(steps)
-        self.spec = spec
+        self.spec, shown = spec, self.metadata
         super().__init__(self.core.count, self.core.observation_space, self.core.action_space)
-        self.metadata: dict[str, Any] = metadata(self.core.task.config.control_period)
-        self.pictures: Pictures = Pictures(self.core, render_mode)
-        self._infos = Infos(self.core)
+        self.metadata = shown
         self._actions: Any = None
         if seed is not None:
             self.seed(seed)

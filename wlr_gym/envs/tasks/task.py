@@ -153,7 +153,7 @@ class TaskConfig(SettingsModel):
     """Contents of ``configs/task/*.yaml``.
 
     An episode is a success when no termination term ended it and every measure named in ``success`` stays within its limits.
-    ``summary`` opens the environment's documentation, ``history`` closes it: version of the id -> what changed. The last
+    ``summary``: what it asks for. ``history``: version of the id -> what changed. The last
     version is the present one. ``robot`` is the one that the numbers are written for; ``scaling`` says how they follow another:
     place of a number -> rule, see :mod:`wlr_gym.envs.tasks.scaling`. ``controller``: gains of the hand-written controller whose
     action may be observed.

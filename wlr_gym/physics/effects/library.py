@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from wlr_gym.physics.effects.effect import (
     add_vector,
     along,
     multiply,
+    one_step,
     put,
     steps,
     together,
@@ -281,8 +282,7 @@ BODY_FORCE = "force on the body"
 
 def _asymmetry_guesses(where: Places, observed: Observed) -> list[Guess]:
     mu = observed.mean("ground.mu_x")
-    less = -0.25 * mu
-    return [Guess(((Change({"mu": mu + less}),),), lambda a: (mu + less * float(a[0]),))]
+    return [one_step("mu", -0.25 * mu, mu)]
 
 
 def _weakening_guesses(where: Places, observed: Observed) -> list[Guess]:
@@ -513,24 +513,23 @@ def _payload_guesses(where: Places, observed: Observed) -> list[Guess]:
 def _payload_coordinates(where: Places, observed: Observed) -> Coordinates:
     """Mass and moments, in place of mass and place."""
     moments = {f"moment_{axis}": Coordinate("kg m", 0.0, -0.2, 0.2, 0.01) for axis in "xyz"}
-    return Coordinates({"mass": Coordinate("kg", 0.0, 0.0, 2.0, 0.1), **moments}, _load, within=_no_farther(FARTHEST_LOAD))
+    return _size_times_place({"mass": Coordinate("kg", 0.0, 0.0, 2.0, 0.1)} | moments, FARTHEST_LOAD)
 
 
-def _no_farther(distance: float) -> Callable[[Sequence[float]], tuple[float, ...]]:
-    """Keep a size, and what it is times a place, where the place is no farther out than ``distance``."""
+def _size_times_place(numbers: dict[str, Coordinate], farthest: float) -> Coordinates:
+    """A size, and what it is times a place, along each axis; the place is no farther out than ``farthest``."""
+    size = next(iter(numbers))
+
+    def placed(values: Sequence[float]) -> dict[str, float]:
+        amount = max(float(values[0]), 1e-6)
+        places = (float(np.clip(value / amount, -farthest, farthest)) for value in values[1:])
+        return {size: amount, **dict(zip("xyz", places, strict=False))}
 
     def within(values: Sequence[float]) -> tuple[float, ...]:
-        most = float(values[0]) * distance
+        most = float(values[0]) * farthest
         return float(values[0]), *(float(np.clip(value, -most, most)) for value in values[1:])
 
-    return within
-
-
-def _load(values: Sequence[float]) -> dict[str, float]:
-    """Mass and place of a load from its mass and moments; none is carried farther out than plausible."""
-    mass = max(float(values[0]), 1e-6)
-    moments = zip("xyz", values[1:], strict=True)
-    return {"mass": mass, **{axis: float(np.clip(moment / mass, -FARTHEST_LOAD, FARTHEST_LOAD)) for axis, moment in moments}}
+    return Coordinates(numbers, placed, within=within)
 
 
 def _pulls() -> tuple[dict[str, float], ...]:
@@ -546,21 +545,12 @@ def _tether_guesses(where: Places, observed: Observed) -> list[Guess]:
 def _tether_coordinates(where: Places, observed: Observed) -> Coordinates:
     """Stiffness and the pull at the floor's origin, in place of stiffness and anchor."""
     pulls = {f"pull_{axis}": Coordinate("N", 0.0, -20.0, 20.0, 0.2) for axis in "xy"}
-    springs = {"stiffness": Coordinate("N/m", 0.0, 0.0, 20.0, 0.5), **pulls}
-    return Coordinates(springs, _anchored, within=_no_farther(FARTHEST_ANCHOR))
+    return _size_times_place({"stiffness": Coordinate("N/m", 0.0, 0.0, 20.0, 0.5)} | pulls, FARTHEST_ANCHOR)
 
 
 def _anchor(severity: float) -> EffectParameter:
     near = (-FARTHEST_ANCHOR, FARTHEST_ANCHOR)
     return EffectParameter("m", "anchor, floor frame", -1e3, 1e3, 0.0, near, severity, optional=True, is_size=False)
-
-
-def _anchored(values: Sequence[float]) -> dict[str, float]:
-    """Stiffness and anchor from stiffness and the pull at the floor's origin."""
-    stiffness = max(float(values[0]), 1e-6)
-    pulls = zip("xy", values[1:], strict=True)
-    places = {axis: float(np.clip(pull / stiffness, -FARTHEST_ANCHOR, FARTHEST_ANCHOR)) for axis, pull in pulls}
-    return {"stiffness": stiffness, **places}
 
 
 BODY_EFFECTS: tuple[Effect, ...] = (
