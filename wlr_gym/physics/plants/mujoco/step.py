@@ -94,6 +94,11 @@ CAPSULE_LEAN = math.pi / 6
 LEAST_MU = 1e-5
 
 
+def over(added: Out, lanes: Lanes) -> Lanes:
+    """Lay lanes over others."""
+    return ChainMap(added, lanes)  # pyright: ignore[reportArgumentType]  # nothing writes to them
+
+
 def with_engine_rates(lanes: Lanes) -> Lanes:
     """Add the quasi-velocities of the engine: body-frame velocity of the body origin, absolute leg and wheel rates."""
     body = to_body(rotation_rows(lanes), vector(lanes, "u"))
@@ -101,7 +106,7 @@ def with_engine_rates(lanes: Lanes) -> Lanes:
     for i in CORNERS:
         added[f"leg_rate{i}"] = lanes["wy"] + lanes[f"joint_rate{i}"]
         added[f"wheel_rate{i}"] = added[f"leg_rate{i}"] + lanes[f"joint_rate{FIRST_WHEEL + i}"]
-    return ChainMap(added, lanes)
+    return over(added, lanes)
 
 
 def drift(lanes: Lanes, duration: Value) -> Out:
@@ -287,7 +292,7 @@ def after(lanes: Lanes, step: Value) -> Out:
         torque = ops.where_positive(lanes[f"half_play{j}"], friction * (1.0 / step), out[f"gear_torque{j}"])
         out[f"gear_torque{j}"] = torque + crept
     out["mechanical_energy"], out["electrical_energy"] = mechanical, electrical
-    out |= _drift_of_rotors(ChainMap(out, lanes), step)
+    out |= _drift_of_rotors(over(out, lanes), step)
     push = [(lanes[f"u{a}"] - lanes[f"old_u{a}"]) * (1.0 / step) - lanes[f"gravity_{a}"] for a in AXES]
     specific_force = to_body(rotation_rows(lanes), push)
     for k, a in enumerate(AXES):
@@ -332,7 +337,7 @@ def observe(lanes: Lanes) -> Out:
     renamed |= {f"normal{i}": lanes[f"force_z{i}"] for i in CORNERS}
     renamed |= {f"gear_friction{j}": lanes[f"gear_torque{j}"] for j in range(8)}
     renamed |= {f"rolling_friction{i}": lanes[f"rolling_torque{i}"] for i in CORNERS}
-    out = engine.observe(ChainMap(renamed, lanes), 1.0, FEATURES)  # impulses over a step of 1 are forces
+    out = engine.observe(over(renamed, lanes), 1.0, FEATURES)  # impulses over a step of 1 are forces
     for j in range(8):
         out[f"joint_velocity_{j}"] = out[f"raw_velocity_{j}"] = lanes[f"joint_rate{j}"]
     return out
