@@ -11,6 +11,7 @@ gyroscope and accelerometer (``imu.bandwidth``) inside its substeps.
 from __future__ import annotations
 
 import math
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -39,24 +40,15 @@ from wlr_gym.robot.parameters import Parameters
 #: Parameters that a robot's sensor remembers, in the order of the first columns of its state.
 FLOW_ERRORS = ("flow.present", "flow.scale", "flow.mount_yaw", "flow.dropout", "flow.poor_floor")
 _PRESENT, _FLOW_SCALE, _FLOW_MOUNT_YAW, _DROPOUT, _POOR_FLOOR = range(len(FLOW_ERRORS))
-_FLOW_PHASE = 5
-_SEEN = 6
-_PLACE = 7
-_TURN = 10
-_CARRIED = 14
-_SHOWN = 16
-_QUALITY = 18
-_END = 19
-#: Columns of a robot's state. Beyond ``_FLOW_PHASE``: tick, place and attitude when last looked; image shift since the last
-#: frame; shown flow and quality, and when its interval ended.
-FLOW_WIDTH = 20
-#: First column of a robot's state that a reset clears.
-FLOW_MEMORY = _SEEN
+#: First columns of a robot's state, and all of them. Beyond ``_FLOW_PHASE``, cleared by a reset: tick, place and attitude when
+#: last looked; image shift since the last frame; shown flow and quality, and when its interval ended.
+_FLOW_PHASE, _SEEN, _PLACE, _CARRIED, _SHOWN, _QUALITY, _END, FLOW_WIDTH = accumulate((5, 1, 1, 7, 2, 2, 1, 1))
 
-#: Entries of the settings: place of the lens, one count, frame rate, noises, quality and limits.
-FLOW_SETTINGS = 12
-_LENS, _COUNT, _RATE, _NOISE, _SPEED_NOISE = 0, 3, 4, 5, 6
-_MEAN_QUALITY, _QUALITY_NOISE, _LEAST_QUALITY, _LEAST_HEIGHT, _GREATEST_RATE = 7, 8, 9, 10, 11
+#: First entries of the settings, and all of them: place of the lens, one count, frame rate, noises, quality and limits.
+(
+    _LENS, _COUNT, _RATE, _NOISE, _SPEED_NOISE, _MEAN_QUALITY, _QUALITY_NOISE, _LEAST_QUALITY, _LEAST_HEIGHT, _GREATEST_RATE,
+    FLOW_SETTINGS,
+) = accumulate((0, 3, *[1] * 9))  # fmt: skip
 
 #: Edge of the squares of floor that have a texture of their own (m).
 CELL = 0.2
@@ -100,10 +92,10 @@ def check_flow(robot: Robot, parameters: Parameters) -> None:
         )
 
 
-@njit(cache=True, nogil=True)
-def flow_phase(seed: Any) -> float:
-    """Return the phase of a robot's frames, 0 to 1."""
-    return float(np.int64(words4(seed, _FLOW_PHASE_STREAM, 0, 0)[0])) * 2.0**-32
+@njit(cache=True, nogil=True, inline="always")
+def _uniform(seed: Any, stream: Any, counter: Any, block: Any) -> float:
+    """A number from 0 to 1."""
+    return float(np.int64(words4(seed, stream, counter, block)[0])) * 2.0**-32
 
 
 @njit(cache=True, nogil=True)
@@ -150,7 +142,7 @@ def _texture(seed: Any, x: float, y: float, poor_floor: float) -> float:
     if poor_floor <= 0.0:
         return 1.0
     cell_x, cell_y = math.floor(x / CELL) + _CELLS, math.floor(y / CELL) + _CELLS
-    drawn = float(np.int64(words4(seed, _TEXTURE_STREAM, cell_x, cell_y)[0])) * 2.0**-32
+    drawn = _uniform(seed, _TEXTURE_STREAM, cell_x, cell_y)
     return drawn / poor_floor if drawn < poor_floor else 1.0
 
 
@@ -206,7 +198,7 @@ def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state:
     n0, n1, n2, _ = normals4(seed, _NOISE_STREAM, tick, 0)
     texture = _texture(seed, place[0], place[1], state[_POOR_FLOOR])
     quality = min(settings[_MEAN_QUALITY] * texture + settings[_QUALITY_NOISE] * n2, 1.0)
-    lost = float(np.int64(words4(seed, _FLOW_DROPOUT_STREAM, tick, 0)[0])) * 2.0**-32 < state[_DROPOUT]
+    lost = _uniform(seed, _FLOW_DROPOUT_STREAM, tick, 0) < state[_DROPOUT]
     too_fast = max(abs(x), abs(y)) > settings[_GREATEST_RATE]
     if lost or too_fast or distance < settings[_LEAST_HEIGHT] or distance == 0.0 or quality < settings[_LEAST_QUALITY]:
         state[_QUALITY] = 0.0
@@ -250,49 +242,20 @@ RAW_LAYOUT = Layout(
     )
 )
 
-# Columns of the state matrix: what a robot's sensors remember.
+# First columns of the state matrix: what a robot's sensors remember.
 _CALIBRATION = (
-    "joint.zero_offset",
-    "imu.gyro_bias",
-    "imu.accel_bias",
-    "camera.mount_yaw",
-    "camera.scale",
-    "camera.delay",
-    "camera.present",
-    "camera.dropout",
-)
-_ZERO_OFFSET = 0
-_GYRO_BIAS = 4
-_ACCEL_BIAS = 7
-_MOUNT_YAW = 10
-_SCALE = 11
-_DELAY = 12
-_CAMERA_PRESENT = 13
-_CAMERA_DROPOUT = 14
-_IMU_TO_BODY = 15
-_WHEEL_ZERO = 24
-_START_POSE = 28
-_SHOWN_POSE = 31
-_EXPOSED = 34
-_PHASE = 35
-_FLOW = 36
-_POSES = _FLOW + FLOW_WIDTH
-
-# Entries of the settings vector.
-_PERIOD = 0
-_CAMERA_RATE = 1
-_NOISY = 2
-_POSITION_COUNT = 3
-_VELOCITY_COUNT = 4
-_VOLT_COUNT = 5
-_EFFORT_COUNTS = 6
-_VOLT_NOISE = 14
-_GYRO_NOISE = 15
-_ACCEL_NOISE = 16
-_CAMERA_NOISE = 17
-_YAW_NOISE = 18
-_EFFORT_NOISE = 19
-_FLOW_SETTINGS = _EFFORT_NOISE + len(JOINTS)
+    "joint.zero_offset", "imu.gyro_bias", "imu.accel_bias",
+    "camera.mount_yaw", "camera.scale", "camera.delay", "camera.present", "camera.dropout",
+)  # fmt: skip
+(
+    _ZERO_OFFSET, _GYRO_BIAS, _ACCEL_BIAS, _MOUNT_YAW, _SCALE, _DELAY, _CAMERA_PRESENT, _CAMERA_DROPOUT, _IMU_TO_BODY,
+    _WHEEL_ZERO, _START_POSE, _SHOWN_POSE, _EXPOSED, _PHASE, _FLOW, _POSES,
+) = accumulate((0, 4, 3, 3, 1, 1, 1, 1, 1, 9, 4, 3, 3, 1, 1, FLOW_WIDTH))  # fmt: skip
+# First entries of the settings vector.
+(
+    _PERIOD, _CAMERA_RATE, _NOISY, _POSITION_COUNT, _VELOCITY_COUNT, _VOLT_COUNT, _EFFORT_COUNTS, _VOLT_NOISE, _GYRO_NOISE,
+    _ACCEL_NOISE, _CAMERA_NOISE, _YAW_NOISE, _EFFORT_NOISE, _FLOW_SETTINGS,
+) = accumulate((0, *[1] * 6, len(JOINTS), *[1] * 5, len(JOINTS)))  # fmt: skip
 
 # First columns of the signals, as plain numbers for the kernel.
 _RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_HEIGHT, _RAW_TURN, _RAW_POSE = (
@@ -300,18 +263,10 @@ _RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_HEIGHT, _RAW_
     for name in ("joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "height", "quaternion", "pose")
 )
 _OUT_VELOCITY, _OUT_EFFORT, _OUT_GYRO, _OUT_ACCEL, _OUT_VOLT, _OUT_CAMERA, _OUT_AGE, _OUT_FLOW = (
-    SENSOR_LAYOUT.slices[name].start
-    for name in (
-        "joint_velocity",
-        "joint_effort",
-        "gyro",
-        "accelerometer",
-        "supply_voltage",
-        "camera_pose",
-        "joint_age",
-        "flow",
+    SENSOR_LAYOUT.slices[name].start for name in (
+        "joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "camera_pose", "joint_age", "flow",
     )
-)
+)  # fmt: skip
 _TICK_STREAM = stream_number("sensors")
 _CAMERA_STREAM = stream_number("camera")
 _PHASE_STREAM = stream_number("camera phase")
@@ -356,7 +311,7 @@ def _camera(seed: Any, tick: int, pose: Any, settings: Any, state: Any, out: Any
 @njit(cache=True, nogil=True, inline="always")
 def _is_lost(seed: Any, frame: int, dropout: float) -> bool:
     """Whether the camera's frame of this number never arrives."""
-    return dropout > 0.0 and float(np.int64(words4(seed, _DROPOUT_STREAM, frame, 0)[0])) * 2.0**-32 < dropout
+    return dropout > 0.0 and _uniform(seed, _DROPOUT_STREAM, frame, 0) < dropout
 
 
 @njit(cache=True, nogil=True)
@@ -445,8 +400,9 @@ def measure_rows(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, o
 
 
 @njit(cache=True, nogil=True)
-def _camera_phase(seed: Any) -> float:
-    return float(np.int64(words4(seed, _PHASE_STREAM, 0, 0)[0])) * 2.0**-32
+def _phase(seed: Any, stream: Any) -> float:
+    """Phase of a robot's frames of camera or flow, 0 to 1."""
+    return _uniform(seed, stream, 0, 0)
 
 
 class SensorModel:
@@ -503,9 +459,9 @@ class SensorModel:
         self._states[rows, _WHEEL_ZERO:_START_POSE] = raw[rows, WHEEL_SLICE]
         self._states[rows, _START_POSE:_SHOWN_POSE] = raw[rows, _RAW_POSE:]
         self._states[rows, _SHOWN_POSE:_PHASE] = 0.0
-        self._states[rows, _PHASE] = [_camera_phase(seed) for seed in self._seeds[rows]]
-        self._states[rows, _FLOW + FLOW_MEMORY : _POSES] = 0.0
-        self._states[rows, _FLOW + FLOW_MEMORY - 1] = [flow_phase(seed) for seed in self._seeds[rows]]
+        self._states[rows, _FLOW + _SEEN : _POSES] = 0.0
+        for column, stream in ((_PHASE, _PHASE_STREAM), (_FLOW + _FLOW_PHASE, _FLOW_PHASE_STREAM)):
+            self._states[rows, column] = [_phase(seed, stream) for seed in self._seeds[rows]]
         for i in rows:
             measure_rows(raw, *self.memory(), out, i, i + 1)
 
