@@ -86,14 +86,10 @@ def apart_from(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, n
     return Parting(apart / np.maximum(travel, 0.05), np.degrees(turned), error)
 
 
-def describe(cases: list[Case], values: np.ndarray) -> dict[str, float]:
-    """Values by the names of their cases, for a readable failure."""
-    return {f"{case.motion} {case.effect}": float(value) for case, value in zip(cases, values, strict=True)}
-
-
 def outside(cases: list[Case], values: np.ndarray, bound: float) -> dict[str, float]:
-    """The cases whose value is not within its bound."""
-    return {name: value for name, value in describe(cases, values).items() if not value < bound}
+    """The cases, by their names, whose value is not within its bound."""
+    named = {f"{case.motion} {case.effect}": float(value) for case, value in zip(cases, values, strict=True)}
+    return {name: value for name, value in named.items() if not value < bound}
 
 
 def test_every_excitation_ends_at_the_same_place():

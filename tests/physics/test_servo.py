@@ -253,45 +253,6 @@ def test_profile_registers_at_zero_mean_no_profile():
         servo.profile_limits(np.zeros(4), np.zeros(4))
 
 
-# --- one source for numpy and kernels
-
-
-LAWS = {
-    "wheel": (servo.wheel_profile_step, (0.3, 1.0, 2.0, 11.2, 1e-3, 0.2, 8.63, 12.0)),
-    "leg": (servo.leg_profile_step, (1.0, 0.2, 1.5, 1.0, 7.5, 1e-3)),
-    "voltage": (servo.controller_voltage, (55.0, 0.1, 1.0, 0.0, 0.9, 0.3, 12.0)),
-    "torque": (servo.motor_torque, (2.16, 3.55, 8.0, 1.2)),
-}
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_traced_law_equals_numpy(law):
-    function, sample = LAWS[law]
-    rng = np.random.default_rng(3)
-    columns = np.array(sample) * rng.uniform(0.2, 2.5, size=(200, len(sample)))
-    if law == "leg":
-        columns[::4, 4] = servo.NO_LIMIT
-        columns[::8, 3] = servo.NO_LIMIT
-        columns[1::9, 2] = columns[1::9, 0]
-    if law == "wheel":
-        columns[::4, 3] = servo.NO_LIMIT
-        columns[::5, 6] = 0.0
-        columns[::3, 0] += 10.0
-    graph = Graph()
-    traced = function(*(graph.input(f"x{i}") for i in range(len(sample))))
-    outputs = {f"y{i}": node for i, node in enumerate(traced if isinstance(traced, tuple) else (traced,))}
-    source = "\n".join(emit(outputs, lambda n: n, lambda n, v: f"{n} = {v}", ""))
-    expected = np.atleast_2d(function(*columns.T))
-    for row in range(len(columns)):
-        scope = {
-            "math": math,
-            "select": lambda condition, a, b: a if condition else b,
-            **{f"x{i}": float(x) for i, x in enumerate(columns[row])},
-        }
-        exec(source, scope)
-        np.testing.assert_allclose([scope[name] for name in outputs], expected[:, row], rtol=1e-12, atol=1e-15)
-
-
 # --- registers
 
 

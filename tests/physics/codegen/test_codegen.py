@@ -3,6 +3,7 @@
 import os
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,47 +12,6 @@ from llvmlite import binding
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.codegen import Graph, emit, hoist, load_module, ops, straight_line_source
 from wlr_gym.physics.codegen.compilation import cache_directory
-
-
-def formula(x, y, p):
-    s, c = ops.sin_cos(x)
-    a = ops.where_positive(y - 0.2, s * c - y, y * y + 3.0 * x)
-    return ops.clip(a * p + ops.sqrt(ops.absolute(x)) - 0.5 * (x * y), -2.0, 2.0) + ops.minimum(x, y) * ops.tanh(y)
-
-
-def compiled(width, dtype="float64", fused=True):
-    graph = Graph()
-    out = formula(graph.input("x"), graph.input("y"), graph.input("p") * graph.input("p"))
-    lines = emit({"out": out}, lambda n: f"W[{'xyp'.index(n)}, k]", lambda n, v: f"W[3, k] = {v}", "            ", fused=fused)
-    body = [
-        "@njit(cache=True, nogil=True, error_model='numpy')",
-        "def run(X):",
-        f"    W = np.empty((4, {width}), np.{dtype})",
-        f"    for e in range(X.shape[0] // {width}):",
-        f"        W[:] = X[e * {width} : (e + 1) * {width}].T",
-        f"        for k in range({width}):",
-        *lines,
-        f"        X[e * {width} : (e + 1) * {width}] = W.T",
-    ]
-    return load_module("test_formula", "\n".join(body) + "\n").run
-
-
-@pytest.fixture
-def table():
-    return np.random.default_rng(0).normal(scale=2.0, size=(64, 4))
-
-
-def test_compiled_equals_numpy(table):
-    expected = formula(table[:, 0], table[:, 1], table[:, 2] ** 2)
-    compiled(8)(table)
-    np.testing.assert_allclose(table[:, 3], expected, rtol=2e-14, atol=2e-14)
-
-
-def test_same_bits_at_every_width(table):
-    narrow, wide = table.copy(), table.copy()
-    compiled(1)(narrow)
-    compiled(8)(wide)
-    assert np.array_equal(narrow, wide)
 
 
 @pytest.mark.skipif(not binding.get_host_cpu_features().get("avx512f"), reason="no vector registers of 512 bits")
@@ -137,10 +97,8 @@ INPUTS, WIDTH = 6, 8
 PLAIN = "@njit(nogil=True, error_model='numpy')"
 
 
-def expressions() -> dict[str, object]:
+def expressions(a, b, c, d, e, f) -> dict[str, Any]:
     """Every operation that can be traced, of inputs and of numbers."""
-    owner = Graph()
-    a, b, c, d, e, f = (owner.input(str(k)) for k in range(INPUTS))
     return {
         "fused": a * b + c,
         "fused_minus": c - a * b,
@@ -160,41 +118,54 @@ def expressions() -> dict[str, object]:
     }
 
 
-def source(precision: str, straight: bool) -> str:
-    outputs = expressions()
+def source(precision: str, straight: bool, width: int) -> str:
+    owner = Graph()
+    outputs = expressions(*(owner.input(str(k)) for k in range(INPUTS)))
     place = {name: INPUTS + k for k, name in enumerate(outputs)}
     lines = emit(
         outputs,
-        lambda name: f"w[{int(name) * WIDTH} + k]",
-        lambda name, text: f"w[{place[name] * WIDTH} + k] = {text}",
+        lambda name: f"w[{int(name) * width} + k]",
+        lambda name, text: f"w[{place[name] * width} + k] = {text}",
         "" if straight else " " * 8,
         lambda value: f"F({value!r})",
         fused=True,
     )
     block = straight_line_source("block", ["w", "k"], lines) if straight else []
     body = ["        block(w, k)"] if straight else lines
-    head = [PLAIN, "def run(W):", "    w = numbers_of(W)", f"    for k in range({WIDTH}):"]
+    head = [PLAIN, "def run(W):", "    w = numbers_of(W)", f"    for k in range({width}):"]
     return "\n".join([f"F = np.{precision}", *block, *head, *body, ""])
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_the_same_bits_as_numbas_own(precision, tmp_path, monkeypatch):
+def computed(numbers: np.ndarray, precision: str, straight: bool = False) -> np.ndarray:
+    """Inputs and outputs (rows, width) of the compiled expressions."""
+    values, width = numbers.astype(precision).flatten(), numbers.shape[1]
+    load_module(f"block_{precision}_{straight}_{width}", source(precision, straight, width)).run(values)
+    return values.reshape(numbers.shape)
+
+
+@pytest.fixture
+def numbers(tmp_path, monkeypatch) -> np.ndarray:
     monkeypatch.setenv("WLR_GYM_CACHE", str(tmp_path))
-    generator = np.random.default_rng(1)
-    count = INPUTS + len(expressions())
-    numbers = generator.normal(0.0, 3.0, (count, WIDTH)).astype(precision)
+    return np.random.default_rng(1).normal(0.0, 3.0, (INPUTS + len(expressions(*np.ones(INPUTS))), WIDTH))
+
+
+def test_numpys_values_and_the_same_bits_at_every_width(numbers):
+    found = computed(numbers, "float64")
+    alone = np.hstack([computed(numbers[:, k : k + 1], "float64") for k in range(WIDTH)])
+    np.testing.assert_array_equal(found, alone)
+    np.testing.assert_allclose(found[INPUTS:], list(expressions(*numbers[:INPUTS]).values()), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_the_same_bits_as_numbas_own(precision, numbers):
     numbers[:INPUTS, 0] = [0.0, -0.0, np.nan, np.inf, -np.inf, 1e-30]
-    results = []
-    for straight in (True, False):
-        values = numbers.flatten()
-        load_module(f"block_{precision}_{straight}", source(precision, straight)).run(values)
-        results.append(values.reshape(count, WIDTH))
+    straight, numbas = computed(numbers, precision, True), computed(numbers, precision)
     kind = {"float32": np.uint32, "float64": np.uint64}[precision]
-    finite = ~np.isnan(results[1])
-    assert np.array_equal(finite, ~np.isnan(results[0]))
-    assert np.array_equal(results[0].view(kind)[finite], results[1].view(kind)[finite])
+    finite = ~np.isnan(numbas)
+    assert np.array_equal(finite, ~np.isnan(straight))
+    assert np.array_equal(straight.view(kind)[finite], numbas.view(kind)[finite])
     assert finite[INPUTS:].mean() > 0.8
-    assert np.array_equal(results[0][:INPUTS], numbers[:INPUTS], equal_nan=True)
+    assert np.array_equal(straight[:INPUTS], numbers[:INPUTS].astype(precision), equal_nan=True)
 
 
 def test_what_it_does_not_know_is_refused(tmp_path, monkeypatch):

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wlr_gym.base.random import spawn_seeds
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import Plant, PlantOptions, RobotOptions, Sensors
-from wlr_gym.robot import load_robot
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Plant, PlantOptions, RobotOptions, Sensors
+from wlr_gym.physics.plants.sensors import SensorModel
+from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
 ROBOT = load_robot()
@@ -132,3 +134,21 @@ def rollout(
         truth.append(plant.truth().values.copy())
     plant.close()
     return np.array(truth), np.array(sensors)
+
+
+def read(raws: np.ndarray, parameters=None, seeds=None, options: PlantOptions = QUIET, robot: Robot = ROBOT) -> np.ndarray:
+    """What sensors read (ticks, N, columns) of raw signals (ticks, N, columns), the first at the reset."""
+    count = raws.shape[1]
+    model, out = SensorModel(robot, options, count), np.zeros((count, SENSOR_LAYOUT.width))
+    parameters = Parameters.nominal(robot, count) if parameters is None else parameters
+    model.reset(raws[0], out, spawn_seeds(0, count) if seeds is None else seeds, parameters)
+    readings = [out.copy()]
+    for raw in raws[1:]:
+        model.measure(raw, out)
+        readings.append(out.copy())
+    return np.array(readings)
+
+
+def channel(readings: np.ndarray, name: str) -> np.ndarray:
+    """A channel of readings."""
+    return readings[..., SENSOR_LAYOUT.slices[name]]

@@ -1,9 +1,11 @@
 """The optical-flow sensor against what it is computed from by other means: true velocities, and counted statistics."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from simulators import QUIET, channel, read
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import spawn_seeds
@@ -17,7 +19,7 @@ from wlr_gym.robot.parameters import Parameters
 ROBOT = load_robot("flow")
 FLOW: Any = ROBOT.sensors.flow
 PERIOD = 0.02
-QUIET = PlantOptions(sensor_noise=False)
+record = partial(read, robot=ROBOT)
 
 
 def robot_with(**flow):
@@ -34,24 +36,6 @@ def gliding(velocity, ticks, count=1, height=0.134 + 0.035, yaw=0.0):
     way = PERIOD * np.arange(ticks)[:, None, None] * np.asarray(velocity)
     raw[..., RAW_LAYOUT.slices["pose"]] = np.concatenate([way, np.full((ticks, 1, 1), yaw)], axis=2)
     return raw
-
-
-def record(raw, parameters=None, robot=ROBOT, options=QUIET, seeds=None):
-    count = raw.shape[1]
-    model = SensorModel(robot, options, count)
-    out = np.zeros((count, SENSOR_LAYOUT.width))
-    parameters = Parameters.nominal(robot, count) if parameters is None else parameters
-    seeds = spawn_seeds(0, count) if seeds is None else seeds
-    model.reset(raw[0], out, seeds, parameters)
-    readings = [out.copy()]
-    for row in raw[1:]:
-        model.measure(row, out)
-        readings.append(out.copy())
-    return np.array(readings)
-
-
-def channel(readings, name):
-    return readings[..., SENSOR_LAYOUT.slices[name]]
 
 
 # ---- against the true velocities ------------------------------------------------------------------------------------

@@ -4,33 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
+from simulators import QUIET, ROBOT, channel, read
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import spawn_seeds
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, PlantOptions, Sensors, Truth
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
 from wlr_gym.physics.servo import effort_counts
-from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 
-ROBOT = load_robot()
-QUIET = PlantOptions(sensor_noise=False)
+NOISY = PlantOptions()
 PERIOD = 0.02
-
-
-def buffers(count):
-    return np.zeros((count, RAW_LAYOUT.width)), np.full((count, SENSOR_LAYOUT.width), np.nan)
-
-
-def record(model, raws, seeds, parameters):
-    """Reset on raws[0], then one tick for each later matrix; returns (T, N, width)."""
-    out = np.zeros((model.count, SENSOR_LAYOUT.width))
-    model.reset(raws[0], out, seeds, parameters)
-    readings = [out.copy()]
-    for raw in raws[1:]:
-        model.measure(raw, out)
-        readings.append(out.copy())
-    return np.array(readings)
 
 
 def along_path(times, count=1, wrap=False):
@@ -54,12 +38,8 @@ def noisy():
     raw = np.zeros((ticks, count, RAW_LAYOUT.width))
     raw[:, :, :] = np.random.default_rng(0).normal(size=(1, 1, RAW_LAYOUT.width))
     raw[:, :, RAW_LAYOUT.slices["supply_voltage"]] = 11.87
-    readings = record(SensorModel(ROBOT, PlantOptions(), count), raw, spawn_seeds(4, count), Parameters.nominal(ROBOT, count))
+    readings = read(raw, seeds=spawn_seeds(4, count), options=NOISY)
     return raw[0, 0], readings
-
-
-def channel(readings, name):
-    return readings[..., SENSOR_LAYOUT.slices[name]]
 
 
 @pytest.mark.parametrize(
@@ -124,15 +104,15 @@ def random_case(count, ticks=40):
 @pytest.mark.parametrize("place", [0, 17, 63])
 def test_alone_or_in_a_batch_gives_the_same_bits(place):
     raws, seeds, parameters = random_case(64)
-    batch = record(SensorModel(ROBOT, PlantOptions(), 64), raws, seeds, parameters)
+    batch = read(raws, parameters, seeds, NOISY)
     row = slice(place, place + 1)
-    alone = record(SensorModel(ROBOT, PlantOptions(), 1), raws[:, row].copy(), seeds[row], Parameters(parameters.values[row]))
+    alone = read(raws[:, row].copy(), Parameters(parameters.values[row]), seeds[row], NOISY)
     assert np.array_equal(batch[:, row], alone)
 
 
 def test_ranges_give_the_same_bits_as_the_whole_batch():
     raws, seeds, parameters = random_case(64)
-    whole, parts = (SensorModel(ROBOT, PlantOptions(), 64) for _ in range(2))
+    whole, parts = (SensorModel(ROBOT, NOISY, 64) for _ in range(2))
     out, other = np.zeros((2, 64, SENSOR_LAYOUT.width))
     whole.reset(raws[0], out, seeds, parameters)
     parts.reset(raws[0], other, seeds, parameters)
@@ -145,7 +125,7 @@ def test_ranges_give_the_same_bits_as_the_whole_batch():
 
 def test_masked_reset_restarts_only_the_masked_robots():
     raws, seeds, parameters = random_case(4)
-    touched, untouched = (SensorModel(ROBOT, PlantOptions(), 4) for _ in range(2))
+    touched, untouched = (SensorModel(ROBOT, NOISY, 4) for _ in range(2))
     out, other = np.zeros((2, 4, SENSOR_LAYOUT.width))
     for model, matrix in ((touched, out), (untouched, other)):
         model.reset(raws[0], matrix, seeds, parameters)
@@ -153,7 +133,7 @@ def test_masked_reset_restarts_only_the_masked_robots():
             model.measure(raw, matrix)
     mask = np.array([False, True, False, False])
     touched.reset(raws[0], out, seeds, parameters, mask)
-    fresh = record(SensorModel(ROBOT, PlantOptions(), 4), raws[[0, 20]], seeds, parameters)
+    fresh = read(raws[[0, 20]], parameters, seeds, NOISY)
     assert np.array_equal(out[1], fresh[0, 1])
     touched.measure(raws[20], out)
     untouched.measure(raws[20], other)
@@ -163,7 +143,7 @@ def test_masked_reset_restarts_only_the_masked_robots():
 
 def test_without_noise_the_readings_are_exact_and_biases_stay():
     raws, seeds, parameters = random_case(3)
-    readings = record(SensorModel(ROBOT, QUIET, 3), raws, seeds, parameters)
+    readings = read(raws, parameters, seeds)
     truth = raws[-1]
     sensors = Sensors(readings[-1])
     legs, wheels = truth[:, :4], truth[:, 4:8]
@@ -183,7 +163,7 @@ def test_camera_shows_the_path_as_it_was_at_the_stated_age(delay):
     raws, pose = along_path(times, count, wrap=True)
     parameters = Parameters.nominal(ROBOT, count)
     parameters["camera.delay"] = delay
-    readings = record(SensorModel(ROBOT, QUIET, count), raws, spawn_seeds(3, count), parameters)
+    readings = read(raws, parameters, spawn_seeds(3, count))
     age = channel(readings, "camera_age")[..., 0]
     new = channel(readings, "camera_is_new")[..., 0] == 1
     exposed = times[:, None] - age
@@ -206,7 +186,7 @@ def test_camera_frame_is_the_start_pose_turned_by_the_mounting():
     raws[1:, 0, RAW_LAYOUT.slices["pose"]] = start + np.array([0.3, 0.4, 0.25])
     parameters = Parameters.nominal(ROBOT)
     parameters["camera.mount_yaw"] = mount
-    readings = record(SensorModel(ROBOT, QUIET, 1), raws, spawn_seeds(0, 1), parameters)
+    readings = read(raws, parameters)
     shown = channel(readings, "camera_pose")[:, 0]
     assert shown[0].tolist() == [0, 0, 0]
     turn = -(0.8 + mount)
@@ -219,7 +199,7 @@ def test_camera_scale_stretches_the_measured_path_and_leaves_the_yaw():
     parameters = Parameters.nominal(ROBOT, 2)
     parameters["camera.mount_yaw"] = 0.2
     parameters["camera.scale"] = [1.0, 1.07]
-    readings = record(SensorModel(ROBOT, QUIET, 2), raws, np.full(2, 9, np.uint64), parameters)
+    readings = read(raws, parameters, np.full(2, 9, np.uint64))
     shown = channel(readings, "camera_pose")
     assert np.abs(shown[-1, 0, :2]).min() > 0.01
     np.testing.assert_allclose(shown[:, 1, :2], 1.07 * shown[:, 0, :2], rtol=1e-14)
@@ -232,7 +212,7 @@ def test_a_tilted_imu_reads_gravity_along_its_own_axes():
     raw[:, :, RAW_LAYOUT.slices["gyro"]] = [0.0, 0.0, 2.0]
     parameters = Parameters.nominal(ROBOT, 3)
     parameters["imu.mount"] = [[0.0, 0.1, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.3]]
-    sensors = Sensors(record(SensorModel(ROBOT, QUIET, 3), raw, spawn_seeds(0, 3), parameters)[-1])
+    sensors = Sensors(read(raw, parameters)[-1])
     sine, cosine = np.sin(0.1), np.cos(0.1)
     # nose of the sensor down: its x axis looks down; right side down: its y axis looks up; turned about z: nothing changes
     directions = [[-sine, 0, cosine], [0, sine, cosine], [0, 0, 1]]
@@ -243,7 +223,7 @@ def test_a_tilted_imu_reads_gravity_along_its_own_axes():
 def test_mounting_is_the_rotation_from_sensor_to_body_and_biases_are_the_sensors():
     raws, seeds, parameters = random_case(3)
     roll, pitch, yaw = parameters["imu.mount"].T
-    readings = record(SensorModel(ROBOT, QUIET, 3), raws, seeds, parameters)
+    readings = read(raws, parameters, seeds)
     sensors = Sensors(readings[-1])
     for name, bias in (("gyro", "imu.gyro_bias"), ("accelerometer", "imu.accel_bias")):
         for robot in range(3):
@@ -260,7 +240,7 @@ def test_mounting_is_the_rotation_from_sensor_to_body_and_biases_are_the_sensors
 def test_without_mounting_errors_the_readings_are_the_truth_to_the_bit():
     raws, seeds, _ = random_case(4)
     raws[3], raws[4] = 0.0, -1e-300
-    readings = record(SensorModel(ROBOT, QUIET, 4), raws, seeds, Parameters.nominal(ROBOT, 4))
+    readings = read(raws, seeds=seeds)
     for name in ("gyro", "accelerometer"):
         assert np.array_equal(channel(readings, name), raws[..., RAW_LAYOUT.slices[name]])
 
@@ -268,15 +248,13 @@ def test_without_mounting_errors_the_readings_are_the_truth_to_the_bit():
 def test_yaw_unwraps_over_many_turns():
     times = np.arange(0, 20, PERIOD)
     raws, _ = along_path(times, 1, wrap=True)
-    readings = record(SensorModel(ROBOT, QUIET, 1), raws, spawn_seeds(0, 1), Parameters.nominal(ROBOT))
+    readings = read(raws)
     assert channel(readings, "camera_pose")[-1, 0, 2] == pytest.approx(1.7 * times[-1], abs=1.7 * 0.06)
 
 
 def test_same_seed_same_noise_other_seed_other_noise():
     raws, seeds, parameters = random_case(2)
-    first = record(SensorModel(ROBOT, PlantOptions(), 2), raws, seeds, parameters)
-    again = record(SensorModel(ROBOT, PlantOptions(), 2), raws, seeds, parameters)
-    other = record(SensorModel(ROBOT, PlantOptions(), 2), raws, seeds + np.uint64(1), parameters)
+    first, again, other = (read(raws, parameters, given, NOISY) for given in (seeds, seeds, seeds + np.uint64(1)))
     assert np.array_equal(first, again)
     gyro = SENSOR_LAYOUT.slices["gyro"]
     assert not (first[..., gyro] == other[..., gyro]).any()
@@ -285,8 +263,7 @@ def test_same_seed_same_noise_other_seed_other_noise():
 def test_control_period_sets_the_camera_pattern():
     options = dataclasses.replace(QUIET, control_period=1 / 30, physics_step=1 / 300)
     raws, _ = along_path(np.arange(60) / 30)
-    new = channel(record(SensorModel(ROBOT, options, 1), raws, spawn_seeds(0, 1), Parameters.nominal(ROBOT)), "camera_is_new")
-    assert new.all()
+    assert channel(read(raws, options=options), "camera_is_new").all()
 
 
 def test_channels_that_do_not_exist_can_be_asked_for():
@@ -300,9 +277,8 @@ def test_channels_that_do_not_exist_can_be_asked_for():
 
 def test_wrong_shapes_are_refused():
     model = SensorModel(ROBOT, PlantOptions(), 2)
-    raw, out = buffers(3)
     with pytest.raises(InputError, match="sensors of 2 robots"):
-        model.measure(raw, out)
+        model.measure(np.zeros((3, RAW_LAYOUT.width)), np.zeros((3, SENSOR_LAYOUT.width)))
 
 
 @pytest.mark.parametrize(
