@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from wlr_gym.base.random import fill_normals, stream_number
 from wlr_gym.physics.plants.base import (
     SENSOR_LAYOUT,
     TRUTH_LAYOUT,
@@ -20,8 +19,6 @@ from wlr_gym.physics.plants.base import (
 )
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
-
-NOISE = stream_number("fake sensors")
 
 
 class FakePlant:
@@ -36,7 +33,6 @@ class FakePlant:
         self.parameters = Parameters.nominal(self.robot, count)
         self._seeds = np.zeros(count, np.uint64)
         self._ticks = np.zeros(count, np.int64)
-        self._noise = np.zeros((count, SENSOR_LAYOUT.width))
         self._sensors = Sensors(np.zeros((count, SENSOR_LAYOUT.width)))
         self._truth = Truth(np.zeros((count, TRUTH_LAYOUT.width)))
         self.reset(parameters=self.parameters)
@@ -94,8 +90,8 @@ class FakePlant:
         sensors["accelerometer"][rows] = [0.0, 0.0, 9.81]
         sensors["supply_voltage"][rows] = 12.0
         if self.options.sensor_noise:
-            fill_normals(self._seeds, NOISE, self._ticks, self._noise)
-            sensors.values[rows] += 0.01 * self._noise[rows]
+            noise = 0.7548 * (self._seeds[rows, None] % np.uint64(10007)) + 0.5698 * self._ticks[rows, None]
+            sensors.values[rows] += 0.04 * ((noise + 0.618 * np.arange(SENSOR_LAYOUT.width)) % 1.0 - 0.5)
 
     def truth(self):
         return self._truth

@@ -95,29 +95,11 @@ def _normal_pair(radius_word: Any, angle_word: Any) -> Any:
 
 @njit(cache=True, nogil=True, inline="always")
 def normals4(seed: Any, stream: Any, counter: Any, block: Any) -> Any:
-    """Four independent standard normals: the columns 4 block ... 4 block + 3 of :func:`fill_normals`."""
+    """Four independent standard normals, a function of these numbers alone; ``seed`` and ``stream`` are uint64."""
     a, b, c, d = words4(seed, stream, counter, block)
     n0, n1 = _normal_pair(a, b)
     n2, n3 = _normal_pair(c, d)
     return n0, n1, n2, n3
-
-
-@njit(cache=True, nogil=True)
-def fill_normals(seeds: Any, stream: Any, counters: Any, out: Any) -> None:
-    """Fill ``out`` (N, K) with standard normals; row i is a function of (seeds[i], stream, counters[i]) alone.
-
-    Args:
-        seeds: (N,) uint64.
-        stream: uint64, its low 32 bits count (see :func:`stream_number`).
-        counters: (N,) int64.
-        out: (N, K) float64.
-    """
-    columns = out.shape[1]
-    for row in range(out.shape[0]):
-        for block in range((columns + 3) // 4):
-            four = normals4(seeds[row], np.uint64(stream), counters[row], block)
-            for k in range(min(4, columns - 4 * block)):
-                out[row, 4 * block + k] = four[k]
 
 
 def stream_number(name: str) -> np.uint64:
