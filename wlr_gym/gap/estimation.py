@@ -543,8 +543,10 @@ def fit(
     steps = problem.steps if steps is None else steps
     if columns is not None:
         (now,) = replay([model], runs)
+    elif near is not None:
+        now, columns = linearise(model, runs, near.columns, near.noise)
     else:
-        now, columns = linearise(model, runs, *((near.columns, near.noise) if near is not None else ()))
+        now, columns = linearise(model, runs)
     gained, most, tau = np.inf, scatter, autocorrelation_time
     for step in range(steps):
         tau = autocorrelation_time

@@ -101,7 +101,7 @@ def analyse(
     """
     check_number("threads", threads, least=1)
     if out is not None:
-        from wlr_gym.gap.report.page import check_folder, save_analysis
+        from wlr_gym.gap.report.page import check_folder
 
         check_folder(Path(out))
     tell("reading", STAGES["reading"])
@@ -122,6 +122,8 @@ def analyse(
     if named := named_robot(data, rig, robot):
         done = replace(done, provenance={**done.provenance, "robot": named})
     if out is not None:
+        from wlr_gym.gap.report.page import save_analysis
+
         tell("drawing", STAGES["drawing"])
         save_analysis(done, Path(out))
     return done

@@ -189,11 +189,11 @@ def responses(fit: Fit, probes: Sequence[Probe]) -> Responses:
     return Responses(fit, keys, columns, response, push, model.tightness, away, information, *model.room, products)
 
 
-def screen(candidates: Sequence[Candidate], found: Responses, threshold: float = LEAST_GAIN) -> list[Score]:
-    """Return the score of every candidate, best first; ``threshold``: see :func:`least_gain`."""
+def screen(candidates: Sequence[Candidate], found: Responses) -> list[Score]:
+    """Return the score of every candidate, best first."""
     nothing = _fall(found, np.zeros((0, len(found.push))))[0]
     best = [max((_score(c, start, found, nothing) for start in c.starts), key=lambda s: s.gain) for c in candidates if c.starts]
-    seen = [replace(score, visible=score.is_visible(threshold)) for score in best]
+    seen = [replace(score, visible=score.is_visible(LEAST_GAIN)) for score in best]
     return sorted(seen, key=lambda score: -score.gain)
 
 
