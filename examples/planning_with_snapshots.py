@@ -21,7 +21,8 @@ import gymnasium as gym
 import numpy as np
 
 import wlr_gym  # noqa: F401
-from wlr_gym.learning.evaluation import measures_of, roll_out, summarise
+from wlr_gym.learning.evaluation.metrics import summarise
+from wlr_gym.learning.evaluation.rollout import measures_of, roll_out
 from wlr_gym.policy import load_agent_config, make_policy
 
 ID = "WLR-Velocity-v0"

@@ -345,7 +345,7 @@ def _line(study: AdaptStudy, case: AdaptCase, contender: str, say: Say) -> dict[
 
 def _train(progress: Progress, name: str, family: Family) -> str:
     """Train on from the old policy with a family, in a folder of its own; return the policy."""
-    train_in(progress, progress.out / name, progress.out / f"{name}.yaml", family)
+    train_in(progress, name, family)
     return str(progress.out / name / "policy")
 
 

@@ -299,7 +299,7 @@ def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[s
     """Work through the sets, in processes of their own, and say after each how long the rest will take."""
     begin, named = time.monotonic(), {one.name: one for one in cases}
     jobs = [_job(plan, one, analyser) for one in cases]
-    with _spreading(plan, analyser, say, ray) as spread_out:
+    with _spreading(plan, ray) as spread_out:
         for done, ended in enumerate(spread_out(jobs), 1):
             passed = time.monotonic() - begin
             rest = passed / done * (len(cases) - done)
@@ -309,19 +309,15 @@ def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[s
 
 
 @contextmanager
-def _spreading(
-    plan: Plan, analyser: str, say: Callable[[str], None], ray: str | None
-) -> Iterator[Callable[[Sequence[Job]], Iterator[Ended]]]:
+def _spreading(plan: Plan, ray: str | None) -> Iterator[Callable[[Sequence[Job]], Iterator[Ended]]]:
     """Yield what runs jobs: processes of this machine, or a Ray cluster."""
     if ray is None:
         yield lambda jobs: spread(jobs, plan.processes)
         return
-    from wlr_gym.learning.sweep.ray import LOCAL, connected, fit_nodes, spread_on_ray
+    from wlr_gym.learning.sweep.ray import LOCAL, connected, spread_on_ray
 
     with connected(ray, plan.processes if ray == LOCAL else None):
-        check = Job("check", _MODULE, {"check": analyser}, str((plan.out / "work" / "check.log").resolve()))
-        nodes = fit_nodes(check, say)
-        yield lambda jobs: spread_on_ray(jobs, nodes, plan.processes)
+        yield lambda jobs: spread_on_ray(jobs, plan.processes)
 
 
 def _job(plan: Plan, one: BlindCase, analyser: str) -> Job:
@@ -347,11 +343,8 @@ def _outcome(plan: Plan, one: BlindCase, error: str) -> str:
 
 
 def _work(task: Mapping[str, Any], send: Send) -> None:
-    """Do one set, in a process of its own; or find out whether one could be done here."""
-    module, _, function = task.get("analyser", task.get("check")).partition(":")
-    if "check" in task:
-        importlib.import_module(module)
-        return
+    """Do one set, in a process of its own."""
+    module, _, function = task["analyser"].partition(":")
     fields = {name: value for name, value in task.items() if name not in ("index", "analyser")}
     plan = Plan(**{**fields, "out": Path(task["out"]), "runs": tuple(task["runs"])})
     run_case(plan, case(task["index"], plan.first_seed), getattr(importlib.import_module(module), function))

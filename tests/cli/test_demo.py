@@ -20,8 +20,7 @@ from wlr_gym.demo import diagnosis, policies, retraining, workers
 from wlr_gym.demo.page import NOT_SHOWN, SHOWN, SKIPPED, TERMS, Demo, Section
 from wlr_gym.demo.page import page as page_of
 from wlr_gym.gap.report.result import PATCH_FILE, RESULT_FILE
-from wlr_gym.learning.evaluation import Estimate
-from wlr_gym.learning.evaluation.metrics import Metric
+from wlr_gym.learning.evaluation.metrics import Estimate, Metric
 from wlr_gym.physics.effects import load_patch, save_patch
 
 COMMAND = [sys.executable, "-c", "import sys; from wlr_gym.cli import main; sys.exit(main())", "demo", "--quick"]

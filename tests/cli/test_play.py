@@ -14,8 +14,8 @@ from PIL import Image
 from wlr_gym.cli import main
 from wlr_gym.cli import play as play_module
 from wlr_gym.envs.tasks.signals import PlanarPose, Signals, error_from_path
-from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.evaluation.film import Journey, commands, drive, film, film_length, result
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import make_policy
 from wlr_gym.render.teleop import RESET, UP, Script
 from wlr_gym.render.view import View

@@ -111,7 +111,7 @@ def test_the_interface_of_stable_baselines3_takes_a_spec(registry, task):
 @pytest.mark.slow
 def test_a_pickled_batch_of_stable_baselines3_knows_the_task_elsewhere(registry, task, tmp_path):
     """So does the evaluation once the file is gone: the spec holds the whole task."""
-    from wlr_gym.learning.evaluation import make_core
+    from wlr_gym.learning.evaluation.rollout import make_core
 
     env_id = register_task(task)
     (tmp_path / "env.pkl").write_bytes(pickle.dumps(Sb3VecEnv(env_id, 2)))

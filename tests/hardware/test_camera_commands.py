@@ -19,7 +19,7 @@ from wlr_gym.cli import OK, run_command
 from wlr_gym.cli.doctor import check_policy
 from wlr_gym.data.runs import read_run
 from wlr_gym.hardware.log import read_events
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import environment_for, make_policy
 
 POLICY = "velocity_slip_aware"

@@ -34,7 +34,7 @@ from wlr_gym.hardware.emulator.link import emulated_robot
 from wlr_gym.hardware.log import CsvTable, read_events
 from wlr_gym.hardware.loop import StoppedError
 from wlr_gym.hardware.timing import MonotonicClock
-from wlr_gym.learning.evaluation import make_core, roll_out
+from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.policy import make_policy
 
 ID = "WLR-Velocity-v0"

@@ -18,7 +18,7 @@ from wlr_gym.hardware.config import PadButtons
 from wlr_gym.hardware.deployment import deploy, loop_of
 from wlr_gym.hardware.log import read_events
 from wlr_gym.hardware.operator import DrivingPad, Operator
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import make_policy
 
 RANGES = {"linear_velocity_x": (-0.1, 0.2), "yaw_rate": (-0.5, 0.5)}

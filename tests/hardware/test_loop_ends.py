@@ -20,7 +20,7 @@ from wlr_gym.hardware.deployment import deploy, drive_robot, loop_of
 from wlr_gym.hardware.operator import Keys, stop_on_signals
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.adaptation.driving import interrupted
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.physics.plants.base import PlantOptions, RobotOptions
 from wlr_gym.policy import make_policy
 

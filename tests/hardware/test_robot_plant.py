@@ -16,7 +16,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.data.runs import read_run
 from wlr_gym.envs.core import MEASURED, measured_truth
 from wlr_gym.envs.settings import EnvironmentOptions
-from wlr_gym.learning.evaluation import make_core, roll_out
+from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.physics.effects import Patch
 from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, RobotOptions, Sensors, read_robot_options

@@ -11,7 +11,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.envs.interfaces import PathVectorEnv, PostureEnv, WlrEnv
 from wlr_gym.envs.tasks.task import read_task
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import contract_of, make_policy, policy_environment
 
 torch = pytest.importorskip("torch")

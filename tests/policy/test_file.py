@@ -9,8 +9,8 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.envs.tasks import contract as task_contract
 from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.task import ObserverConfig
-from wlr_gym.learning.evaluation import make_core
-from wlr_gym.policy import check_contract, load_policy, make_policy, read_contract, write_contract
+from wlr_gym.learning.evaluation.rollout import make_core
+from wlr_gym.policy import check_contract, load_policy, read_contract, write_contract
 from wlr_gym.policy.file import DEFAULTS, LEFT_OUT, with_defaults
 from wlr_gym.robot import Robot, load_robot
 
@@ -176,13 +176,3 @@ def test_broken_contracts_are_refused(tmp_path, content, message):
     (tmp_path / "contract.json").write_bytes(content)
     with pytest.raises(InputError, match=message):
         read_contract(tmp_path)
-
-
-def test_a_place_without_a_policy(tmp_path, contract):
-    with pytest.raises(InputError, match="no policy there"):
-        make_policy(tmp_path, contract)
-
-
-def test_neither_agent_nor_folder(contract):
-    with pytest.raises(InputError, match=r"neither a folder, .* nor a shipped policy \(did you mean 'do_nothing'"):
-        make_policy("do_nothin", contract)

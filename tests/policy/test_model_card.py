@@ -7,7 +7,7 @@ import pytest
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.learning.evaluation import make_core, start_episodes
+from wlr_gym.learning.evaluation.rollout import make_core, start_episodes
 from wlr_gym.policy import (
     contract_of,
     find_policy,

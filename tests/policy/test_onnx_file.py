@@ -18,7 +18,7 @@ import onnx
 
 from wlr_gym.base.errors import InputError, MissingPackageError
 from wlr_gym.cli import main
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import contract_of, export_policy, load_agent, load_policy, make_policy, read_contract, write_contract
 from wlr_gym.policy.export import compare
 from wlr_gym.policy.onnx_file import CONTRACT_KEY, FINGERPRINT_KEY, open_policy, seal
@@ -254,9 +254,9 @@ def test_command_line(trained, exported, tmp_path, capsys):
 
 @pytest.mark.parametrize(("clock", "seconds"), [([1.0, 2.0, 4.0], 4.0), ([1.0, 2.0, 0.5, 3.0], 5.0), ([7.0], 7.0)])
 def test_wall_time_of_resumed_runs(clock, seconds):
-    from wlr_gym.cli.export import wall_time
+    from wlr_gym.learning.curves import wall_time
 
-    assert wall_time(clock) == seconds
+    assert wall_time({"seconds": now} for now in clock) == seconds
 
 
 def test_training_commands_are_told_without_the_machine():

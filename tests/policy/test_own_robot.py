@@ -11,7 +11,7 @@ from wlr_gym.base.paths import find_config
 from wlr_gym.cli.deploy import DeployOptions, driven_robot
 from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.describe import contract
-from wlr_gym.learning.evaluation import common_robot, read_subjects
+from wlr_gym.learning.evaluation.subjects import common_robot, read_subjects
 from wlr_gym.learning.sweep.plan import SweepPlan, resolve
 from wlr_gym.learning.training import with_robot
 from wlr_gym.policy import environment_for, load_policy, make_policy, policy_environment, write_contract

@@ -9,7 +9,7 @@ pytest.importorskip("serial")
 from policy_log import act_again
 
 from wlr_gym.hardware.deployment import deploy
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import make_policy
 
 ID = "WLR-Velocity-v0"

@@ -14,7 +14,7 @@ import onnx
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import contract_of, find_policy, make_policy, policy_environment
 from wlr_gym.policy.export import file_hash, reseal
 from wlr_gym.policy.onnx_file import seal

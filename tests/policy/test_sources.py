@@ -12,7 +12,7 @@ from wlr_gym.envs.core import make_task
 from wlr_gym.envs.settings import EnvironmentOptions
 from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.envs.tasks.task import read_task
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import agents as sources
 from wlr_gym.policy import (
     contract_of,
@@ -151,7 +151,7 @@ def test_what_is_no_policy(tmp_path):
         (tmp_path, r"no policy there"),
         (tmp_path / "notes.txt", r"expected a folder, or a file \.onnx"),
         (tmp_path / "none.onnx", r"none\.onnx' is no policy"),
-        ("do_nothin", r"did you mean 'do_nothing'"),
+        ("do_nothin", r"neither a folder, .* nor a shipped policy \(did you mean 'do_nothing'"),
     ):
         with pytest.raises(InputError, match=message):
             policy_environment(source)

@@ -3,8 +3,6 @@
 A job is a module that is run with a task (JSON) on its standard input, and says in lines of JSON on its standard output what it
 has to say; the last line is ``{"error": ""}``. Whatever else it prints goes to its log. Its input stays open as long as
 somebody waits for it. When that ends, for whatever reason, the job gets SIGTERM and ends in good order.
-
-:func:`follow` and what it uses need the standard library only: a cluster carries them to nodes that may have nothing else.
 """
 
 from __future__ import annotations

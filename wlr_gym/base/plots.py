@@ -11,6 +11,7 @@ from wlr_gym.base.files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 BLUE, ORANGE, GREEN, WINE, SKY = "#1f4e9c", "#e06c00", "#2e9e6b", "#6d1a36", "#8cc8f0"
@@ -44,6 +45,14 @@ def tidy(axes: Axes, grid: Literal["both", "x", "y"] = "both") -> None:
             locator.set_params(steps=[1, 2, 5, 10])
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+
+
+def log_axis(axis: Axis) -> None:
+    """Write the numbers of a logarithmic axis without powers."""
+    from matplotlib.ticker import LogLocator
+
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
 
 
 def text_colour(background: Sequence[float]) -> Literal["black", "white"]:

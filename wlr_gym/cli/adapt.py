@@ -21,7 +21,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
 from wlr_gym.base.text import duration, pairs
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PORT, Count, JsonOption, PatchOption, Seed, SensorsOption, handed, refuse_given
+from wlr_gym.cli.options import PORT, Count, JsonOption, PatchOption, Seed, SensorsOption, refuse_given
 from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
 from wlr_gym.policy import policy_environment
 from wlr_gym.robot import load_robot
@@ -82,7 +82,7 @@ def run(options: AdaptOptions) -> int:
     Raises:
         InputError: bad options, runs of another robot, a policy that does not fit, a folder of another command.
     """
-    from wlr_gym.learning.adaptation import adapt
+    from wlr_gym.learning.adaptation import Asked, adapt
     from wlr_gym.learning.adaptation.state import NUMBERS_FILE
 
     _check(options)
@@ -90,12 +90,12 @@ def run(options: AdaptOptions) -> int:
     real = _real(options, console) if options.hardware is not None else None
     try:
         with progress(console) as tell:
-            own = {
+            own = {name: getattr(options, name) for name in Asked.model_fields if hasattr(options, name)} | {
                 "driven": real, "effects": options.patch() if options.emulated else None, "environment": options.env,
                 "excitations": options.excitation, "sensors": options.present() or (),
                 "threads": options.threads or os.cpu_count() or 1, "tell": partial(tell, ""),
             }  # fmt: skip
-            found = adapt(**handed(options, adapt, **own))
+            found = adapt(out=options.out, **own)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted; the same command goes on where it was") from None
     content = json.loads((found.page.parent / NUMBERS_FILE).read_text(encoding="utf-8"))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -34,44 +35,14 @@ from wlr_gym.cli.options import (
 from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.envs.registry import task_name_of
 from wlr_gym.envs.tasks.task import having
-from wlr_gym.learning.evaluation import (
-    FIRST_SEED,
-    MAIN,
-    OTHER_PLANT,
-    Card,
-    Condition,
-    Rollout,
-    Subject,
-    common_robot,
-    comparison_rows,
-    make_player,
-    read_subjects,
-    record_episodes,
-    rows,
-    seed_rows,
-    sweep_rows,
-    sweeps_for,
-    transfer_rows,
-    write_card,
-    write_episodes,
-    write_samples,
-)
-from wlr_gym.learning.evaluation.card import content
-from wlr_gym.learning.evaluation.scoring import (
-    ACCEPTANCE_BLOCKS,
-    ACCEPTANCE_EPISODES,
-    ACCEPTANCE_FILE,
-    BACKENDS,
-    BASELINES,
-    OTHER_EPISODES,
-    SWEEP_EPISODES,
-    accept,
-    acceptance_rows,
-    evaluate,
-    fitting_baselines,
-    write_acceptance,
-)
-from wlr_gym.physics.effects import Patch
+from wlr_gym.learning.evaluation import card as cards
+from wlr_gym.learning.evaluation import scoring
+from wlr_gym.learning.evaluation.card import MAIN, Card
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, sweeps_for
+from wlr_gym.learning.evaluation.episode_recorder import record_episodes, write_samples
+from wlr_gym.learning.evaluation.rollout import Rollout
+from wlr_gym.learning.evaluation.scoring import BACKENDS, BASELINES, accept, evaluate
+from wlr_gym.learning.evaluation.subjects import Subject, common_robot, make_player, read_subjects
 from wlr_gym.policy import shipped_names, trained_environment
 from wlr_gym.render.video import check_video
 from wlr_gym.robot import robot_content
@@ -104,12 +75,12 @@ class EvaluateOptions(ProgressOption, JsonOption, ForceOption, PatchOption, Sens
     """Seed of the first episode; the others count up from it, each further one of --blocks from 10000 above the last one."""
     backend: str | None = None
     """Simulator: gibbs_appell, mujoco, or both (the second for the main table only); default: the first, with --full both."""
-    other_episodes: Count = OTHER_EPISODES
+    other_episodes: Count = scoring.OTHER_EPISODES
     """Episodes in the second simulator."""
     sweep: tuple[str, ...] | None = None
     """Sweeps: friction, split, floors, slope, grip, shapes, paper, latency, payload; default: none, with --full all that suit
     the task."""
-    sweep_episodes: Count = SWEEP_EPISODES
+    sweep_episodes: Count = scoring.SWEEP_EPISODES
     """Episodes per point of a sweep."""
     randomization: str | None = None
     """Name in configs/randomization/, path, or a gap result (.json); default: the task's."""
@@ -146,9 +117,17 @@ def run(options: EvaluateOptions) -> int:
     if options.out is not None:
         options.refuse_results(options.out, "card.json")
     with output_folder(options.out):
-        card, samples = _play(options, patch)
+        first: list[Rollout] = []  # the first block of the first subject
+
+        def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
+            if not first:
+                first.append(rollout)
+
+        with _progress(options.progress) as tell:
+            own = {"env_id": options.env, "sweeps": options.sweep, "sensors": options.present(), "effects": patch}
+            card = evaluate(**handed(options, evaluate, **own, tell=tell, watch=watch))
     if options.json:
-        print_json(content(card))
+        print_json(cards.content(card))
     else:
         print_card(card)
     robot = options.robot or common_robot(subjects)
@@ -158,12 +137,21 @@ def run(options: EvaluateOptions) -> int:
     }  # fmt: skip
     if options.out is not None:
         driven = {} if robot is None else {"robot": robot_content(robot)}
-        _write(options.out, card, samples, options.seed)
+        _write(options.out, card, first[0], options.seed)
         record_provenance(options.out, settings_of(options) | driven | {"effects": patch.content()["effects"]}, options.seed)
         if options.record:
-            _record(options, _shown(card, subjects[0]), options.out / "runs", keywords)
+            source, folder = _shown(card, subjects[0]).sources[0], options.out / "runs"
+            core, policy = make_player(str(options.env), source, options.record, keywords)
+            with closing(core):
+                written = record_episodes(core, policy, folder, options.seed)
+            print(f"written: {len(written)} runs in {folder}")
     if options.video is not None:
-        _film(options, [_shown(card, subject) for subject in subjects[:2]], options.video, keywords)
+        from wlr_gym.learning.evaluation.film import film_beside
+
+        shown = [_shown(card, subject) for subject in subjects[:2]]
+        drawn = partial(tracked, text="drawing", console=Console(), shown=options.progress)
+        film_beside(options.video, str(options.env), shown, options.seed, options.video_seconds, keywords, watch=drawn)
+        print(f"written: {options.video}")
     return OK
 
 
@@ -176,22 +164,23 @@ def _accept(options: EvaluateOptions) -> int:
     )
     _subjects(options)
     if options.out is not None:
-        refuse_existing(options.out / ACCEPTANCE_FILE, options.force)
+        refuse_existing(options.out / scoring.ACCEPTANCE_FILE, options.force)
     with output_folder(options.out), _progress(options.progress) as tell:
         own = {
             "policy": options.policy[0], "env_id": options.env, "references": options.baselines,
             "floors": None if options.randomization is None else (options.randomization,),
-            "episodes": ACCEPTANCE_EPISODES if options.episodes is None else options.episodes,
-            "blocks": ACCEPTANCE_BLOCKS if options.blocks is None else options.blocks,
-            "sensors": options.present(), "effects": options.patch(), "tell": tell,
+            "episodes": scoring.ACCEPTANCE_EPISODES if options.episodes is None else options.episodes,
+            "blocks": scoring.ACCEPTANCE_BLOCKS if options.blocks is None else options.blocks,
+            "sensors": options.present(), "effects": options.patch(), "threads": options.threads, "tell": tell,
         }  # fmt: skip
         result = accept(**handed(options, accept, **own))
     if options.json:
         print_json(result)
-    _print(f"acceptance of {result.policy}: {result.blocks} x {result.episodes} episodes a family", acceptance_rows(result))
+    title = f"acceptance of {result.policy}: {result.blocks} x {result.episodes} episodes a family"
+    _print(title, scoring.acceptance_rows(result))
     if options.out is not None:
-        write_acceptance(options.out / ACCEPTANCE_FILE, result)
-        print(f"written: {options.out / ACCEPTANCE_FILE}")
+        scoring.write_acceptance(options.out / scoring.ACCEPTANCE_FILE, result)
+        print(f"written: {options.out / scoring.ACCEPTANCE_FILE}")
     print("accepted" if result.accepted else f"refused: {len(result.refused)} losses may be above {result.largest_loss:g} %")
     return OK if result.accepted else FAILED
 
@@ -223,7 +212,7 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
     }
     if options.baselines is None:
         names = FULL_BASELINES if full else BASELINES
-        fitting = fitting_baselines(environment, names)
+        fitting = scoring.fitting_baselines(environment, names)
         if len(fitting) < len(names):
             print(f"no baseline here, made for other tasks: {', '.join(name for name in names if name not in fitting)}")
         shipped = shipped_names() if full else ()  # reading them needs onnxruntime
@@ -240,20 +229,6 @@ def _check(options: EvaluateOptions) -> None:
     if options.video is not None:
         check_video(options.video)
         refuse_existing(options.video, options.force, "--video")
-
-
-def _play(options: EvaluateOptions, patch: Patch) -> tuple[Card, Rollout]:
-    """Play everything; returns the card, and the first block of the first subject."""
-    first: list[Rollout] = []
-
-    def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
-        if not first:
-            first.append(rollout)
-
-    with _progress(options.progress) as tell:
-        own = {"env_id": options.env, "sweeps": options.sweep, "sensors": options.present(), "effects": patch}
-        card = evaluate(**handed(options, evaluate, **own, tell=tell, watch=watch))
-    return card, first[0]
 
 
 @contextmanager
@@ -274,48 +249,24 @@ def _write(folder: Path, card: Card, samples: Rollout, seed: int) -> None:
     from wlr_gym.learning.evaluation.plots import draw_card
 
     pictures = draw_card(folder, card)
-    write_card(folder, card, pictures)
-    write_episodes(folder / "episodes.parquet", card, seed)
+    cards.write_card(folder, card, pictures)
+    cards.write_episodes(folder / "episodes.parquet", card, seed)
     write_samples(folder / "samples.csv", samples)
     names = ("card.md", "card.json", "episodes.parquet", "samples.csv", *pictures.values())
     print(f"written to {folder}: {', '.join(names)}")
 
 
-def _record(options: EvaluateOptions, subject: Subject, folder: Path, keywords: Mapping[str, Any]) -> None:
-    """Write the first episodes of the policy as runs."""
-    core, policy = make_player(str(options.env), subject.sources[0], options.record, keywords)
-    with closing(core):
-        written = record_episodes(core, policy, folder, options.seed)
-    print(f"written: {len(written)} runs in {folder}")
-
-
-def _film(options: EvaluateOptions, subjects: Sequence[Subject], path: Path, keywords: Mapping[str, Any]) -> None:
-    """Write the first episode of up to two subjects, side by side."""
-    from wlr_gym.learning.evaluation.film import film_beside
-
-    film_beside(
-        path,
-        str(options.env),
-        subjects,
-        options.seed,
-        options.video_seconds,
-        keywords,
-        watch=lambda pictures, count: tracked(pictures, count, "drawing", Console(), options.progress),
-    )
-    print(f"written: {path}")
-
-
 def print_card(card: Card) -> None:
     """Print the tables of a card, intervals as ± half of their width."""
     for name, seeds in card.seed_scores.items():
-        _print(f"training seeds of {name}, median seed {seeds.median_seed}", seed_rows(card, name, short=True))
-    _print("mean over episodes ± half of the 95 % confidence interval", rows(card.scores[MAIN], card.metrics, short=True))
+        _print(f"training seeds of {name}, median seed {seeds.median_seed}", cards.seed_rows(card, name, short=True))
+    _print("mean over episodes ± half of the 95 % confidence interval", cards.rows(card.scores[MAIN], card.metrics, short=True))
     if len(card.names) > 1:
-        _print(f"{card.names[0]} is better by, paired episode by episode", comparison_rows(card, short=True))
+        _print(f"{card.names[0]} is better by, paired episode by episode", cards.comparison_rows(card, short=True))
     for index, sweep in enumerate(card.sweeps):
-        _print(f"sweep {sweep.name}: tracking error", sweep_rows(card, index))
-    if OTHER_PLANT in card.results:
-        _print("on both simulators, same episodes", transfer_rows(card, short=True))
+        _print(f"sweep {sweep.name}: tracking error", cards.sweep_rows(card, index))
+    if cards.OTHER_PLANT in card.results:
+        _print("on both simulators, same episodes", cards.transfer_rows(card, short=True))
 
 
 def _print(title: str, table: Sequence[Sequence[str]]) -> None:

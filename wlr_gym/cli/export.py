@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -210,7 +209,7 @@ def real_observations(source: Path) -> NDArray[np.float32]:
 
 def training_facts(folder: Path) -> dict[str, Any]:
     """Return what the run folder around a policy says of its training, as far as it does: command, git commit, wall time."""
-    from wlr_gym.learning.evaluation import read_curve
+    from wlr_gym.learning.curves import read_curve, wall_time
 
     facts: dict[str, Any] = {}
     origin, curve = folder.parent / PROVENANCE_FILE, folder.parent / "learning_curve.csv"
@@ -218,13 +217,8 @@ def training_facts(folder: Path) -> dict[str, Any]:
         saved = read_yaml(origin) or {}
         facts |= {"command": portable(saved.get("command", "")), "git_commit": saved.get("git_commit")}
     if curve.is_file() and (rows := read_curve(curve)):
-        facts["seconds"] = wall_time([row["seconds"] for row in rows])
+        facts["seconds"] = wall_time(rows)
     return facts
-
-
-def wall_time(clock: Sequence[float]) -> float:
-    """Return the time a run took (s), from a clock that started anew each time the run was resumed."""
-    return sum(now for now, later in pairwise([*clock, 0.0]) if later < now)
 
 
 def portable(command: str) -> str:

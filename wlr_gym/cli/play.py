@@ -29,7 +29,7 @@ from wlr_gym.cli.options import (
 )
 from wlr_gym.cli.terminal import print_json
 from wlr_gym.policy import Policy, environment_for, make_policy
-from wlr_gym.render.teleop import HELP, Gamepad, Keyboard, Ranges, Script
+from wlr_gym.render.teleop import Gamepad, Keyboard, Ranges, Script
 from wlr_gym.render.video import check_video
 from wlr_gym.render.view import CAMERAS, LARGEST, SMALLEST, View, fits, require_display
 from wlr_gym.render.web.page import HOST, PORT
@@ -94,7 +94,7 @@ class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
 def run(options: PlayOptions) -> int:
     """Play, until the window is closed or the video is written."""
     from wlr_gym.envs.tasks.task import having
-    from wlr_gym.learning.evaluation import make_core
+    from wlr_gym.learning.evaluation.rollout import make_core
 
     _check(options)
     keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
@@ -105,16 +105,12 @@ def run(options: PlayOptions) -> int:
     with closing(make_core(environment_of(options.env, options.agent), 1, own)) as core:
         policy = make_policy(options.agent, core.contract())
         driver = _driver(options, core)
-        if options.video is None and not options.web:
-            require_display()  # after all names, which are checked first
-        if options.beside is not None:
-            _film_beside(options, keywords)
-        elif options.video is not None:
-            _film(options, core, policy, driver)
-        else:
-            show(options, core, policy, driver, _web_viewer if options.web else _window_viewer)
         if options.video is not None:
-            _print_film(options, core)
+            _film(options, options.video, core, keywords)
+        else:
+            if not options.web:
+                require_display()  # after all names, which are checked first
+            show(options, core, policy, driver)
     return OK
 
 
@@ -122,7 +118,12 @@ def _check(options: PlayOptions) -> None:
     require_simulator(options.backend, "a real robot is driven with wlr deploy; wlr play takes a simulator")
     if options.gamepad and (options.command is not None or options.video is not None):
         raise InputError("--gamepad drives in the window: leave out --command and --video")
-    _check_view(options)
+    check_name("view", options.camera, CAMERAS, "--camera")
+    size = f"--size {options.size[0]} {options.size[1]}"
+    if not all(map(fits, options.size)):
+        raise InputError(f"{size}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
+    if options.video is not None and options.video.suffix.lower() == ".mp4" and any(pixels % 2 for pixels in options.size):
+        raise InputError(f"{size}: expected even numbers: .mp4 has no others")
     if options.beside is not None and options.video is None:
         raise InputError("--beside: two robots are shown in a video only: add --video")
     if options.json and options.video is None:
@@ -132,15 +133,6 @@ def _check(options: PlayOptions) -> None:
     if options.video is not None:
         check_video(options.video)
         refuse_existing(options.video, options.force, "--video")
-
-
-def _check_view(options: PlayOptions) -> None:
-    check_name("view", options.camera, CAMERAS, "--camera")
-    size = f"--size {options.size[0]} {options.size[1]}"
-    if not all(map(fits, options.size)):
-        raise InputError(f"{size}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
-    if options.video is not None and options.video.suffix.lower() == ".mp4" and any(pixels % 2 for pixels in options.size):
-        raise InputError(f"{size}: expected even numbers: .mp4 has no others")
 
 
 def _view(options: PlayOptions) -> View:
@@ -176,71 +168,48 @@ def _check_commands(script: Script, ranges: Ranges, robot: Robot) -> None:
         )
 
 
-def _film(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None) -> None:
-    from wlr_gym.learning.evaluation.film import film, film_length
-    from wlr_gym.render import write_video
+def _film(options: PlayOptions, video: Path, core: Core, keywords: dict[str, Any]) -> None:
+    """Film the policy, beside a second one where there is one, and say what was written."""
+    from wlr_gym.learning.evaluation.film import film_beside, film_length
+    from wlr_gym.learning.evaluation.subjects import read_subjects
 
-    assert options.video is not None
-    seconds = _seconds(options)
+    seconds = SECONDS if options.seconds is None else options.seconds
     count, _, fps = film_length(core, seconds, options.fps)
-    title = f"{options.agent} on {core.plant.capabilities.name}"
-    pictures = film(core, policy, options.seed, seconds, view=_view(options), driver=driver, title=title, fps=options.fps)
-    write_video(options.video, tracked(pictures, count, "drawing", Console()), fps, count)
-
-
-def _seconds(options: PlayOptions) -> float:
-    return SECONDS if options.seconds is None else options.seconds
-
-
-def _print_film(options: PlayOptions, core: Core) -> None:
-    from wlr_gym.learning.evaluation.film import film_length
-
-    count, _, fps = film_length(core, _seconds(options), options.fps)
-    print(f"written: {options.video} ({count} pictures, {count / fps:g} s)")
-    if options.json:
-        print_json({"video": options.video, "pictures": count, "seconds": count / fps})
-
-
-def _film_beside(options: PlayOptions, keywords: dict[str, Any]) -> None:
-    from wlr_gym.learning.evaluation import read_subjects
-    from wlr_gym.learning.evaluation.film import film_beside
-
-    assert options.video is not None
-    assert options.beside is not None
     film_beside(
-        options.video,
+        video,
         environment_of(options.env, options.agent),
-        read_subjects([options.agent, options.beside]),
+        read_subjects([options.agent, *filter(None, [options.beside])]),
         options.seed,
-        _seconds(options),
+        seconds,
         keywords,
         view=_view(options),
         schedule=options.command,
+        title=f"{options.agent} on {core.plant.capabilities.name}" if options.beside is None else "",
         fps=options.fps,
         watch=lambda pictures, count: tracked(pictures, count, "drawing", Console()),
     )
+    print(f"written: {video} ({count} pictures, {count / fps:g} s)")
+    if options.json:
+        print_json({"video": video, "pictures": count, "seconds": count / fps})
 
 
-def _window_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> Viewer:
-    from wlr_gym.render.viewer import Viewer
+def _viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> Viewer | WebViewer:
+    """Return the page, or the window, and say what its keys do."""
+    if options.web:
+        from wlr_gym.render.web.player import HELP, WebViewer
 
-    if on_key is not None:
-        print(HELP)
-    return Viewer(robot, _view(options), on_key)
+        viewer = WebViewer(robot, _view(options), on_key, options.host, options.port)
+    else:
+        from wlr_gym.render.teleop import HELP
+        from wlr_gym.render.viewer import Viewer
 
-
-def _web_viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> WebViewer:
-    from wlr_gym.render.web.player import HELP, WebViewer
-
-    viewer = WebViewer(robot, _view(options), on_key, options.host, options.port)
+        viewer = Viewer(robot, _view(options), on_key)
     if on_key is not None:
         print(HELP)
     return viewer
 
 
-def show(
-    options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, new_viewer: NewViewer = _window_viewer
-) -> None:
+def show(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, new_viewer: NewViewer = _viewer) -> None:
     """Play in a window until it is closed, on a page until Ctrl-C, or for ``options.seconds``; ``new_viewer`` makes either."""
     from wlr_gym.learning.evaluation.film import commands, drive, present_time
 

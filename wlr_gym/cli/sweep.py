@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,11 @@ from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import Count, JsonOption, ray_address, refuse_given
 from wlr_gym.cli.terminal import print_json
+from wlr_gym.learning.sweep.book import SweepResult
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
-from wlr_gym.learning.sweep.results import PAGE_FILE, TABLE_FILE, name_of
-from wlr_gym.learning.sweep.running import SweepResult, resume_sweep, start_sweep
+from wlr_gym.learning.sweep.results import PAGE_FILE, TABLE_FILE, words
+from wlr_gym.learning.sweep.running import resume_sweep, start_sweep
+from wlr_gym.policy.agents import apply_changes
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def _plan(options: SweepOptions) -> SweepPlan:
     changes |= {name: value for name, value in given.items() if value is not None}
     changes |= _settings(options.set)
     if options.robot is not None:
-        _nest(changes["settings"], ["environment", "robot"], options.robot)
+        apply_changes(changes["settings"], [f"environment.robot={json.dumps(options.robot)}"])
     if not options.what.endswith((".yaml", ".yml")):
         changes["environment"] = options.what
     elif options.search is not None:
@@ -101,16 +104,8 @@ def _settings(words: tuple[str, ...]) -> Mapping[str, Any]:
         if len(values) > 1:
             space[name] = values
         else:
-            _nest(settings, name.split("."), values[0])
+            apply_changes(settings, [f"{name}={json.dumps(values[0], default=str)}"])
     return {"settings": settings, "space": space}
-
-
-def _nest(settings: dict[str, Any], path: list[str], value: Any) -> None:
-    for part in path[:-1]:
-        settings = settings.setdefault(part, {})
-        if not isinstance(settings, dict):
-            raise InputError(f"--set {'.'.join(path)}: '{part}' is a value, not a group")
-    settings[path[-1]] = value
 
 
 def _report(found: SweepResult, as_json: bool) -> int:
@@ -120,7 +115,7 @@ def _report(found: SweepResult, as_json: bool) -> int:
         return FAILED if found.failed else OK
     if found.ranking:
         best = found.ranking[0]
-        _say(f"best: {name_of(best.settings)}: {number(best.mean)} over {counted(len(best.values), 'seed')}")
+        _say(f"best: {words(best.settings)}: {number(best.mean)} over {counted(len(best.values), 'seed')}")
         _say(f"score it: wlr evaluate {best.policies}")
     _say(f"table: {found.folder / TABLE_FILE}\npage: {found.folder / PAGE_FILE}")
     if found.failed:

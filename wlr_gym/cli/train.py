@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption, PatchOption, ProgressOption, Seed, environment_of, refuse_given
 from wlr_gym.cli.terminal import print_json
-from wlr_gym.learning.training import resume_training, run_training, settings_of, unused, with_robot
+from wlr_gym.learning.training import resume_training, run_training, settings_of
 from wlr_gym.policy import Training, TrainingProgress, find_policy
 
 
@@ -69,11 +68,20 @@ def run(options: TrainOptions) -> int:
         environment = (
             options.env or "WLR-Velocity-v0" if options.init is None else environment_of(options.env, find_policy(options.init))
         )
-        config = _config(options, environment)
-        folder = unused(options.out or default_folder(options, environment, config))
+        added: dict[str, Any] = {} if options.backend is None else {"backend": options.backend}
+        if patch := options.patch():  # its content, so that the run folder says what was added
+            added["effects"] = patch.content()["effects"]
+        given = {"changes": options.set, "settings": {"environment": added} if added else None, "seed": options.seed}
+        config = settings_of(environment, options.config, options.agent, options.init, robot=options.robot, **given)
+        folder = options.out or default_folder(options, environment, config)
         training = Training(environment, folder, config, False, seconds, options.progress, options.init, updates.append)
         policy = run_training(options.agent, training)
-    _print_end(updates, options)
+    if updates and updates[0].steps < updates[0].total_steps:  # it looks finished otherwise
+        last = updates[0]
+        print(
+            f"stopped after {options.max_minutes:g} min at step {last.steps:,} of {last.total_steps:,}; "
+            f"go on with: wlr train --resume {last.folder}"
+        )
     best = policy.with_name("best")
     if options.json:
         print_json({"environment": environment, "policy": policy, "best": best if best.is_dir() else None})
@@ -84,28 +92,7 @@ def run(options: TrainOptions) -> int:
     return OK
 
 
-def _print_end(updates: Iterable[TrainingProgress], options: TrainOptions) -> None:
-    """Say at which update the limit of time stopped a training, which looks finished otherwise."""
-    for one in updates:
-        if one.steps < one.total_steps:
-            print(
-                f"stopped after {options.max_minutes:g} min at step {one.steps:,} of {one.total_steps:,}; "
-                f"go on with: wlr train --resume {one.folder}"
-            )
-
-
 def default_folder(options: TrainOptions, environment: str, config: dict[str, Any]) -> Path:
     """Return the run folder of a training without ``--out``: its environment, settings and seed."""
     settings = Path(options.config or options.init or options.agent).stem
     return Path("runs_out") / f"{environment.rpartition(':')[2]}_{settings}_{config.get('seed', 0)}"
-
-
-def _config(options: TrainOptions, environment: str) -> dict[str, Any]:
-    config = settings_of(environment, options.config, options.agent, options.init, options.set)
-    if options.seed is not None:
-        config["seed"] = options.seed
-    if options.backend is not None:
-        config["environment"] = (config.get("environment") or {}) | {"backend": options.backend}
-    if patch := options.patch():  # its content, so that the run folder says what was added
-        config["environment"] = (config.get("environment") or {}) | {"effects": patch.content()["effects"]}
-    return with_robot(config, options.robot)

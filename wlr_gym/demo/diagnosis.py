@@ -81,7 +81,7 @@ def drive(demo: Demo, tell: Tell) -> Section:
 
 def _deploy(demo: Demo, patch: Any, seed: int) -> None:
     from wlr_gym.hardware.deployment import deploy
-    from wlr_gym.learning.evaluation import make_core
+    from wlr_gym.learning.evaluation.rollout import make_core
     from wlr_gym.policy import environment_for, make_policy
 
     hardware = {"emulated": True, "log": demo.measured, "effects": patch}

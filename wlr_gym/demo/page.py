@@ -17,7 +17,7 @@ from wlr_gym.base.plots import save
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from wlr_gym.learning.evaluation import Subject
+    from wlr_gym.learning.evaluation.subjects import Subject
 
 ENVIRONMENT = "WLR-Velocity-v0"
 

@@ -13,12 +13,13 @@ from wlr_gym.base.html import heading, table
 from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, filmed, paragraph
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, plain, unit_of
-from wlr_gym.learning.evaluation import FIRST_SEED, MAIN, Card, Condition, Subject, play, work
-from wlr_gym.learning.evaluation.card import rows
+from wlr_gym.learning.evaluation.card import MAIN, Card, rows
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED, Condition, play
+from wlr_gym.learning.evaluation.subjects import Subject
 
 if TYPE_CHECKING:
-    from wlr_gym.learning.evaluation import Rollout
     from wlr_gym.learning.evaluation.metrics import Metric
+    from wlr_gym.learning.evaluation.rollout import Rollout
     from wlr_gym.policy import TrainingProgress
 
 LEARN_TITLE = "1. A policy learns"
@@ -29,7 +30,8 @@ BEST = 2.0
 
 def train(demo: Demo, tell: Tell) -> Section:
     """Train PPO, draw its learning curve."""
-    from wlr_gym.learning.evaluation import plots, read_curve
+    from wlr_gym.learning.curves import read_curve
+    from wlr_gym.learning.evaluation import plots
     from wlr_gym.policy import Training, load_agent, load_agent_config
 
     def on_update(done: TrainingProgress) -> None:
@@ -83,7 +85,8 @@ def behind(reward: float, references: Mapping[str, float]) -> list[str]:
 
 
 def _play_alone(source: str | Path, demo: Demo) -> Rollout:
-    from wlr_gym.learning.evaluation import make_player, roll_out
+    from wlr_gym.learning.evaluation.rollout import roll_out
+    from wlr_gym.learning.evaluation.subjects import make_player
 
     core, policy = make_player(ENVIRONMENT, source, demo.episodes, {"precision": "float32"})
     with closing(core):
@@ -160,12 +163,12 @@ def _play(demo: Demo, tell: Tell) -> Card:
         Condition(label, {"randomization": floor, "precision": "float32", **NO_CAMERA}, episodes=demo.episodes)
         for label, floor in ((MAIN, "ice"), (SPLIT, "split"))
     ]
-    total, done = work(conditions, subjects, 1000), 0
+    done = 0.0
 
-    def on_tick(text: str, cost: int) -> None:
+    def on_tick(text: str, share: float) -> None:
         nonlocal done
-        done += cost
-        tell(f"on ice: {text.partition(':')[0]}", 0.5 * min(1.0, done / total))
+        done += share
+        tell(f"on ice: {text.partition(':')[0]}", 0.5 * min(1.0, done))
 
     return Card(play(ENVIRONMENT, subjects, conditions, FIRST_SEED + demo.seed, on_tick))
 

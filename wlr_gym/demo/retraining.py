@@ -12,7 +12,7 @@ from wlr_gym.demo.diagnosis import POLICY
 from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, SKIPPED, Demo, Section, Tell, filmed, paragraph
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.gap.report.text import listed, places, plain
-from wlr_gym.learning.evaluation import Subject
+from wlr_gym.learning.evaluation.subjects import Subject
 
 TITLE = "6. What training on wins back"
 OLD, NEW = "old policy", "trained on"
@@ -28,7 +28,7 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     from wlr_gym.gap.report.result import RESULT_FILE, read_result
     from wlr_gym.learning.adaptation.adapt import state_uncertainty
     from wlr_gym.learning.adaptation.driving import AFTER, EmulatedRobot, drive_after, episodes_of, errors_of, seeds_of
-    from wlr_gym.learning.adaptation.retraining import train_on, trained_policy
+    from wlr_gym.learning.adaptation.retraining import TRAINING, train_in, trained_policy
     from wlr_gym.learning.adaptation.state import Asked, Progress
     from wlr_gym.physics.effects import load_patch
     from wlr_gym.robot import load_robot, robot_hash
@@ -53,7 +53,7 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     model, found = state_uncertainty(progress, Decided(history, result, demo.gap), own)
     if found is None:
         return Section(TITLE, "Left out: the gap workflow states no numbers to train on with.", _said(model), SKIPPED)
-    training = train_on(progress, found)
+    command = train_in(progress, TRAINING, found.training)
     progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING * share)
     after = drive_after(progress, EmulatedRobot(own, hidden), trained_policy(progress))
     progress.tell = lambda text, share: tell(text, _TRAINING + _DRIVING + _WITHOUT * share)
@@ -66,7 +66,7 @@ def retrain(demo: Demo, tell: Tell) -> Section:
         "the simulator with what the gap workflow found and calibrated, each number drawn from its interval. It is not told "
         "what was hidden."
     )
-    html += _said(model) + commands([training.command])
+    html += _said(model) + commands([command])
     html += paragraph(
         f"Then both drive the emulated robot with the hidden fault in turns: {demo.drives} episodes of "
         f"{demo.drive_seconds:g} s each, the same commands for both, none met in training; the old one also drives the robot "

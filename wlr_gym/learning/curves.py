@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError
@@ -25,6 +26,12 @@ def read_curve(path: Path) -> list[dict[str, float]]:
         return [{key: float(value) for key, value in row.items()} for row in table]
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{path}: not a learning curve: {error}") from None
+
+
+def wall_time(curve: Iterable[Mapping[str, float]]) -> float:
+    """Return the time a run took, s, by the ``seconds`` of its rows: a clock that starts anew each time the run is resumed."""
+    clock = [row["seconds"] for row in curve]
+    return sum(now for now, later in pairwise([*clock, 0.0]) if later < now)
 
 
 class CurveFile:

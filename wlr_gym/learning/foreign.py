@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.learning.evaluation.rollout import seen_observations
-from wlr_gym.learning.ppo.policy import ModulePolicy, acting_net
+from wlr_gym.learning.ppo.policy import ModulePolicy, acting_net, to_onnx
 from wlr_gym.policy.agents import FED_AS
 from wlr_gym.policy.export import Parity, write_policy_file
 from wlr_gym.policy.file import policy_content
@@ -72,13 +71,11 @@ def import_policy(
         MissingPackageError: a package is not installed.
     """
     require_package("onnxscript", "export")
-    from wlr_gym.learning.ppo.policy import to_onnx
-
     bare = getattr(env, "unwrapped", env)
     if not hasattr(bare, "contract") or not hasattr(bare, "core"):
         raise InputError(f"env = {env!r}: expected an environment of wlr_gym, made as it was for the training")
     contract = bare.contract()
-    width, actions = len(contract["observation"]), len(contract["action"])
+    width = len(contract["observation"])
     source = network if isinstance(network, torch.nn.Module) else sb3_network(Path(network))
     worn = _worn(env, bare)
     whole = _Whole(_normalizer(worn if normalizer is None else normalizer, width), source)
@@ -89,22 +86,18 @@ def import_policy(
     config = {"environment": {"task": dict(task or {})}}  # its robot is in the contract
     env_id = _id_of(bare)
     content = policy_content(AGENT, config, contract, {"environment": env_id})
-    with _acting(whole):
-        _check(whole, width, actions)
-        try:
-            graph = to_onnx(whole, width)
-        except torch.onnx.OnnxExporterError as error:
-            raise InputError(f"the network cannot be written as an ONNX graph: {_reason(error)}") from error
-        return write_policy_file(Path(out), graph, content, ModulePolicy(whole), _driven(bare, env_id, whole))
-
-
-@contextmanager
-def _acting(network: torch.nn.Module) -> Iterator[None]:
-    """Let a network act, not train, until the end of the block; then each of its modules is as it was."""
-    before = {module: module.training for module in network.modules()}
-    network.eval()
+    policy = ModulePolicy(whole)
+    before = {module: module.training for module in whole.modules()}
+    whole.eval()
     try:
-        yield
+        _check(whole, width, len(contract["action"]))
+        graph = to_onnx(whole, width)
+        definition = (bare.spec and bare.spec.kwargs.get("definition")) or task_source_of(env_id)
+        with closing(Core(definition, bare.core.settings, ROBOTS)) as core:
+            driven = seen_observations(core, policy, SECONDS)
+        return write_policy_file(Path(out), graph, content, policy, driven)
+    except torch.onnx.OnnxExporterError as error:
+        raise InputError(f"the network cannot be written as an ONNX graph: {_reason(error)}") from error
     finally:
         for module, training in before.items():
             module.training = training
@@ -141,13 +134,6 @@ def _id_of(bare: Any) -> str:
         if task == bare.task_name:
             return env_id
     raise InputError(f"env = {bare!r} has no id: register its task with register_task and make it with gymnasium.make")
-
-
-def _driven(bare: Any, env_id: str, network: torch.nn.Module) -> NDArray[np.float32]:
-    """Return observations (M, D) of robots that the network drives."""
-    source = (bare.spec and bare.spec.kwargs.get("definition")) or task_source_of(env_id)
-    with closing(Core(source, bare.core.settings, ROBOTS)) as core:
-        return seen_observations(core, ModulePolicy(network), SECONDS)
 
 
 def _check(network: _Whole, width: int, actions: int) -> None:
@@ -201,27 +187,22 @@ def _worn(env: Any, bare: Any) -> VecNormalize | None:
 
 
 def _normalizer(given: Any, width: int) -> torch.nn.Module:
-    if given is None:
-        return torch.nn.Identity()
+    """Return what observations go through: a module as it is; nothing, a ``VecNormalize`` or the path of one as a module."""
     if isinstance(given, torch.nn.Module):
         return given
-    found = given if isinstance(given, VecNormalize) else _saved_normalizer(Path(given))
-    if not found.norm_obs:
+    if isinstance(given, str | Path):
+        try:
+            given, path = pickle.loads(Path(given).read_bytes()), given
+        except Exception as error:  # pickle raises whatever the bytes lead it to
+            raise InputError(f"{given}: not a saved VecNormalize: {error}") from None
+        if not isinstance(given, VecNormalize):
+            raise InputError(f"{path}: holds {type(given).__name__}, expected a saved VecNormalize")
+    if given is None or not given.norm_obs:
         return torch.nn.Identity()
-    shape = getattr(getattr(found, "obs_rms", None), "mean", np.zeros(0)).shape
+    shape = getattr(getattr(given, "obs_rms", None), "mean", np.zeros(0)).shape
     if shape != (width,):
         raise InputError(f"normalizer: statistics of shape {shape}, expected ({width},) as the environment observes")
-    return _Standardise(found)
-
-
-def _saved_normalizer(path: Path) -> VecNormalize:
-    try:
-        found = pickle.loads(path.read_bytes())
-    except Exception as error:  # pickle raises whatever the bytes lead it to
-        raise InputError(f"{path}: not a saved VecNormalize: {error}") from None
-    if not isinstance(found, VecNormalize):
-        raise InputError(f"{path}: holds {type(found).__name__}, expected a saved VecNormalize")
-    return found
+    return _Standardise(given)
 
 
 # ---- Stable-Baselines3 ----

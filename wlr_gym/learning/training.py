@@ -68,35 +68,42 @@ def train(
         InputError: unknown environment, agent, policy or setting, a bad value, or a folder that is in use.
         KeyboardInterrupt: Ctrl-C or SIGTERM, after a checkpoint was saved.
     """
-    if not isinstance(settings, Mapping | None):
-        raise InputError(f"settings = {settings!r}: expected a mapping, such as {{'total_steps': 100_000}}")
-    chosen = merge_changes(settings_of(env_id, config, agent, init), for_task(settings or {}, task_name_of(env_id)))
-    if seed is not None:
-        chosen["seed"] = seed
-    if robot is not None:
-        chosen = with_robot(chosen, robot)
-    request = Training(env_id, unused(Path(out)), chosen, False, max_seconds, progress, init, on_update)
-    return run_training(agent, request)
+    chosen = settings_of(env_id, config, agent, init, settings=settings, seed=seed, robot=robot)
+    return run_training(agent, Training(env_id, Path(out), chosen, False, max_seconds, progress, init, on_update))
 
 
 def settings_of(
-    env_id: str, config: str | Path | None, agent: str, init: str | Path | None, changes: tuple[str, ...] = ()
+    env_id: str,
+    config: str | Path | None,
+    agent: str,
+    init: str | Path | None,
+    *,
+    changes: tuple[str, ...] = (),
+    settings: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    robot: RobotSource | None = None,
 ) -> dict[str, Any]:
-    """Return the settings of a training: of ``config``, of the policy to start from, or the agent's own.
+    """Return all settings of a training: of ``config``, of the policy to start from, or the agent's own, with what is changed.
 
     Args:
-        env_id, config, agent, init: as for :func:`train`.
-        changes: ``key=value`` laid over them.
+        env_id, config, agent, init, settings, seed, robot: as for :func:`train`.
+        changes: ``key=value``, laid over the settings before ``settings``.
 
     Raises:
-        InputError: unknown names, or a change that is not ``key=value``.
+        InputError: unknown names, or a change that is none.
     """
+    if not isinstance(settings, Mapping | None):
+        raise InputError(f"settings = {settings!r}: expected a mapping, such as {{'total_steps': 100_000}}")
+    task = task_name_of(env_id)
+    load_agent(agent)  # an unknown one is refused as that, not as settings
     if init is None or config is not None:
-        load_agent(agent)  # an unknown one is refused as that, not as settings
-        return load_agent_config(config or agent, changes, task_name_of(env_id))
-    chosen = {**agent_function(agent, "settings_to_start_from")(init), "tasks": {}}
-    apply_changes(chosen, changes)
-    return for_task(chosen, task_name_of(env_id))
+        chosen = load_agent_config(config or agent, changes, task)
+    else:
+        chosen = {**agent_function(agent, "settings_to_start_from")(init), "tasks": {}}
+        apply_changes(chosen, changes)
+        chosen = for_task(chosen, task)
+    chosen = merge_changes(chosen, for_task(settings or {}, task))
+    return with_robot(chosen if seed is None else chosen | {"seed": seed}, robot)
 
 
 def with_robot(settings: Mapping[str, Any], robot: RobotSource | None = None) -> dict[str, Any]:
@@ -105,9 +112,6 @@ def with_robot(settings: Mapping[str, Any], robot: RobotSource | None = None) ->
     Args:
         settings: of the agent.
         robot: instead of the one that they name; None = that one. Without any the settings stay as they are.
-
-    Raises:
-        InputError: no such robot, or one that cannot be simulated.
     """
     environment = settings.get("environment") or {}
     chosen = environment.get("robot") if robot is None and isinstance(environment, Mapping) else robot
@@ -162,13 +166,11 @@ def _extend(settings: dict[str, Any], total_steps: int) -> None:
 
 
 def run_training(agent: str, training: Training) -> Path:
-    """Train, and return the folder of the policy.
-
-    Raises:
-        InputError: the agent has nothing to learn, or a time limit that is none.
-    """
+    """Train, and return the folder of the policy."""
     if training.max_seconds is not None:
         check_number("max_seconds", training.max_seconds, "s", above=0)
+    if not training.resume:
+        require_empty(training.folder, "wlr train" if can_resume(training.folder) else "")
     check_environment_settings(training.config)
     return agent_function(agent, "train")(replace(training, config=with_robot(training.config)))
 
@@ -188,16 +190,6 @@ def check_environment_settings(settings: Mapping[str, Any]) -> None:
             raise InputError(f"unknown setting 'environment.{name}'{nearest(name, valid)}; valid: {', '.join(valid)}")
     if isinstance(environment, Mapping) and isinstance(backend := environment.get("backend"), str):
         check_simulator(backend)
-
-
-def unused(folder: Path) -> Path:
-    """Return a folder that a training may fill.
-
-    Raises:
-        InputError: something is in it.
-    """
-    require_empty(folder, "wlr train" if can_resume(folder) else "")
-    return folder
 
 
 def can_resume(folder: Path) -> bool:

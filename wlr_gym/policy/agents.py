@@ -12,7 +12,7 @@ import types
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast
 
 import numpy as np
 import yaml
@@ -124,11 +124,7 @@ def agent_names() -> list[str]:
 
 
 def load_agent(name: str) -> Agent:
-    """Import ``agents/<name>/agent.py`` by its place on disk.
-
-    Raises:
-        InputError: no such agent; the message lists those there are.
-    """
+    """Import ``agents/<name>/agent.py`` by its place on disk."""
     check_name("agent", name, agent_names())
     package = f"wlr_gym_agents_{name}"  # made for its folder, so that it can import its neighbours relatively
     if package not in sys.modules:
@@ -225,15 +221,6 @@ FED = ("observations", "observer", "controller", "action", "control_period")
 FED_AS = "fed_as"
 
 
-@runtime_checkable
-class HasContract(Protocol):
-    """An environment of this library."""
-
-    def contract(self) -> dict[str, Any]:
-        """Return what a policy must be fed and what its output means."""
-        ...
-
-
 def shipped_directory() -> Path:
     """Return the folder of the shipped policies, in a clone or a wheel."""
     return data_directory("agents") / "shipped"
@@ -245,14 +232,7 @@ def shipped_names() -> list[str]:
 
 
 def _policy_place(source: str | Path) -> Path | None:
-    """Return the policy folder or file of a trained policy.
-
-    Args:
-        source: policy folder, run folder with a ``policy`` in it, policy file, or name of a shipped policy.
-
-    Returns:
-        None where it is none of these.
-    """
+    """Return the folder or file of a policy that is given by it, by a run folder or by a shipped name; None = none of these."""
     path = Path(source)
     if path.suffix == SUFFIX and path.is_file():
         return path
@@ -302,16 +282,12 @@ def find_policy(source: str | Path, or_agent: bool = False) -> Path:
 
 
 def contract_of(source: str | Path) -> dict[str, Any]:
-    """Return the contract of a trained policy: what ``contract.json`` says, or the metadata of a policy file.
-
-    Raises:
-        InputError: no policy there, or broken.
-    """
+    """Return the contract of a trained policy: what ``contract.json`` says, or the metadata of a policy file."""
     place = find_policy(source)
     return open_policy(place)[1] if place.is_file() else read_contract(place)
 
 
-def load_policy(source: str | Path, environment: Contract | HasContract) -> Policy:
+def load_policy(source: str | Path, environment: Contract | Any) -> Policy:
     """Load a trained policy for an environment.
 
     Args:
@@ -324,7 +300,7 @@ def load_policy(source: str | Path, environment: Contract | HasContract) -> Poli
     place = find_policy(source)
     if not isinstance(environment, Mapping):
         bare = getattr(environment, "unwrapped", environment)
-        if not isinstance(bare, HasContract):
+        if not hasattr(bare, "contract"):
             raise InputError(f"environment = {environment!r}: expected one that was made, or what its contract() returns")
         environment = bare.contract()
     if place.is_file():
@@ -337,11 +313,7 @@ def load_policy(source: str | Path, environment: Contract | HasContract) -> Poli
 
 
 def make_policy(source: str | Path, environment: Contract) -> Policy:
-    """Return the policy of an agent's name (with its shipped settings), or a trained one; see :func:`load_policy`.
-
-    Raises:
-        InputError: neither an agent nor a policy, or a policy that does not fit the environment.
-    """
+    """Return the policy of an agent's name (with its shipped settings), or a trained one; see :func:`load_policy`."""
     if str(source) in agent_names():
         return agent_function(str(source), "make_policy")(environment, load_agent_config(source))
     find_policy(source, or_agent=True)
@@ -399,9 +371,6 @@ def environment_for(source: str | Path, given: Mapping[str, Any]) -> dict[str, A
     Args:
         source: as of :func:`make_policy`.
         given: keywords of the environment, such as ``{"randomization": "ice", "robot": None}``.
-
-    Raises:
-        InputError: neither an agent nor a policy, or a broken one.
     """
     own = policy_environment(source)
     if isinstance(own.get("task"), Mapping) and isinstance(given.get("task"), Mapping):
@@ -422,11 +391,7 @@ def fed_environment(environment: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def trained_environment(source: str | Path) -> str | None:
-    """Return the id of the environment that a policy was trained in; None for agents, which nobody trained.
-
-    Raises:
-        InputError: neither an agent nor a policy, or a broken one.
-    """
+    """Return the id of the environment that a policy was trained in; None for agents, which nobody trained."""
     if str(source) in agent_names():
         return None
     return contract_of(find_policy(source, or_agent=True)).get("training", {}).get("environment")

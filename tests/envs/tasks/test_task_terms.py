@@ -18,9 +18,8 @@ from wlr_gym.envs.tasks.signals import PlanarPose, Signals, true_pose
 from wlr_gym.envs.tasks.task import limits_of, scales_of, succeeded
 from wlr_gym.envs.tasks.terms import COMPUTED, MEASURES, REWARDS, ScalarTerm
 from wlr_gym.envs.tasks.terms.observations import ComputedTerm
-from wlr_gym.learning.evaluation import make_core
 from wlr_gym.learning.evaluation.metrics import errors_of
-from wlr_gym.learning.evaluation.rollout import Measure
+from wlr_gym.learning.evaluation.rollout import Measure, make_core
 from wlr_gym.policy import Policy, load_agent
 from wlr_gym.robot import JOINTS, load_robot
 

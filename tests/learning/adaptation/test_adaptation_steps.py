@@ -185,9 +185,10 @@ def episodes(stopped):
 def test_a_policy_that_the_supervision_stops_more_often_is_trained_again(tmp_path, monkeypatch, stops, trainings):
     done = {}
 
-    def train(progress, folder, config, family, rewards=None):
-        (folder / "policy").mkdir(parents=True, exist_ok=True)
-        done[folder.name] = rewards
+    def train(progress, name, family, rewards=None):
+        (progress.out / name / "policy").mkdir(parents=True, exist_ok=True)
+        done[name] = rewards
+        return f"wlr train --out {progress.out / name}"
 
     def watched(progress, found, own, policy):
         return episodes(stops if policy.endswith("training/policy") else 20)

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from wlr_gym.learning.evaluation import read_curve
+from wlr_gym.learning.curves import read_curve
 from wlr_gym.policy import Training, load_agent
 
 ENVIRONMENT = "WLR-Velocity-v0"

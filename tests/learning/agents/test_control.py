@@ -9,7 +9,8 @@ from studies.paper import corrected
 from studies.paper.quantities import PaperConstants, State
 from wlr_gym.base.errors import InputError
 from wlr_gym.learning import tuning
-from wlr_gym.learning.evaluation import make_core, roll_out, score
+from wlr_gym.learning.evaluation.card import score
+from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.learning.tuning import tracking_score
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 from wlr_gym.policy.control import PidConfig, task_settings

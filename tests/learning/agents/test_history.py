@@ -6,8 +6,9 @@ from policy_log import act_again
 from ppo_runs import ENVIRONMENT, train
 
 from wlr_gym.hardware.deployment import deploy
-from wlr_gym.learning.evaluation import make_core, play, read_subjects
-from wlr_gym.learning.evaluation.conditions import Condition
+from wlr_gym.learning.evaluation.conditions import Condition, play
+from wlr_gym.learning.evaluation.rollout import make_core
+from wlr_gym.learning.evaluation.subjects import read_subjects
 from wlr_gym.policy import contract_of, export_policy, make_policy, policy_environment
 
 pytest.importorskip("stable_baselines3")

@@ -11,8 +11,7 @@ from ppo_runs import train as train_plain
 
 import wlr_gym
 from wlr_gym.base.errors import InputError
-from wlr_gym.learning.evaluation import make_core
-from wlr_gym.learning.evaluation.rollout import seen_observations
+from wlr_gym.learning.evaluation.rollout import make_core, seen_observations
 from wlr_gym.policy import check_contract, export_policy, load_agent, load_policy, make_policy, read_contract
 from wlr_gym.policy.onnx_file import open_policy
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.learning.evaluation import make_core, roll_out, score
+from wlr_gym.learning.evaluation.card import score
+from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.learning.evaluation.subjects import make_player
 from wlr_gym.policy import load_agent, make_policy
 

@@ -18,7 +18,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import PACKAGE
 from wlr_gym.cli import main
 from wlr_gym.envs import Sb3VecEnv
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.learning.ppo.policy import parse_settings
 from wlr_gym.learning.ppo.training import TrainingLog, begin_episodes, make_model
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
@@ -48,13 +48,10 @@ def test_run_folder_is_complete(run):
     assert contract["training"] == {"environment": ENVIRONMENT, "steps": 384, "updates": 12, "seed": 0, "log_std": noise}
 
 
-def test_same_seed_gives_the_same_run_bit_for_bit(run, tmp_path):
+def test_same_seed_gives_the_same_run_bit_for_bit_and_another_one_another(run, tmp_path):
     again = train(tmp_path / "again")
     assert curve(tmp_path / "again") == curve(run)
     assert_same_weights(again, run / "policy")
-
-
-def test_another_seed_gives_another_run(run, tmp_path):
     train(tmp_path / "other", seed=1)
     assert curve(tmp_path / "other") != curve(run)
 
@@ -71,7 +68,7 @@ def test_training_changes_the_policy(run):
 def test_private_names_of_stable_baselines_are_used_in_one_module():
     names = r"\bmodel\._|_last_obs|_last_episode_starts|_n_updates|_setup_learn|_update_current|_get_samples|_build\b|_on_step"
     texts = {path.name: path.read_text(encoding="utf-8") for path in (PACKAGE / "learning").rglob("*.py")}
-    assert [name for name, text in texts.items() if re.search(names, text)] == ["sb3.py"]
+    assert [name for name, text in texts.items() if re.search(names, text)] == ["networks.py"]
 
 
 def test_plain_stable_baselines_loads_the_model(run):
@@ -236,12 +233,9 @@ def test_what_a_callback_raises_ends_the_run_with_a_checkpoint(run, tmp_path):
     assert_same_weights(train(tmp_path / "a", resume=True), run / "policy")
 
 
-def test_weights_that_are_not_finite_stop_the_run_with_a_dump(tmp_path):
-    with pytest.raises(RuntimeError, match=r"failure\.npz"):
+def test_weights_that_are_not_finite_stop_the_run(tmp_path):
+    with pytest.raises(RuntimeError, match=r"is not finite after \d+ steps"):
         train(tmp_path / "nan", learning_rate=1e30, final_learning_rate=1e30)
-    with np.load(tmp_path / "nan" / "failure.npz") as dump:
-        assert dump["new_obs"].shape[0] == 8
-        assert "parameters" in dump
 
 
 def test_time_limit_ends_in_good_order(tmp_path):

@@ -15,7 +15,8 @@ from ppo_runs import ENVIRONMENT, SETTINGS, assert_same_weights, curve, train, w
 import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
-from wlr_gym.learning.evaluation import make_core, read_curve
+from wlr_gym.learning.curves import read_curve
+from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.policy import Training, export_policy, load_agent, read_contract
 
 torch = pytest.importorskip("torch")

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from wlr_gym.learning.evaluation import Measure, Rollout
+from wlr_gym.learning.evaluation.rollout import Measure, Rollout
 
 TICKS, EPISODES, PERIOD = 50, 4, 0.02
 MEASURES = (Measure("velocity_error", "m/s", "speed", rms=0.02), Measure("yaw_rate_error", "rad/s", "turning", rms=0.06))

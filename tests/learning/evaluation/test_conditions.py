@@ -4,10 +4,20 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.learning.evaluation import Condition, Subject, identity, play, read_subjects, work
-from wlr_gym.learning.evaluation.conditions import BLOCK, SWEEPS, read_sweep, sweeps_for
-from wlr_gym.learning.evaluation.subjects import make_player
+from wlr_gym.learning.evaluation.conditions import (
+    BLOCK,
+    LEFT_FRICTION,
+    SLOPE_FRICTION,
+    SWEEPS,
+    Condition,
+    play,
+    read_sweep,
+    sweeps_for,
+)
+from wlr_gym.learning.evaluation.rollout import Rollout
+from wlr_gym.learning.evaluation.subjects import Subject, identity, make_player, read_subjects
 from wlr_gym.policy import agents as sources_module
+from wlr_gym.robot.parameter_table import ELEMENTS
 
 ID = "WLR-Velocity-v0"
 SHORT = {"episode_length": 0.2}
@@ -39,8 +49,8 @@ def test_every_subject_plays_every_condition_with_the_same_episodes(monkeypatch)
         assert rollout.seeds.tolist() == [100 + BLOCK * block + i for i in range(3)]
         assert np.array_equal(rollout.parameters, other.parameters)
         assert np.array_equal(rollout.command, other.command)
-    assert sum(cost for _, cost in told) == work(conditions, SUBJECTS, 10) == 3 * (2 + 1) * 2 * 10
-    assert ("idle: icy", 3) in told
+    assert sum(share for _, share in told) == pytest.approx(1.0)
+    assert ("idle: icy", pytest.approx(1 / (2 * 3 * 10))) in told
 
 
 def test_an_observation_of_ones_own_changes_nothing_but_the_observation(monkeypatch):
@@ -104,7 +114,7 @@ def test_all_policies_of_a_subject_play_all_blocks():
 
     results = play(ID, [both], [condition], 100, lambda text, cost: told.append(cost), watch)
     assert moved == [(block, 100 + BLOCK * block, moves) for moves in (True, False) for block in range(3)]
-    assert sum(told) == work([condition], [both], 50)
+    assert sum(told) == pytest.approx(1.0)
     rewards = results["main"]["both"].pairs["reward"][..., 0]
     alone = play(ID, [Subject("second", ("do_nothing",))], [condition], 100)["main"]["second"].pairs["reward"][..., 0]
     assert np.array_equal(rewards[1], alone[0])
@@ -173,3 +183,55 @@ def test_a_sweep_of_another_task_is_refused():
 def test_impossible_numbers_are_refused(numbers, message):
     with pytest.raises(InputError, match=message):
         Condition("main", **numbers)
+
+
+# ---- every sweep sets what its axis says, seen in what the robots were given ----
+
+LEFT, RIGHT = [0, 2], [1, 3]
+
+
+def given(name: str, task: str) -> list[tuple[float, Rollout]]:
+    """The first, middle and last point of a sweep: its value, and two episodes of two environment steps."""
+    sweep = SWEEPS[name]
+    chosen = [sweep.points[k] for k in (0, len(sweep.points) // 2, -1)]
+    conditions = {condition.label: condition for condition in sweep.conditions({"episode_length": 0.04}, 2)}
+    played: list[Rollout] = []
+    play(
+        f"WLR-{task}-v0",
+        SUBJECTS[:1],
+        [conditions[sweep.label(p)] for p in chosen],
+        watch=lambda *seen: played.append(seen[-1]),
+    )
+    return [(point.value, rollout) for point, rollout in zip(chosen, played, strict=True)]
+
+
+def parameter(rollout: Rollout, name: str) -> np.ndarray:
+    """All elements of a parameter (episodes, elements)."""
+    return rollout.parameters[:, [name in (element, element.partition("[")[0]) for element in ELEMENTS]]
+
+
+def test_friction_is_the_same_under_every_wheel():
+    for friction, rollout in given("friction", "Velocity"):
+        np.testing.assert_allclose(rollout.friction, friction)
+
+
+def test_split_is_the_ratio_of_right_to_left():
+    for ratio, rollout in given("split", "Velocity"):
+        np.testing.assert_allclose(rollout.friction[:, LEFT], LEFT_FRICTION)
+        np.testing.assert_allclose(rollout.friction[:, RIGHT], ratio * LEFT_FRICTION)
+
+
+@pytest.mark.parametrize("name", ["slope", "grip"])
+def test_slopes_are_so_much_less_steep_than_friction_holds(name):
+    for value, rollout in given(name, "Slope"):
+        friction, below = (SLOPE_FRICTION, value) if name == "slope" else (value, 2.0)
+        np.testing.assert_allclose(rollout.friction, friction)
+        steepness = np.degrees(parameter(rollout, "ground.slope[pitch]"))
+        np.testing.assert_allclose(steepness, np.degrees(np.arctan(friction)) - below)
+        assert (steepness > 0.0).all()  # as the task's own randomisation has it: uphill ahead
+
+
+@pytest.mark.parametrize(("name", "quantity"), [("latency", "command.delay"), ("payload", "payload.mass")])
+def test_delay_and_payload_are_what_the_axis_says(name, quantity):
+    for value, rollout in given(name, "Velocity"):
+        np.testing.assert_allclose(parameter(rollout, quantity), value)

@@ -12,7 +12,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.data import convert, read_dataset, read_run, simulate_again, simulated_parameters, write_run
 from wlr_gym.data.sensors import SENSED
-from wlr_gym.learning.evaluation import EpisodeRecorder
+from wlr_gym.learning.evaluation.episode_recorder import EpisodeRecorder
 from wlr_gym.robot.parameters import Parameters
 
 EVENTS = {

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from evaluation_examples import EPISODES, MEASURES, PERIOD, TICKS, measured, rollout
 
-from wlr_gym.learning.evaluation import Measure, metrics_of, score, summarise
-from wlr_gym.learning.evaluation.metrics import spectrum
+from wlr_gym.learning.evaluation.card import score
+from wlr_gym.learning.evaluation.metrics import metrics_of, spectrum, summarise
+from wlr_gym.learning.evaluation.rollout import Measure
 
 
 def test_perfect_driving():

@@ -12,9 +12,9 @@ import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.cli import evaluate, main
-from wlr_gym.learning.evaluation import MAIN, OTHER_PLANT, Card, Subject, read_subjects, summarise, write_card, write_episodes
-from wlr_gym.learning.evaluation.card import content, scores_of, seed_rows
-from wlr_gym.learning.evaluation.metrics import Bootstrap, interquartile_mean
+from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card, content, scores_of, seed_rows, write_card, write_episodes
+from wlr_gym.learning.evaluation.metrics import Bootstrap, interquartile_mean, summarise
+from wlr_gym.learning.evaluation.subjects import Subject, read_subjects
 from wlr_gym.policy import write_contract
 
 N = 48

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym import train
-from wlr_gym.learning.evaluation import read_curve
+from wlr_gym.learning.curves import read_curve
 
 ENVIRONMENT = "brief_task:WLR-Brief-v0"
 #: 8 robots, 8 ticks per update; scored every 4 updates, with a checkpoint every 2.

@@ -10,18 +10,15 @@ import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config
 from wlr_gym.cli import main, sweep
-from wlr_gym.learning.evaluation import make_core
+from wlr_gym.learning.evaluation.rollout import make_core
+from wlr_gym.learning.sweep.book import Book
 from wlr_gym.learning.sweep.plan import (
     SweepPlan,
-    known_settings,
-    label_of,
+    Trial,
     read_plan,
     resolve,
-    trial_of,
     trials_of,
-    whole_settings,
 )
-from wlr_gym.learning.sweep.running import _Book
 
 ENVIRONMENT = "WLR-Velocity-v0"
 ROOT = Path(__file__).resolve().parents[3]
@@ -33,10 +30,10 @@ def plan(**fields):
 
 def test_a_grid_is_all_combinations_with_all_seeds():
     whole = resolve(plan(space={"gamma": [0.9, 0.97], "environment.randomization": ["ice", None]}, seeds=[3, 4]))
-    trials = trials_of(known_settings(whole) or [], whole.seed_list)
+    trials = trials_of(whole.known_settings() or [], whole.seed_list)
     assert len(trials) == 8
     assert trials[3].name == "gamma=0.9,environment.randomization=null,seed=4"
-    settings = whole_settings(whole, trials[0])
+    settings = whole.settings_of(trials[0])
     assert (settings["gamma"], settings["seed"], settings["environment"]["randomization"]) == (0.9, 3, "ice")
     assert settings["environment"]["precision"] == "float32"
     assert whole.settings["environment"]["randomization"] != "ice"
@@ -50,23 +47,23 @@ def test_settings_for_one_task_count_there():
 def test_a_value_is_no_group(capsys, tmp_path):
     words = ["sweep", ENVIRONMENT, "--set", "environment=3", "environment.randomization=ice", "--out", str(tmp_path / "out")]
     assert main(words) == 2
-    assert "--set environment.randomization: 'environment' is a value, not a group" in capsys.readouterr().err
+    assert "setting 'environment.randomization=\"ice\"': 'environment' is a value, not a group" in capsys.readouterr().err
 
 
 def test_what_a_folder_keeps_is_the_whole_plan():
     whole = resolve(plan(config="ppo_blind", settings={"total_steps": 1000}, space={"gamma": [0.9, 0.97]}))
     again = parse_config(SweepPlan, whole.model_dump(mode="json"), "again")
     assert again.config is None
-    assert whole_settings(again, trial_of({"gamma": 0.9}, 1)) == whole_settings(whole, trial_of({"gamma": 0.9}, 1))
+    assert again.settings_of(Trial({"gamma": 0.9}, 1)) == whole.settings_of(Trial({"gamma": 0.9}, 1))
 
 
 def test_variants_are_settings_that_belong_together():
     variants = {"recipe": {}, "no history": {"gamma": 0.9, "environment.randomization": None}}
     whole = resolve(plan(variants=variants, space={"epochs": [2, 3]}, seeds=1))
     again = parse_config(SweepPlan, whole.model_dump(mode="json"), "again")
-    trials = trials_of(known_settings(again) or [], again.seed_list)
+    trials = trials_of(again.known_settings() or [], again.seed_list)
     assert [trial.name for trial in trials][-1] == "epochs=3,variant=no_history,seed=0"
-    first, last = whole_settings(again, trials[0]), whole_settings(again, trials[-1])
+    first, last = again.settings_of(trials[0]), again.settings_of(trials[-1])
     assert (last["gamma"], last["epochs"], last["environment"]["randomization"]) == (0.9, 3, None)
     assert first == whole.settings | {"seed": 0, "epochs": 2}
 
@@ -74,7 +71,7 @@ def test_variants_are_settings_that_belong_together():
 def test_the_ablations_can_begin():
     """Every setting that they name exists, in the agent and in the task."""
     whole = resolve(read_plan(ROOT / "examples" / "ablations.yaml"))
-    found = [whole_settings(whole, trial) for trial in trials_of(known_settings(whole) or [], [0])]
+    found = [whole.settings_of(trial) for trial in trials_of(whole.known_settings() or [], [0])]
     assert len({json.dumps(settings, sort_keys=True) for settings in found}) == len(found) == len(whole.variants)
     for settings in found:
         make_core(ENVIRONMENT, 1, settings["environment"]).close()
@@ -89,8 +86,8 @@ def test_random_settings_are_the_same_again_and_within_their_ranges():
         },
         "search": {"method": "random", "trials": 50},
     }
-    drawn = known_settings(plan(**fields))
-    assert drawn == known_settings(plan(**fields))
+    drawn = plan(**fields).known_settings()
+    assert drawn == plan(**fields).known_settings()
     assert drawn is not None
     assert all(1e-4 <= one["learning_rate"] <= 1e-2 for one in drawn)
     assert 10 < sum(one["learning_rate"] < 1e-3 for one in drawn) < 40
@@ -99,14 +96,14 @@ def test_random_settings_are_the_same_again_and_within_their_ranges():
 
 
 def test_a_setting_drawn_twice_is_trained_once():
-    drawn = known_settings(plan(space={"gamma": [0.9, 0.97]}, search={"trials": 10}))
+    drawn = plan(space={"gamma": [0.9, 0.97]}, search={"trials": 10}).known_settings()
     assert len(drawn or []) == 2
 
 
 def test_long_names_stay_different():
     first, second = ({"environment.task": {"rewards": {"slip": {"weight": -w}, "x" * 200: {}}}} for w in (1.0, 2.0))
-    assert len(label_of(first)) < 200
-    assert label_of(first) != label_of(second)
+    assert len(Trial(first, 0).label) < 200
+    assert Trial(first, 0).label != Trial(second, 0).label
 
 
 @pytest.mark.parametrize(
@@ -117,8 +114,8 @@ def test_long_names_stay_different():
         ({"space": {"gamma": [0.9, 1.5]}}, "gamma=1.5,seed=0.*gamma"),
         ({"variants": {"one": {"learning_rte": 1e-3}}}, "variant=one,seed=0.*did you mean 'learning_rate'"),
         ({"variants": {"one": {}}, "space": {"variant": ["two"]}}, "give 'variants'"),
-        ({"variants": {"one": {"gamma": 0.9}}, "space": {"gamma": [0.97]}}, "'one' sets 'gamma', which 'seeds' or 'space'"),
-        ({"variants": {"one": {"seed": 1}}}, "'one' sets 'seed'"),
+        ({"variants": {"one": {"gamma": 0.9}}, "space": {"gamma": [0.97]}}, "one sets 'gamma', which 'seeds' or 'space'"),
+        ({"variants": {"one": {"seed": 1}}}, "one sets 'seed'"),
         ({"variants": {"one": {"gamma": datetime.date(2026, 1, 1)}}}, "variants: one: gamma: .* is no setting"),
         ({"variants": {"a b": {}, "a_b": {}}, "search": {"trials": 1}}, "two trials are called 'variant=a_b"),
         ({"variants": {"one": {}, "two": {"gama": 0.9}}, "search": {"trials": 1}}, "did you mean 'gamma'"),
@@ -204,7 +201,7 @@ def test_bad_options_exit_with_2_and_leave_nothing(arguments, message, capsys, t
 
 
 def test_one_is_one(tmp_path):
-    book = _Book(parse_config(SweepPlan, {"environment": ENVIRONMENT, "seeds": 1}, "sweep"), tmp_path, print)
+    book = Book(parse_config(SweepPlan, {"environment": ENVIRONMENT, "seeds": 1}, "sweep"), tmp_path, print)
     assert book.size == "1 trial: 1 setting x 1 seed"
 
 

@@ -1,4 +1,4 @@
-"""Sweeps on Ray: two nodes on this machine, one of which dies; a node without the package; searches."""
+"""Sweeps on Ray: two nodes on this machine, one of which dies; searches."""
 
 import signal
 import subprocess
@@ -18,17 +18,6 @@ pytest.importorskip("torch")
 ray = pytest.importorskip("ray")
 
 UNSCORED = SETTINGS | {"evaluate_every": 0}
-#: Read by Python at its start: there is no wlr_gym.
-WITHOUT = """
-import sys
-
-class Without:
-    def find_spec(self, name, path=None, target=None):
-        if name == "wlr_gym":
-            raise ModuleNotFoundError("No module named 'wlr_gym'")
-
-sys.meta_path.insert(0, Without())
-"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -109,20 +98,6 @@ def test_a_killed_driver_resumes(cluster, hold, tmp_path):
     assert [one.status for one in found.trials] == ["done"]
     assert (found.trials[0].folder / "provenance_resumed.yaml").is_file()
     assert_like_alone(found.trials[0], tmp_path / "alone", UNSCORED)
-
-
-@pytest.mark.slow
-def test_a_node_without_the_package_is_named_and_left_out(cluster, tmp_path):
-    (tmp_path / "sitecustomize.py").write_text(WITHOUT)
-    path = ":".join([str(tmp_path), *sys.path])
-    node = cluster.add_node(num_cpus=4, env_vars={"PYTHONPATH": path})
-    lines = []
-    found = wlr_gym.sweep(ENVIRONMENT, tmp_path / "out", settings=UNSCORED, seeds=2, ray=cluster.address, say=lines.append)
-    cluster.remove_node(node)
-    assert [one.status for one in found.trials] == ["done"] * 2
-    (left_out,) = (line for line in lines if "left out" in line)
-    assert "No module named 'wlr_gym'" in left_out
-    assert "it needs wlr-gym[train]" in left_out
 
 
 @pytest.mark.slow

@@ -16,9 +16,10 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.learning.evaluation.subjects import expand
+from wlr_gym.learning.sweep import book as book_module
 from wlr_gym.learning.sweep import running
-from wlr_gym.learning.sweep.plan import SweepPlan, trial_of, trials_of
-from wlr_gym.learning.sweep.results import TrialResult, summarise, write_table
+from wlr_gym.learning.sweep.plan import SweepPlan, Trial, trials_of
+from wlr_gym.learning.sweep.results import TrialResult, summarise, write_page, write_table
 
 PLAN = SweepPlan(environment="WLR-Velocity-v0", space={"gamma": [0.9, 0.97]}, seeds=3)
 TRIALS = trials_of([{"gamma": 0.9}, {"gamma": 0.97}], [0, 1, 2])
@@ -26,7 +27,7 @@ TRIALS = trials_of([{"gamma": 0.9}, {"gamma": 0.97}], [0, 1, 2])
 
 def result(settings, folder, score=1.0, seed=0, status="done"):
     scores = [{"steps": 10.0, "tracking_error": score}]
-    return TrialResult(trial_of(settings, seed), folder, status, scores=scores, steps=10, seconds=1.0)
+    return TrialResult(Trial(settings, seed), folder, status, scores=scores, steps=10, seconds=1.0)
 
 
 def write_curve(folder, steps):
@@ -38,7 +39,7 @@ def write_curve(folder, steps):
 def book(tmp_path):
     for name in ("trials", ".locks"):
         (tmp_path / name).mkdir()
-    return running._Book(PLAN, tmp_path, lambda line: None)
+    return book_module.Book(PLAN, tmp_path, lambda line: None)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +108,7 @@ def test_what_was_stopped_early_is_read_after_its_last_checkpoint(book, monkeypa
         write_curve(folder, 128)
         yield
 
-    monkeypatch.setattr(running, "locked", lock_that_is_free_after_the_checkpoint)
+    monkeypatch.setattr(book_module, "locked", lock_that_is_free_after_the_checkpoint)
     book.write()
     assert [(one.status, one.steps) for one in book.results()] == [("stopped early", 128)]
     assert list(pandas.read_parquet(book.folder / "trials.parquet")["steps"]) == [128]
@@ -133,15 +134,13 @@ def test_jobs_are_ended_before_an_interruption_goes_on(book):
     assert (ended, caught.type) == (["in good order"], KeyboardInterrupt)
 
 
-def test_a_table_that_cannot_be_written_says_what_is_there(book, monkeypatch):
-    write_curve(book.folder / "trials" / TRIALS[0].name, 64)
-
+def test_a_table_that_cannot_be_written_says_what_to_do(book, monkeypatch):
     def full(results, folder):
         raise InputError(f"{folder}/trials.parquet: cannot be written: No space left on device")
 
-    monkeypatch.setattr(running, "write_table", full)
-    with pytest.raises(InputError, match=r"No space left.*failed: 1.*wlr sweep --resume"):
-        book.result_of(lambda: book.end(TRIALS[0], "no space"))
+    monkeypatch.setattr(book_module, "write_table", full)
+    with pytest.raises(InputError, match=r"No space left.*wlr sweep --resume"):
+        book.fill(lambda jobs: (Ended(job.name, "no space") for job in jobs))
 
 
 def test_two_cannot_run_one_sweep(tmp_path, monkeypatch):
@@ -158,6 +157,19 @@ def test_two_cannot_run_one_sweep(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="held by another process"):
         wlr_gym.resume_sweep(tmp_path)
     other.communicate(b"\n")
+
+
+@pytest.mark.parametrize("steps", [(), (0.0,), (0.0, 10.0)])
+def test_a_page_says_what_there_is(steps, tmp_path):
+    """Before the first score, with one before the first update only, and with curves."""
+    trials = [TrialResult(trial, tmp_path / trial.name) for trial in TRIALS]
+    for one in trials:
+        one.scores = [{"steps": step, "tracking_error": 1.0 + one.trial.seed} for step in steps]
+    write_page(PLAN, trials, tmp_path)
+    page = (tmp_path / "sweep.html").read_text()
+    assert ("No trial has scores yet" in page) == (not steps)
+    assert ("gamma 0.9. Tracking error 2 (1 to 3, 3 seeds)" in page) == bool(steps)
+    assert ("data:image/png" in page) == bool(steps)
 
 
 def test_settings_are_ranked_by_the_mean_over_their_seeds(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +32,7 @@ from wlr_gym.learning.adaptation.driving import (
     record_runs,
 )
 from wlr_gym.learning.adaptation.retraining import accept_policy, train_supervised
-from wlr_gym.learning.adaptation.state import EXCITATIONS, AdaptStep, Asked, Progress, Tell, open_folder, write_page
+from wlr_gym.learning.adaptation.state import AdaptStep, Asked, Progress, Tell, open_folder, write_page
 from wlr_gym.learning.adaptation.uncertainty import Uncertainty, uncertainty_of
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 from wlr_gym.physics.effects import Source, load_patch, save_patch
@@ -62,40 +62,29 @@ def adapt(
     policy: str | Path,
     out: str | Path,
     *,
-    robot_runs: str | Path | None = None,
     driven: AdaptedRobot | None = None,
+    robot_runs: str | Path | None = None,
     effects: Source = None,
-    backend: str = "gibbs_appell",
     environment: str | None = None,
     robot: RobotSource | None = None,
-    excitations: Sequence[str] = EXCITATIONS,
-    budget_runs: int = 2,
-    budget_seconds: float | None = None,
-    drives: int = 6,
-    drive_seconds: float = 10.0,
-    steps: int = 7_500_000,
-    learning_rate: float = 5e-4,
-    episodes: int = 256,
-    sensors: Sequence[str] = (),
-    seed: int = 0,
     threads: int = 1,
     tell: Tell = lambda text, share: None,
+    **asked: Any,
 ) -> Adapted:
     """Adapt a policy to a robot, as ``wlr adapt`` does. Called again with the same arguments it resumes.
 
     Args:
         policy: that PPO trained: shipped, a file, or a policy or run folder.
         out: folder for all steps; new, empty, or of the same request.
-        robot_runs: measured runs; None = they are recorded on the robot.
         driven: the robot; None = without ``robot_runs`` an emulated one that has ``effects``, with them none.
-        effects: what the emulated robot has that its file does not say. backend: simulator behind it.
+        robot_runs: measured runs; None = they are recorded on the robot.
+        effects: what the emulated robot has that its file does not say.
         environment: id; None = the one that the policy was trained in.
         robot: None = the policy's.
-        excitations: of the first runs. budget_runs, budget_seconds: of further ones.
-        drives, drive_seconds: episodes of the task before and after.
-        steps, learning_rate: of the training. episodes: of each family in the acceptance test.
-        sensors: which of camera and flow the robot has. seed: of everything random.
         threads: of the gap workflow and the acceptance test. tell: called with progress.
+        asked: further fields of :class:`wlr_gym.learning.adaptation.state.Asked`: ``backend`` of the emulated robot,
+            ``excitations``, ``budget_runs``, ``budget_seconds``, ``drives``, ``drive_seconds``, ``steps``, ``learning_rate``,
+            ``episodes``, ``sensors`` and ``seed``.
 
     Raises:
         InputError: bad input of any step, before anything is driven where that can be known; another process works in ``out``.
@@ -108,42 +97,32 @@ def adapt(
     chosen = environment or trained_environment(policy) or "WLR-Velocity-v0"
     own = load_robot(robot if robot is not None else policy_environment(policy).get("robot") or "nominal")
     patch = load_patch(effects)
-    check_simulator(backend, "--backend")
     if robot_runs is not None and patch:
         raise InputError("--effects: measured runs have what their robot has; they are for --emulated")
-    if driven is None and robot_runs is None:
-        driven = EmulatedRobot(own, patch, backend)
-    if driven is not None and "camera" in sensors:
-        raise InputError("--sensors camera: robots are driven without a camera here; give measured runs, or leave it out")
-    same_profile([excite(name, seed, own) for name in excitations])
-    given = {
+    is_driven = driven is not None or robot_runs is None
+    request = parse_options(Asked, {
+        **asked,
         "policy": str(policy),
         "identity": identity(read_subjects([str(policy)])[0]),
         "environment": chosen,
         "robot_runs": None if robot_runs is None else str(Path(robot_runs).resolve()),
         "robot": _fitting(policy, chosen, own),
-        "driven": "" if driven is None else "real" if isinstance(driven, RealRobot) else "emulated",
+        "driven": ("real" if isinstance(driven, RealRobot) else "emulated") if is_driven else "",
         "effects": [dict(one.content()) for one in patch.effects],
-        "backend": backend,
-        "excitations": tuple(excitations),
-        "budget_runs": budget_runs,
-        "budget_seconds": budget_seconds,
-        "drives": drives,
-        "drive_seconds": drive_seconds,
-        "steps": steps,
-        "learning_rate": learning_rate,
-        "episodes": episodes,
-        "sensors": tuple(sensors),
-        "seed": seed,
-    }
-    asked = parse_options(Asked, given)
+    })  # fmt: skip
+    check_simulator(request.backend, "--backend")
+    if is_driven and "camera" in request.sensors:
+        raise InputError("--sensors camera: robots are driven without a camera here; give measured runs, or leave it out")
+    same_profile([excite(name, request.seed, own) for name in request.excitations])
     if robot_runs is not None:
         check_folder(Path(robot_runs), "--robot-runs")
         check_runs(Path(robot_runs), own)  # before anything is written
-    progress = open_folder(Path(out), asked, tell, threads)
+    elif driven is None:
+        driven = EmulatedRobot(own, patch, request.backend)
+    progress = open_folder(Path(out), request, tell, threads)
     with alone_in(progress.out):
         if not progress.steps:
-            record_provenance(progress.out, asked.model_dump(mode="json"), seed)
+            record_provenance(progress.out, request.model_dump(mode="json"), request.seed)
             save_patch(patch, progress.out / "hidden.yaml")
             progress.save()
         return run_steps(progress, driven, own)
@@ -235,15 +214,14 @@ def find_gap(progress: Progress, robot: AdaptedRobot | None) -> AdaptStep:
         said.append("There are too few usable runs for an analysis.")
     else:
         said.insert(0, result.summary or result.verdict)
-    names = [one.name for one in result.effects] if result is not None else []
+    record_by = f" --record emulated --hidden {progress.out / 'hidden.yaml'}" if asked.driven == "emulated" else ""
     return AdaptStep(
         said=tuple(said),
         driving=history.seconds,
-        command=f"wlr gap {data} --out {progress.out / 'gap'} --until-decided --budget-runs {runs}"
-        + (f" --record emulated --hidden {progress.out / 'hidden.yaml'}" if asked.driven == "emulated" else ""),
+        command=f"wlr gap {data} --out {progress.out / 'gap'} --until-decided --budget-runs {runs}{record_by}",
         numbers={
             "verdict": "" if result is None else result.verdict,
-            "effects": names,
+            "effects": [] if result is None else [one.name for one in result.effects],
             "ended": history.ended,
             "folder": str(decided.folder),
         },

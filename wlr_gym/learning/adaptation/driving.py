@@ -156,7 +156,6 @@ class RobotEpisode:
         measures: rms of each measure, SI units.
         seconds: driven.
         reason: why it ended.
-        run: path of its log; empty = none was written.
     """
 
     seed: int
@@ -164,7 +163,6 @@ class RobotEpisode:
     measures: Mapping[str, float]
     seconds: float
     reason: str
-    run: str = ""
 
     @property
     def whole(self) -> bool:
@@ -172,9 +170,7 @@ class RobotEpisode:
         return self.reason == WHOLE
 
 
-def drive_episode(
-    environment: str, policy: str, robot: AdaptedRobot, seed: int, seconds: float, log: Path | None = None
-) -> RobotEpisode:
+def drive_episode(environment: str, policy: str, robot: AdaptedRobot, seed: int, seconds: float) -> RobotEpisode:
     """Drive one episode; torque is off afterwards. Commands are those of a simulated episode of the same seed.
 
     An emulated robot is scored by its true motion, a real one by what the slip observer and the gyro say of it.
@@ -182,7 +178,6 @@ def drive_episode(
     Args:
         environment: id. policy: its source. robot: what is driven.
         seed: of the commands. seconds: of the episode.
-        log: folder for the run; None = none is written.
 
     Raises:
         InputError: a policy that does not fit, or without a slip observer on a real robot; ports that cannot be opened.
@@ -190,7 +185,7 @@ def drive_episode(
     keywords = {"backend": "dynamixel", "hardware": RobotOptions(emulated=True), "episode_length": seconds}
     core = make_core(environment, 1, environment_for(policy, keywords))
     core.plant.close()
-    plant, truth = robot.start(log, seed)
+    plant, truth = robot.start(None, seed)
     core.plant = plant
     try:
         refuse_deadman(plant)
@@ -248,7 +243,7 @@ class _Score:
 
     def episode(self, seed: int, driven: Deployment) -> RobotEpisode:
         """Return how it went."""
-        reason, run = driven.reason, "" if driven.run is None else str(driven.run)
+        reason = driven.reason
         task, ticks = self._task, max(1, self._ticks)
         rms = np.sqrt(self._scores.squares[0] / ticks)
         measures = {name: float(value) for name, value in zip(task.measures, rms, strict=True)}
@@ -256,7 +251,7 @@ class _Score:
         scales = scales_of(task.config)
         errors = {(name, kind): np.array([measures[name] if kind == "rms" else largest[name]]) for name, kind in scales}
         error = float(tracking_error(scales, errors, np.array([reason != WHOLE]))[0])
-        return RobotEpisode(seed, error, measures, ticks * task.config.control_period, reason, run)
+        return RobotEpisode(seed, error, measures, ticks * task.config.control_period, reason)
 
 
 # ---- steps: the task before, the excitations, and the task again, old policy beside new ------------------------------
@@ -312,11 +307,7 @@ def drive_after(progress: Progress, robot: AdaptedRobot | None, kept: str) -> Ad
 
 
 def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> AdaptStep:
-    """Drive the excitations, or check the runs that were given.
-
-    Raises:
-        InputError: runs of another robot, or none.
-    """
+    """Drive the excitations, or check the runs that were given."""
     asked = progress.asked
     if asked.robot_runs is not None:
         return check_runs(Path(asked.robot_runs), own)

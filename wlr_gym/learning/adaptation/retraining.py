@@ -92,67 +92,55 @@ def training_settings(asked: Asked, family: Family, rewards: Mapping[str, Any] |
     }
 
 
-def train_in(progress: Progress, folder: Path, config: Path, family: Family, rewards: Mapping[str, Any] | None = None) -> None:
-    """Train on from the policy with a family, in ``folder``; an interrupted training resumes from its newest checkpoint.
+def train_in(progress: Progress, name: str, family: Family, rewards: Mapping[str, Any] | None = None) -> str:
+    """Train on from the policy with a family; an interrupted training resumes from its newest checkpoint.
 
     Args:
-        progress: what was asked for. folder: of the run. config: file that the settings are written to.
-        family: what it trains with. rewards: terms beside those of the recipe.
+        progress: what was asked for. name: of the run folder in that of the adaptation. family: what it trains with.
+        rewards: terms beside those of the recipe.
+
+    Returns:
+        The command that does the same.
     """
-    asked = progress.asked
+    asked, folder = progress.asked, progress.out / name
+    config = progress.folder("model") / f"{name}.yaml"
 
     def on_update(update: TrainingProgress) -> None:
         progress.tell("training", update.steps / update.total_steps)
 
-    if (folder / "policy").is_dir():
-        return
-    if (folder / CONFIG_FILE).is_file():
+    if (folder / CONFIG_FILE).is_file() and not (folder / "policy").is_dir():
         resume_training(folder, on_update=on_update)
-        return
-    write_yaml(config, training_settings(asked, family, rewards))
-    train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
-
-
-def train_on(progress: Progress, found: Uncertainty) -> AdaptStep:
-    """Train on from the policy with what was found."""
-    asked, folder = progress.asked, progress.out / TRAINING
-    config = progress.folder("model") / "training.yaml"
-    train_in(progress, folder, config, found.training)
-    return AdaptStep(
-        said=(
-            f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}, in "
-            f"{TRAINED_SHARE:.0%} of each interval.",
-        ),
-        command=_command(progress, config, folder),
-        numbers={"steps": asked.steps, "learning_rate": asked.learning_rate},
-    )
+    elif not (folder / "policy").is_dir():
+        write_yaml(config, training_settings(asked, family, rewards))
+        train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
+    return f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}"
 
 
 def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
     """Train on; once more, wheels that stick being a cost, where the supervision may stop the new policy more often."""
-    record, trained = train_on(progress, found), str(progress.out / TRAINING / "policy")
-    old, new = (watched(progress, found, own, policy) for policy in (progress.asked.policy, trained))
-    if not may_stop_more(new, old):
-        return record
-    shares = f"{new.mean():.0%} of episodes, and the old policy in {old.mean():.0%}"
-    if not _takes_rewards(progress.asked.policy):
-        said = f"The supervision would stop it in {shares}; its task is a file of its own, so nothing was changed."
-        return record.model_copy(update={"said": (*record.said, said)})
-    config = progress.folder("model") / f"{AGAIN}.yaml"
-    train_in(progress, progress.out / AGAIN, config, found.training, STUCK_WHEELS)
-    said = f"The supervision would stop it in {shares}; that may be more often: trained again, wheels that stick being a cost."
-    command = _command(progress, config, progress.out / AGAIN)
-    return record.model_copy(update={"said": (*record.said, said), "command": command})
+    asked = progress.asked
+    command = train_in(progress, TRAINING, found.training)
+    said = [
+        f"{asked.steps:,} environment steps from {asked.policy}, learning rate {asked.learning_rate:g}, in "
+        f"{TRAINED_SHARE:.0%} of each interval."
+    ]
+    trained = str(progress.out / TRAINING / "policy")
+    old, new = (watched(progress, found, own, policy) for policy in (asked.policy, trained))
+    if may_stop_more(new, old):
+        often = f"The supervision would stop it in {new.mean():.0%} of episodes, and the old policy in {old.mean():.0%}"
+        if _takes_rewards(asked.policy):
+            command = train_in(progress, AGAIN, found.training, STUCK_WHEELS)
+            said.append(f"{often}; that may be more often: trained again, wheels that stick being a cost.")
+        else:
+            said.append(f"{often}; its task is a file of its own, so nothing was changed.")
+    numbers = {"steps": asked.steps, "learning_rate": asked.learning_rate}
+    return AdaptStep(said=tuple(said), command=command, numbers=numbers)
 
 
 def _takes_rewards(policy: str) -> bool:
     """Whether reward terms can be laid over the task of a policy's recipe: it is not a file."""
     environment = agent_function("ppo", "settings_to_start_from")(policy).get("environment") or {}
     return isinstance(environment.get("task") or {}, Mapping)
-
-
-def _command(progress: Progress, config: Path, folder: Path) -> str:
-    return f"wlr train {progress.asked.environment} --config {config} --init {progress.asked.policy} --out {folder}"
 
 
 def watched(progress: Progress, found: Uncertainty, own: Robot, policy: str) -> NDArray[np.bool_]:

@@ -65,9 +65,6 @@ def uncertainty_of(result: Result, found: Patch, base: str | Mapping[str, Any], 
         base: the task's own randomisation: name, path or content.
         robot: whose numbers they are.
         folder: must be there.
-
-    Raises:
-        InputError: a result with numbers that mean nothing to the robot.
     """
     refuted = makes_worse(result)
     found = Patch() if refuted else found

@@ -249,15 +249,15 @@ def _text(value: float, digits: int) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"  # no -0
 
 
-def comparison_rows(card: Card, label: str = MAIN, *, short: bool = False) -> Table:
+def comparison_rows(card: Card, *, short: bool = False) -> Table:
     """Return how much better the first subject is than each baseline: a header, then one row per metric, and the score."""
-    others = card.comparison[label]
+    others = card.comparison[MAIN]
     table = [["better in", "unit", *others]]
     for metric in card.metrics:
         unit, digits = (metric.unit, metric.digits) if metric.key in BY_DIFFERENCE else ("%", 1)
         unit = "points" if unit == "%" and metric.key in BY_DIFFERENCE else unit
         table.append([metric.key, unit, *(_comparing(own[metric.key], digits, short) for own in others.values())])
-    if label == MAIN and card.share_of:
+    if card.share_of:
         shares = [cell(card.share_of[name], 1, short) if name in card.share_of else "-" for name in others]
         table.append(["score, % of the baseline's", "%", *shares])
     return table
@@ -269,22 +269,22 @@ def _comparing(estimate: Estimate, digits: int, short: bool) -> str:
     return f"**{text}**" if not short and text != "-" and estimate.excludes_zero else text
 
 
-def sweep_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = True) -> Table:
-    """Return one metric of a sweep: a header, then one row per point with a column per subject."""
+def sweep_rows(card: Card, index: int, *, short: bool = True) -> Table:
+    """Return the tracking errors of a sweep: a header, then one row per point with a column per subject."""
     sweep = card.sweeps[index]
-    digits = next(metric.digits for metric in card.metrics if metric.key == key)
+    digits = next(metric.digits for metric in card.metrics if metric.key == "tracking_error")
     body = [
-        [point.label, *(cell(own[key], digits, short) for own in card.scores[sweep.label(point)].values())]
+        [point.label, *(cell(own["tracking_error"], digits, short) for own in card.scores[sweep.label(point)].values())]
         for point in sweep.points
     ]
     return [[sweep.axis, *card.names], *body]
 
 
-def sweep_comparison_rows(card: Card, index: int, key: str = "tracking_error", *, short: bool = False) -> Table:
-    """Return how much better the first subject is over a sweep, in %: one row per point with a column per baseline."""
+def sweep_comparison_rows(card: Card, index: int) -> Table:
+    """Return how much better the first subject tracks over a sweep, in %: one row per point with a column per baseline."""
     sweep = card.sweeps[index]
     body = [
-        [point.label, *(_comparing(own[key], 1, short) for own in card.comparison[sweep.label(point)].values())]
+        [point.label, *(_comparing(own["tracking_error"], 1, False) for own in card.comparison[sweep.label(point)].values())]
         for point in sweep.points
     ]
     return [[sweep.axis, *card.names[1:]], *body]

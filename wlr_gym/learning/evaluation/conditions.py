@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import groupby, product
 from typing import TYPE_CHECKING, Any
 
@@ -64,18 +65,12 @@ Results = dict[str, dict[str, Played]]
 Watch = Callable[[Condition, Subject, int, Rollout], object]
 
 
-def work(conditions: Sequence[Condition], subjects: Sequence[Subject], ticks: int) -> int:
-    """Return how often ``tell`` of :func:`play` counts in all, for episodes of ``ticks`` environment steps."""
-    players = sum(len(subject.sources) for subject in subjects)
-    return sum(condition.cost * condition.blocks for condition in conditions) * players * ticks
-
-
 def play(
     environment: str,
     subjects: Sequence[Subject],
     conditions: Sequence[Condition],
     first_seed: int = FIRST_SEED,
-    tell: Callable[[str, int], object] | None = None,
+    tell: Callable[[str, float], object] | None = None,
     watch: Watch | None = None,
 ) -> Results:
     """Play every condition with every subject. Episode i of block k has seed ``first_seed + 10000 k + i``, whoever plays.
@@ -87,14 +82,11 @@ def play(
         subjects: who plays.
         conditions: under which; neighbours with the same keywords and number of episodes share their environment.
         first_seed: of the first block.
-        tell: called after every environment step with a description and its cost; see :func:`work`.
+        tell: called after every environment step with a description and the share of all that was done in it, of 1.
         watch: called with every block that was played; once per training seed.
-
-    Raises:
-        InputError: unknown environment, policy, keyword or parameter; a policy that does not fit; or an environment of a policy
-            in which floor, start or commands differ from those of the others.
     """
     results: Results = {condition.label: {} for condition in conditions}
+    work = sum(one.cost * one.blocks for one in conditions) * sum(len(subject.sources) for subject in subjects)
     for _, group in groupby(conditions, lambda condition: (condition.keywords, condition.episodes)):
         chosen = list(group)
         references: dict[tuple[str, int], _Given] = {}
@@ -106,7 +98,8 @@ def play(
                     stack.callback(made[-1][0].close)
             for subject in subjects:
                 for condition in chosen:
-                    blocks = _blocks(players[subject], subject, condition, first_seed, tell, watch, references)
+                    share = condition.cost / work
+                    blocks = _blocks(players[subject], subject, condition, first_seed, tell, share, watch, references)
                     results[condition.label][subject.name] = summarise(blocks, len(subject.sources))
     return results
 
@@ -116,15 +109,16 @@ def _blocks(
     subject: Subject,
     condition: Condition,
     first_seed: int,
-    tell: Callable[[str, int], object] | None,
+    tell: Callable[[str, float], object] | None,
+    share: float,
     watch: Watch | None,
     references: dict[tuple[str, int], _Given],
 ) -> Iterator[Rollout]:
-    """Play the blocks of a condition with every player; each is checked against what the first subject was given."""
+    """Play the blocks of a condition, each a ``share`` of all, with every player; check them against the first subject's."""
     text = f"{subject.name}: {condition.label}"
-    on_tick = None if tell is None else lambda: tell(text, condition.cost)
     for (core, policy), block in product(players, range(condition.blocks)):
         seed = first_seed + BLOCK * block
+        on_tick = None if tell is None else partial(tell, text, share / core.limit)
         rollout = roll_out(core, policy, seed, on_tick, parameters=condition.parameters, commands=condition.commands)
         given = _Given(subject.name, rollout)
         references.setdefault((condition.label, block), given).check(given)

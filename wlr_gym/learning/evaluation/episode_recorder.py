@@ -73,11 +73,7 @@ class EpisodeRecorder:
             self._parameters = parameters.copy()
 
     def save(self, path: str | Path, notes: str | None = None) -> Path:
-        """Write the run, its ``meta.yaml`` and its record; see docs/run_format.md.
-
-        Raises:
-            InputError: fewer than two steps, or a ``meta.yaml`` that says something else.
-        """
+        """Write the run, its ``meta.yaml`` and its record; see docs/run_format.md."""
         core, rows = self.core, len(self._goals)
         period = core.task.config.control_period
         table = {"t": period * np.arange(rows)}

@@ -127,19 +127,11 @@ def film_beside(
 
     Args:
         path: see :func:`wlr_gym.render.write_video`.
-        environment: id.
+        environment, keywords: id, and keywords of the environment.
         subjects: one or two.
-        seed: of the episode.
-        seconds: length.
-        keywords: of the environment.
-        view: what to show.
+        seed, seconds, view, title, fps: as for :func:`film`.
         schedule: commands from given times on, see :class:`wlr_gym.render.teleop.Script`; None = the task's own.
-        title: first line of the text in the pictures.
-        fps: pictures per second, where the control period allows.
         watch: is given the pictures and how many there will be, and yields them (progress bars).
-
-    Raises:
-        InputError: no OpenGL, unknown environment, policy or keyword, a bad schedule or path.
     """
     from wlr_gym.learning.evaluation.subjects import make_player
     from wlr_gym.render import side_by_side, write_video

@@ -9,23 +9,21 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import LogLocator, MultipleLocator
+from matplotlib.ticker import MultipleLocator
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, text_colour, tidy
+from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, log_axis, new_figure, save, text_colour, tidy
 from wlr_gym.base.random import episode_seeds
 from wlr_gym.learning.evaluation.card import BY_DIFFERENCE, IDLE, MAIN, Card
 from wlr_gym.learning.evaluation.conditions import Sweep
 from wlr_gym.learning.evaluation.metrics import JITTER_FREQUENCY, TRACKING, Estimate, Metric, has_limits
 from wlr_gym.learning.evaluation.rollout import Rollout
 from wlr_gym.robot import CORNER_SIGNS, WHEELS
-from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -98,7 +96,7 @@ def _draw_sweep(axes: Axes, card: Card, sweep: Sweep, metric: Metric) -> None:
     if metric.key == "tracking_error":
         axes.axhline(1.0, color="0.3", linestyle=":", linewidth=1.2)
         axes.set_yscale("log")
-        _plain_log(axes.yaxis)
+        log_axis(axes.yaxis)
     else:
         axes.set_ylim(*((-2.0, 102.0) if metric.unit == "%" else (0.0, None)))
     if sweep.name in ("friction", "grip"):
@@ -144,8 +142,9 @@ def improvements(card: Card) -> Figure:
         ends = np.maximum(0.0, np.array([[e.mean - e.low, e.high - e.mean] for e in estimates]).T)
         style = {"color": _style(card, name)["color"], "label": f"against {name}", "error_kw": {"linewidth": 1}}
         axes.barh(y, mean, height=0.9 * height, xerr=ends, **style)
-        for place, value in zip(y[mean < -CUT], mean[mean < -CUT], strict=True):
-            _write_cut(axes, float(place), float(value), style["color"])
+        text = {"textcoords": "offset points", "va": "center", "fontsize": 7, "color": text_colour(to_rgb(style["color"]))}
+        for place, value in zip(y[mean < -CUT], mean[mean < -CUT], strict=True):  # bars that are cut off at their end
+            axes.annotate(f"{value:.0f} %", (-CUT, float(place)), (3, -0.5), **text)
     axes.axvline(0.0, color="black", linewidth=1)
     axes.set_yticks(range(len(metrics)), [metric.key.replace("_", " ") for metric in metrics])
     axes.set_ylim(len(metrics) - 0.5, -0.5)
@@ -155,12 +154,6 @@ def improvements(card: Card) -> Figure:
     tidy(axes, "x")
     legend_below(figure)
     return figure
-
-
-def _write_cut(axes: Axes, y: float, value: float, colour: str) -> None:
-    """Write the value of a bar that is cut off at its end."""
-    style = {"textcoords": "offset points", "va": "center", "fontsize": 7, "color": text_colour(to_rgb(colour))}
-    axes.annotate(f"{value:.0f} %", (-CUT, y), (3, -0.5), **style)
 
 
 def pareto(card: Card) -> Figure:
@@ -188,14 +181,8 @@ def _fit(axes: Axes, name: Literal["x", "y"], estimates: Sequence[Estimate]) -> 
         axes.set(**{f"{name}lim": (0.0, None)})
         return
     axes.set(**{f"{name}scale": "log"})
-    _plain_log(axes.xaxis if name == "x" else axes.yaxis)
+    log_axis(axes.xaxis if name == "x" else axes.yaxis)
     axes.minorticks_off()
-
-
-def _plain_log(axis: Axis) -> None:
-    """Write the numbers of a logarithmic axis without powers."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter("{x:g}")
 
 
 def _rivals(card: Card) -> list[str]:
@@ -385,7 +372,8 @@ def _draw(axes: Axes, parameters: Parameters, yaw: float, norm: Normalize) -> No
     ground = float(parameters["ground.mu_x"].mean())
     axes.set_facecolor(colours(norm(ground)))
     ink = "black" if norm(ground) > 0.6 else "white"
-    areas = [_area(parameters, k) for k in range(len(PATCHES))]
+    edges = ("mu", "x_min", "x_max", "y_min", "y_max")
+    areas = np.stack([parameters[f"patch.{name}"][0] for name in edges], axis=1)
     for mu, x_min, x_max, y_min, y_max in areas:
         if x_max > x_min and y_max > y_min:
             axes.add_patch(Rectangle((x_min, y_min), x_max - x_min, y_max - y_min, color=colours(norm(mu)), linewidth=0))
@@ -396,20 +384,11 @@ def _draw(axes: Axes, parameters: Parameters, yaw: float, norm: Normalize) -> No
     ):
         x, y = sign_x * hip_x, sign_y * hip_y
         place = np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y
-        mu = grip * next((area[0] for area in reversed(areas) if _holds(area, *place)), mu_x)
+        under = [mu for mu, x_min, x_max, y_min, y_max in areas if x_min < place[0] < x_max and y_min < place[1] < y_max]
+        mu = grip * (under[-1] if under else mu_x)
         wheel = Rectangle((x - 0.11, y - 0.06), 0.22, 0.12, facecolor=colours(norm(mu)), edgecolor=ink, linewidth=0.8)
         wheel.set_transform(turn)
         axes.add_patch(wheel)
     axes.plot([0.0, 0.4], [0.0, 0.0], color=ink, linewidth=1.2, transform=turn)
     axes.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), aspect="equal", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     axes.tick_params(labelsize=7)
-
-
-def _area(parameters: Parameters, patch: int) -> tuple[float, ...]:
-    """Friction and edges of one patch: mu, x_min, x_max, y_min, y_max."""
-    return tuple(float(parameters[f"patch.{name}"][0, patch]) for name in ("mu", "x_min", "x_max", "y_min", "y_max"))
-
-
-def _holds(area: tuple[float, ...], x: float, y: float) -> bool:
-    _, x_min, x_max, y_min, y_max = area
-    return x_min < x < x_max and y_min < y < y_max

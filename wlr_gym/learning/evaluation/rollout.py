@@ -103,11 +103,7 @@ class Rollout:
 
 
 def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> Core:
-    """Return the batched core of an environment with one robot per episode.
-
-    Raises:
-        InputError: unknown environment or keyword.
-    """
+    """Return the batched core of an environment with one robot per episode."""
     from wlr_gym.envs.core import Core
     from wlr_gym.envs.registry import task_source_of
     from wlr_gym.envs.settings import read_settings
@@ -117,11 +113,7 @@ def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> C
 
 
 def start_episodes(core: Core, policy: Policy, first_seed: int, options: Mapping[str, Any] | None = None) -> None:
-    """Begin an episode with every robot of ``core``, robot i with seed ``first_seed + i``; the policy has forgotten the past.
-
-    Raises:
-        InputError: see :meth:`wlr_gym.envs.core.Core.begin_episodes`.
-    """
+    """Begin an episode with every robot of ``core``, robot i with seed ``first_seed + i``; the policy forgets the past."""
     for row in range(core.count):
         core.seed(row, first_seed + row)
     core.begin_episodes(core.everyone, options)

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from wlr_gym.base.errors import InputError, check_name, require_seed
 from wlr_gym.base.files import write_json
 from wlr_gym.envs.core import make_task
@@ -19,11 +21,11 @@ from wlr_gym.envs.tasks.describe import contract
 from wlr_gym.envs.tasks.randomization import RandomizationConfig, load_randomization
 from wlr_gym.envs.tasks.task import having, read_task
 from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
-from wlr_gym.learning.evaluation.conditions import FIRST_SEED, FLOORS, Condition, Watch, play, read_sweep, work
+from wlr_gym.learning.evaluation.conditions import FIRST_SEED, FLOORS, Condition, Watch, play, read_sweep
 from wlr_gym.learning.evaluation.subjects import Source, common_robot, identity, read_subjects
 from wlr_gym.physics.effects import load_patch
 from wlr_gym.policy import make_policy, policy_environment, shipped_names, trained_environment
-from wlr_gym.robot import RobotSource, load_robot, robot_hash
+from wlr_gym.robot import load_robot, robot_hash
 
 BACKENDS = ("gibbs_appell", "mujoco")
 #: What a policy is compared with where nothing is chosen, as far as it fits the task.
@@ -69,7 +71,7 @@ def evaluate(
         seed: of the first episode; the others count up from it, each further block from 10000 above the last one.
         backend: ``gibbs_appell``, ``mujoco``, or ``both`` (the second for the main table only).
         other_episodes: in the second simulator.
-        sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.sweeps_for` lists those that suit a task).
+        sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.conditions.sweeps_for` lists those that suit a task).
         sweep_episodes: per point of a sweep.
         sensors: which of camera and flow the robots have; None = as their file and the randomisation say.
         randomization, effects, threads, precision: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`.
@@ -106,12 +108,13 @@ def evaluate(
         conditions += sweep.conditions(keywords, sweep_episodes)
     fewer = min(other_episodes, episodes)
     conditions += [Condition(OTHER_PLANT, {**keywords, "backend": other}, episodes=fewer) for other in others]
-    total = work(conditions, subjects, make_task(task_source_of(environment), read_settings(keywords)).episode_steps)
-    results = play(environment, subjects, conditions, seed, lambda text, done: tell(text, done / total), watch)
+    results = play(environment, subjects, conditions, seed, tell, watch)
     count = f"{episodes}, in each of {blocks} blocks" if blocks > 1 else str(episodes)
+    driven = None if robot is None else load_robot(robot)
     said = {
         "environment": environment, "backend": main, "episodes": count, "first seed": seed,
-        "randomization": randomization_said(randomization), "robot": _named(robot), "effects": patch.summary(),
+        "randomization": randomization_said(randomization),
+        "robot": "the task's" if driven is None else f"{driven.name}, {robot_hash(driven)}", "effects": patch.summary(),
     }  # fmt: skip
     if sensors is not None:
         said["sensors that not every robot has"] = ", ".join(sensors) or "none"
@@ -131,13 +134,6 @@ def randomization_said(given: Any) -> str | dict[str, Any]:
     if isinstance(given, RandomizationConfig):
         return given.model_dump(mode="json", exclude_unset=True)
     return dict(given) if isinstance(given, Mapping) else str(given)
-
-
-def _named(robot: RobotSource | None) -> str:
-    if robot is None:
-        return "the task's"
-    loaded = load_robot(robot)
-    return f"{loaded.name}, {robot_hash(loaded)}"
 
 
 def fitting_baselines(environment: str, names: Sequence[str] = BASELINES) -> tuple[str, ...]:
@@ -231,9 +227,8 @@ def accept(
     largest_loss: float = LARGEST_LOSS,
     sensors: Sequence[str] | None = None,
     robot: Any = None,
-    effects: Any = None,
-    threads: int = 1,
     tell: Tell = lambda text, share: None,
+    **conditions: Any,
 ) -> Acceptance:
     """Play a policy and its references on the same episodes of every family of floors.
 
@@ -244,8 +239,9 @@ def accept(
         floors: randomisations; None = those of the task's card.
         episodes: per block. blocks: of episodes, each with its own seeds.
         largest_loss: % of the tracking error.
-        sensors, robot, effects, threads: of the environment; None = the task's.
+        sensors, robot: of the environment; None = the task's.
         tell: called with what is going on and the share of the work that was done since.
+        conditions: further ones of :func:`evaluate`: ``effects``, ``threads``.
 
     Raises:
         InputError: unknown names, or a policy without references.
@@ -270,26 +266,17 @@ def accept(
             randomization=family,
             sensors=sensors,
             robot=robot,
-            effects=effects,
-            threads=threads,
             precision=PRECISION,
             tell=lambda text, share, family=family: tell(f"{_name(family)}: {text}", share / len(chosen)),
+            **conditions,
         )
         errors = {name: scores["tracking_error"].mean for name, scores in card.scores[MAIN].items()}
         for name, better in card.comparison[MAIN].items():
             gain = better["tracking_error"]
             losses.append(Loss(_name(family), name, errors[subject.name], errors[name], -gain.mean, -gain.low))
     inputs = fingerprint(environment, [policy, *against], chosen, robot)
-    return Acceptance(
-        str(policy),
-        environment,
-        episodes,
-        blocks,
-        None if sensors is None else tuple(sensors),
-        largest_loss,
-        inputs,
-        tuple(losses),
-    )
+    present = None if sensors is None else tuple(sensors)
+    return Acceptance(str(policy), environment, episodes, blocks, present, largest_loss, inputs, tuple(losses))
 
 
 def _name(family: Any) -> str:
@@ -344,10 +331,6 @@ def read_acceptance(path: Path) -> Acceptance:
         InputError: not such a file.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        content.pop("format")
-        sensors = content.pop("sensors")
-        losses = tuple(Loss(**loss) for loss in content.pop("losses"))
-        return Acceptance(**content, sensors=None if sensors is None else tuple(sensors), losses=losses)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return TypeAdapter(Acceptance).validate_json(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: expected a result of wlr evaluate --accept: {error}") from None

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from glob import glob, has_magic
 from os.path import commonprefix
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import CONFIG_FILE
@@ -37,15 +37,6 @@ from wlr_gym.policy.onnx_file import SUFFIX
 if TYPE_CHECKING:
     from wlr_gym.envs.core import Core
     from wlr_gym.policy import Policy
-
-
-@runtime_checkable
-class Planner(Protocol):
-    """A policy that plans on the simulator's own state."""
-
-    def use_simulator(self, core: Core) -> None:
-        """Plan for the robots of ``core``."""
-        ...
 
 
 #: What names one or several policies; see :func:`read_subjects`.
@@ -161,8 +152,8 @@ def make_player(environment: str, source: str | Path, episodes: int, keywords: M
     try:
         core = make_core(environment, episodes, environment_for(source, keywords))
         policy = make_policy(source, core.contract())
-        if isinstance(policy, Planner):
-            policy.use_simulator(core)
+        if (plan_with := getattr(policy, "use_simulator", None)) is not None:  # it plans on the simulator's own state
+            plan_with(core)
         return core, policy
     except BaseException as error:
         if core is not None:

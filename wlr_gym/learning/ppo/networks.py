@@ -1,31 +1,39 @@
-"""What the networks of PPO have beyond Stable-Baselines3's own.
+"""What PPO has beyond Stable-Baselines3's own, and all private names of it that this needs: what a new version may break.
 
 - A critic that sees more than its actor (Pinto et al. 2018). It is needed while training only, and may see what no robot
   measures (friction, true slip, contact forces): so it judges a situation right which the actor sees in part.
 - Inputs brought to one scale, and a controller that the network acts on top of: part of its file and of its ONNX graph.
 - Samples that are seen in the left-right mirror.
+- A place in a training that can be read and set.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import TensorBoardOutputFormat
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
 from torch import nn
+from torch.utils.tensorboard import SummaryWriter
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.envs.sb3 import Sb3VecEnv
 from wlr_gym.envs.tasks.describe import column_name
 from wlr_gym.envs.tasks.terms import CONTROLLER
-from wlr_gym.learning.ppo.sb3 import EditedSamples, OpenPolicy
 from wlr_gym.robot import JOINTS
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
 
 GROUPS = ("policy", "privileged")
 
@@ -60,7 +68,7 @@ class AsymmetricNetworks(MlpExtractor):
         return self.policy_net(features[:, : self.seen_by_actor])
 
 
-class AsymmetricPolicy(OpenPolicy):
+class AsymmetricPolicy(ActorCriticPolicy):
     """Stable-Baselines3's policy for observations {``policy``: (N, D), ``privileged``: (N, P)}.
 
     ``net_arch`` must be a list: the same hidden layers for actor and critic.
@@ -69,12 +77,11 @@ class AsymmetricPolicy(OpenPolicy):
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **{**keywords, "features_extractor_class": SideBySide})
 
-    def make_hidden_layers(self) -> AsymmetricNetworks:
-        """Return the hidden layers of actor and critic."""
+    def _build_mlp_extractor(self) -> None:
         assert isinstance(self.observation_space, spaces.Dict)
         assert isinstance(self.net_arch, list)
         seen = _width(self.observation_space, "policy")
-        return AsymmetricNetworks(seen, self.features_dim, self.net_arch, self.activation_fn, self.device)
+        self.mlp_extractor = AsymmetricNetworks(seen, self.features_dim, self.net_arch, self.activation_fn, self.device)
 
 
 def _width(space: spaces.Dict, group: str) -> int:
@@ -174,7 +181,7 @@ class OnTop(nn.Module):
         return x[:, width:] + self.residual * self.last(x[:, :width])
 
 
-class LayeredPolicy(OpenPolicy):
+class LayeredPolicy(ActorCriticPolicy):
     """Stable-Baselines3's policy with :class:`Layers`, for plain observations (N, D)."""
 
     def __init__(self, *arguments: Any, layers: Layers = Layers(), **keywords: Any) -> None:
@@ -186,8 +193,9 @@ class LayeredPolicy(OpenPolicy):
         last: Any = self.action_net
         return OnTop(last.last, last.residual * self.layers.residual_share) if self.layers.controller else last
 
-    def add_layers(self) -> None:
-        """Put the normalisers before the networks, and the controller behind the actor's."""
+    def _build(self, lr_schedule: Any) -> None:
+        """Make the networks; put the normalisers before them, and the controller behind the actor's."""
+        super()._build(lr_schedule)
         networks: Any = self.mlp_extractor
         layers = self.layers
         if layers.normalise:
@@ -200,6 +208,8 @@ class LayeredPolicy(OpenPolicy):
             nn.init.zeros_(last.weight)  # at the start the network adds nothing
             nn.init.zeros_(last.bias)
             self.action_net: nn.Module = OnTop(last, layers.residual)
+        keywords: dict[str, Any] = {"lr": lr_schedule(1), **self.optimizer_kwargs}
+        self.optimizer = self.optimizer_class(self.parameters(), **keywords)
 
 
 class LayeredAsymmetricPolicy(LayeredPolicy, AsymmetricPolicy):
@@ -289,18 +299,19 @@ def _image(name: str) -> tuple[str, float]:
     raise InputError(f"agent 'ppo': setting 'mirror': the mirror image of observation '{name}' is not known; set mirror=false")
 
 
-class _MirroredSamples(EditedSamples):
-    """Every other sample of a minibatch is seen in the mirror."""
+class _MirroredSamples:
+    """Laid over a rollout buffer: every other sample of a minibatch is seen in the mirror."""
 
     mirrors: Mapping[str, Mirror]
     action_mirror: Mirror
 
-    def edit(self, samples: Any) -> None:
-        """Mirror observations and actions."""
+    def _get_samples(self, batch_inds: NDArray[np.intp], env: Any = None) -> Any:
+        samples = super()._get_samples(batch_inds, env)  # type: ignore[misc]
         seen = samples.observations
         for name, rows in seen.items() if isinstance(seen, dict) else (("policy", seen),):
             _mirror(rows, self.mirrors[name])
         _mirror(samples.actions, self.action_mirror)
+        return samples
 
 
 def _mirror(rows: torch.Tensor, mirror: Mirror) -> None:
@@ -323,3 +334,62 @@ def set_mirror(buffer: Any, env: Sb3VecEnv) -> None:
     used = names if env.core.dictionary else {"policy": names["policy"]}
     buffer.mirrors = {group: mirror_of(some) for group, some in used.items()}
     buffer.action_mirror = mirror_of([column.joint for column in task.actions])
+
+
+# ---- where a training is ---------------------------------------------------------------------------------------------
+
+
+def begin_learning(model: PPO, steps: int, watcher: BaseCallback) -> None:
+    """Prepare ``steps`` more environment steps, what was learnt before stays; ``watcher`` is told of each."""
+    model._setup_learn(steps, callback=watcher, reset_num_timesteps=False)
+
+
+def set_share_done(model: PPO, steps: int, total: int) -> None:
+    """Let schedules be where ``steps`` of ``total`` put them."""
+    model._update_current_progress_remaining(steps, total)
+
+
+def last_observations(model: PPO) -> Any:
+    """Return what the robots observe now: (N, D), or {group: (N, ...)}."""
+    return model._last_obs
+
+
+def episode_starts(model: PPO) -> NDArray[np.bool_]:
+    """Return whose episode starts now, (N,)."""
+    return np.asarray(model._last_episode_starts)
+
+
+def go_on_from(model: PPO, observations: Any, starts: NDArray[np.bool_] | None = None) -> None:
+    """Let the next update begin at ``observations``; ``starts`` (N,): whose episode starts there, None = as before."""
+    model._last_obs = observations
+    if starts is not None:
+        model._last_episode_starts = starts
+
+
+def updates_done(model: PPO) -> int:
+    """Return the number of passes over samples so far."""
+    return model._n_updates
+
+
+def set_updates_done(model: PPO, updates: int) -> None:
+    """Count passes from ``updates`` on."""
+    model._n_updates = updates
+
+
+class StepWatcher(BaseCallback):
+    """Is called after every environment step of an update."""
+
+    def on_robots_stepped(self) -> None:
+        """Look at ``self.locals``: ``rewards``, ``dones``, ``infos``, ``new_obs`` and what else is being collected."""
+
+    def _on_step(self) -> bool:
+        self.on_robots_stepped()
+        return True
+
+
+class ResumedTensorBoard(TensorBoardOutputFormat):
+    """TensorBoard's files; what an interrupted run wrote beyond ``steps`` is no longer shown."""
+
+    def __init__(self, folder: Path, steps: int) -> None:
+        self.writer = SummaryWriter(str(folder), purge_step=steps or None)
+        self._is_closed = False

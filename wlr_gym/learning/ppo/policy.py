@@ -20,7 +20,6 @@ from pydantic import Field, PositiveInt, model_validator
 from wlr_gym.base.errors import LARGEST_SEED, InputError, require_package
 from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.policy import contract_of
-from wlr_gym.robot import LEGS, WHEELS
 
 if TYPE_CHECKING:
     import torch
@@ -92,12 +91,6 @@ class PpoConfig(SettingsModel):
     torch_threads: int = Field(1, gt=0)
     environment: dict[str, Any] = Field(default_factory=dict)
     tasks: dict[str, dict[str, Any]] = Field(default_factory=dict)
-
-    def initial_log_stds(self) -> tuple[float, ...]:
-        """Return the logarithm of the exploration noise of each joint at the start."""
-        given = self.initial_log_std
-        legs, wheels = given if isinstance(given, tuple) else (given, given)
-        return (legs,) * len(LEGS) + (wheels,) * len(WHEELS)
 
     @model_validator(mode="after")
     def _whole_batches(self) -> PpoConfig:
@@ -174,11 +167,7 @@ def saved_weights(folder: Path) -> Mapping[str, Any]:
 
 
 def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
-    """Return the ONNX model of the trained policy of a folder: observations (N, D) to actions (N, 8); see ``with_learner``.
-
-    Raises:
-        MissingPackageError: a package is not installed.
-    """
+    """Return the ONNX model of the trained policy of a folder: observations (N, D) to actions (N, 8); see ``with_learner``."""
     require_package("torch", "train")
     require_package("onnxscript", "export")
 
@@ -188,11 +177,7 @@ def export_network(folder: Path, contract: Mapping[str, Any]) -> bytes:
 
 
 def settings_to_start_from(source: str | Path) -> dict[str, Any]:
-    """Return the settings of a fine-tuning: those of the policy's training, at the rate at which it ended.
-
-    Raises:
-        InputError: no policy there, or one that PPO did not train.
-    """
+    """Return the settings of a fine-tuning: those of the policy's training, at the rate at which it ended."""
     contract = contract_to_start_from(source)
     settings = dict(contract["config"])
     settings["learning_rate"] = settings.get("final_learning_rate", PpoConfig.model_fields["final_learning_rate"].default)
@@ -201,11 +186,7 @@ def settings_to_start_from(source: str | Path) -> dict[str, Any]:
 
 
 def with_network_of(config: PpoConfig, source: str | Path) -> PpoConfig:
-    """Return settings with the network of a policy.
-
-    Raises:
-        InputError: no policy there, or one that PPO did not train.
-    """
+    """Return settings with the network of a policy."""
     own = contract_to_start_from(source)["config"]
     return parse_settings({**config.model_dump(), **{name: own[name] for name in NETWORK if name in own}})
 

@@ -13,8 +13,9 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,14 +23,13 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 from rich.console import Console
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file
+from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
 from wlr_gym.envs.core import Core
@@ -37,10 +37,10 @@ from wlr_gym.envs.sb3 import Sb3VecEnv
 from wlr_gym.learning.curves import METRICS, CurveFile, best_of, is_better, read_curve
 from wlr_gym.learning.evaluation.metrics import summarise
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
-from wlr_gym.learning.ppo import sb3
-from wlr_gym.learning.ppo.networks import MirroredBuffer, MirroredDictBuffer, grouped, normalisers, set_mirror
+from wlr_gym.learning.ppo import networks
 from wlr_gym.learning.ppo.policy import MODEL_FILE, PpoConfig, PpoPolicy, network_kind, parse_settings, with_network_of
 from wlr_gym.policy import Training, TrainingProgress, fed_environment, read_contract, write_contract
+from wlr_gym.robot import LEGS, WHEELS
 
 #: Control steps over which observations are gathered for their scales.
 GATHERED = 100
@@ -58,7 +58,7 @@ def run_training(training: Training) -> Path:
     Raises:
         InputError: bad settings, or a policy to start from that does not fit.
         KeyboardInterrupt: stopped by Ctrl-C or SIGTERM, after a checkpoint was saved; the message says how to resume.
-        TrainingError: a loss, weight or observation is not finite; the message names the file with the state.
+        TrainingError: a loss, weight or observation is not finite.
         Exception: what ``on_update`` raised, after a checkpoint was saved.
     """
     config = parse_settings(training.config)
@@ -74,7 +74,13 @@ def run_training(training: Training) -> Path:
             restore_checkpoint(checkpoints[-1], model, env)
         else:
             _begin(training, config, env, model)
-        _record(training, config)
+        if training.resume:
+            write_yaml(training.folder / "provenance_resumed.yaml", provenance(config.seed))
+        else:
+            make_output_folder(training.folder)  # only now: bad settings leave nothing behind
+            settings = {"environment": training.environment, "agent": "ppo", "settings": config.model_dump(mode="json")}
+            settings |= {} if training.init is None else {"init": str(training.init)}
+            record_provenance(training.folder, settings, config.seed)
         return _train(training, config, env, model)
     finally:
         torch.set_num_threads(threads)
@@ -103,26 +109,15 @@ def gather_scales(model: PPO, env: Sb3VecEnv) -> None:
     """Let the untrained policy drive, and normalise observations by their mean and deviation there; the steps count."""
     groups = []
     for _ in range(GATHERED):
-        seen = sb3.last_observations(model)
-        groups.append(grouped(seen))
+        seen = networks.last_observations(model)
+        groups.append(networks.grouped(seen))
         actions, _ = model.predict(seen, deterministic=False)
-        sb3.go_on_from(model, env.step(np.clip(actions, -1.0, 1.0))[0])
+        networks.go_on_from(model, env.step(np.clip(actions, -1.0, 1.0))[0])
     rows = {name: torch.as_tensor(np.concatenate([one[name] for one in groups])) for name in groups[0]}
-    for normaliser in normalisers(model.policy):
+    for normaliser in networks.normalisers(model.policy):
         wide = normaliser.mean.shape[0] > rows["policy"].shape[1]
         normaliser.take(torch.cat(list(rows.values()), dim=1) if wide else rows["policy"])
     model.num_timesteps += GATHERED * env.num_envs
-
-
-def _record(training: Training, config: PpoConfig) -> None:
-    if training.resume:
-        write_yaml(training.folder / "provenance_resumed.yaml", provenance(config.seed))
-        return
-    make_output_folder(training.folder)  # only now: bad settings leave nothing behind
-    settings = {"environment": training.environment, "agent": "ppo", "settings": config.model_dump(mode="json")}
-    if training.init is not None:
-        settings["init"] = str(training.init)
-    record_provenance(training.folder, settings, config.seed)
 
 
 def learning_rate(config: PpoConfig) -> Callable[[float], float]:
@@ -136,6 +131,7 @@ def learning_rate(config: PpoConfig) -> Callable[[float], float]:
 def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
     """Return an untrained Stable-Baselines3 PPO with the configured settings."""
     asymmetric = isinstance(env.observation_space, spaces.Dict)
+    mirrored = networks.MirroredDictBuffer if asymmetric else networks.MirroredBuffer
     kind, keywords = network_kind(config, env.contract(), asymmetric=asymmetric)
     model = PPO(
         kind,
@@ -154,67 +150,66 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
         policy_kwargs=keywords,
         seed=config.seed,
         device="cpu",
-        rollout_buffer_class=(MirroredDictBuffer if asymmetric else MirroredBuffer) if config.mirror else None,
+        rollout_buffer_class=mirrored if config.mirror else None,
     )
+    noise = config.initial_log_std
+    legs, wheels = noise if isinstance(noise, tuple) else (noise, noise)
     with torch.no_grad():
-        model.policy.get_parameter("log_std").copy_(torch.tensor(config.initial_log_stds()))
+        model.policy.get_parameter("log_std").copy_(torch.tensor((legs,) * len(LEGS) + (wheels,) * len(WHEELS)))
     if config.mirror:
-        set_mirror(model.rollout_buffer, env)
+        networks.set_mirror(model.rollout_buffer, env)
     return model
 
 
 def _train(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) -> Path:
-    with StopRequest() as stop:  # before the first file: who sees one and presses Ctrl-C finds a checkpoint
-        log = TrainingLog(training, config, env, model)
-        try:
-            meter = Meter(env.core, training.folder / "failure.npz")
-            sb3.begin_learning(model, config.total_steps - model.num_timesteps, meter)
-            with _progress(training, config, model.num_timesteps) as show:
-                if not log.scores:
-                    log.score()
-                _updates(log, meter, stop, show)
-            place = log.save_checkpoint()
-            if stop.requested:
-                raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {training.folder}")
-            if model.num_timesteps >= config.total_steps:
+    with (
+        StopRequest() as stop,  # before the first file: who sees one and presses Ctrl-C finds a checkpoint
+        closing(TrainingLog(training, config, env, model)) as log,
+    ):
+        meter = Meter(env.core)
+        networks.begin_learning(model, config.total_steps - model.num_timesteps, meter)
+        with progress(Console(), shown=training.progress) as tell:
+            if not log.scores:
                 log.score()
-            return log.save_policy()
-        finally:
-            log.close()
+            _updates(log, meter, stop, partial(tell, ""))
+        place = log.save_checkpoint()
+        if stop.requested:
+            raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {training.folder}")
+        if model.num_timesteps >= config.total_steps:
+            log.score()
+        return log.save(training.folder / "policy")
 
 
-def _updates(log: TrainingLog, meter: Meter, stop: StopRequest, show: Callable[[TrainingProgress], None]) -> None:
+def _updates(log: TrainingLog, meter: Meter, stop: StopRequest, tell: Callable[[str, float], object]) -> None:
     """Update until the steps or the time are over, or somebody asks to stop."""
     training, config, model = log.training, log.config, log.model
     began, first = time.monotonic(), model.num_timesteps
-    stopped = False
-    while model.num_timesteps < config.total_steps and not (stop.requested or stopped):
+    while model.num_timesteps < config.total_steps and not stop.requested:
         if training.max_seconds is not None and time.monotonic() - began > training.max_seconds:
             return
         before = model.num_timesteps
         log.env.set_progress(before)
         row = update(model, meter, config)
-        seconds = time.monotonic() - began
-        row |= {"seconds": seconds, "steps_per_second": (model.num_timesteps - first) / seconds}
+        seconds, now = time.monotonic() - began, model.num_timesteps
+        row |= {"seconds": seconds, "steps_per_second": (now - first) / seconds}
         log.update(row)
-        if config.evaluate_every and _crossed(config.evaluate_every, before, model.num_timesteps):
+        if config.evaluate_every and now // config.evaluate_every > before // config.evaluate_every:
             log.score()
-        if _crossed(config.checkpoint_every, before, model.num_timesteps):
+        if now // config.checkpoint_every > before // config.checkpoint_every:
             log.save_checkpoint()
-        progress = TrainingProgress(training.folder, model.num_timesteps, config.total_steps, row, log.scores)
-        show(progress)
+        done = TrainingProgress(training.folder, now, config.total_steps, row, log.scores)
+        score = f"reward {row['reward_per_second']:.3f}/s"
+        if "tracking_error" in log.scores:
+            score = f"held-out error {log.scores['tracking_error']:.3f}"
+        tell(f"training: {score}, {row['steps_per_second']:,.0f} steps/s", (now - first) / (config.total_steps - first))
         if training.on_update is not None:
             try:
-                training.on_update(progress)
+                training.on_update(done)
             except BaseException:
                 log.save_checkpoint()
                 raise
-            stopped = progress.stop_requested
-
-
-def _crossed(every: int, before: int, now: int) -> bool:
-    """Whether a multiple of ``every`` steps was reached."""
-    return now // every > before // every
+            if done.stop_requested:
+                return
 
 
 def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:
@@ -225,29 +220,32 @@ def begin_episodes(model: PPO, env: Sb3VecEnv, seed: int) -> None:
     """
     env.set_progress(model.num_timesteps)
     env.seed(int(np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1, np.uint32)[0]))
-    sb3.go_on_from(model, env.reset(), np.ones(env.num_envs, bool))
+    networks.go_on_from(model, env.reset(), np.ones(env.num_envs, bool))
     env.core.episodes.sooner[:] = np.arange(env.num_envs) * env.core.limit // env.num_envs
 
 
 def update(model: PPO, meter: Meter, config: PpoConfig) -> dict[str, float]:
     """Collect samples, improve the networks, and return the row of the learning curve."""
     assert model.env is not None
+    reason = ""
     try:
         model.collect_rollouts(model.env, meter, model.rollout_buffer, n_rollout_steps=config.steps_per_env)
         schedule = config.schedule_steps or config.total_steps
-        sb3.set_share_done(model, min(model.num_timesteps, schedule), schedule)
+        networks.set_share_done(model, min(model.num_timesteps, schedule), schedule)
         if config.desired_kl is not None:  # the rate is the optimiser's own, which checkpoints keep
             model.lr_schedule = ConstantSchedule(model.policy.optimizer.param_groups[0]["lr"])
         model.train()
         if config.desired_kl is not None:
             adapt_rate(model, config.desired_kl)
     except FloatingPointError as error:
-        meter.fail(str(error))
+        reason = str(error)
     except ValueError:  # torch refuses a distribution that is not finite
         if _healthy(model):
             raise
-    if not _healthy(model):
-        meter.fail("a weight of the network, or its exploration noise, is not finite")
+    if not reason and not _healthy(model):
+        reason = "a weight of the network, or its exploration noise, is not finite"
+    if reason:
+        raise TrainingError(f"{reason} after {model.num_timesteps} steps")
     logged = model.logger.name_to_value
     losses = {name: float(logged.get(f"train/{name}", math.nan)) for name in LOSSES}
     return {"steps": model.num_timesteps, **meter.take(), **losses}
@@ -273,21 +271,15 @@ def _healthy(model: PPO) -> bool:
 
 
 class TrainingError(RuntimeError):
-    """Training met a number that is not finite; the message names the file with the state it happened in."""
+    """Training met a number that is not finite; the same seed meets it again, also from the newest checkpoint."""
 
 
-class Meter(sb3.StepWatcher):
-    """Watches every environment step of an update: sums up what the learning curve shows and stops at non-finite numbers.
+class Meter(networks.StepWatcher):
+    """Watches every environment step of an update: sums up what the learning curve shows and stops at non-finite numbers."""
 
-    Args:
-        core: the batch of robots.
-        dump: file to write the state to when a number is not finite.
-    """
-
-    def __init__(self, core: Core, dump: Path) -> None:
+    def __init__(self, core: Core) -> None:
         super().__init__()
         self.core = core
-        self.dump = dump
         self._clear()
 
     def _clear(self) -> None:
@@ -298,8 +290,8 @@ class Meter(sb3.StepWatcher):
     def on_robots_stepped(self) -> None:
         """Add up a step."""
         rewards, dones = self.locals["rewards"], self.locals["dones"]
-        if not all(np.isfinite(array).all() for array in (rewards, *_arrays("", self.locals["new_obs"]).values())):
-            self.fail("an observation or reward is not finite")
+        if not all(np.isfinite(array).all() for array in (rewards, *networks.grouped(self.locals["new_obs"]).values())):
+            raise TrainingError(f"an observation or reward is not finite after {self.num_timesteps} steps")
         going_on = ~dones
         slip = self.core.plant.truth()["slip_velocity"].reshape(-1, 4, 2)
         self._ticks += 1
@@ -311,16 +303,6 @@ class Meter(sb3.StepWatcher):
             self._episodes += 1
             self._falls += not self.locals["infos"][row]["TimeLimit.truncated"]
 
-    def fail(self, reason: str) -> None:
-        """Write the state to the dump file and raise :class:`TrainingError`."""
-        arrays: dict[str, Any] = {}
-        for name in ("actions", "new_obs", "obs_tensor", "rewards"):
-            arrays |= _arrays(name, self.locals[name]) if name in self.locals else {}
-        episodes = self.core.episodes
-        arrays |= {"parameters": self.core.parameters.values, "robot_seeds": episodes.robot_seeds, "ticks": episodes.steps}
-        replace_file(self.dump, lambda temporary: np.savez(temporary, **arrays))  # type: ignore[arg-type]
-        raise TrainingError(f"{reason} after {self.num_timesteps} steps; state written to {self.dump}")
-
     def take(self) -> dict[str, float]:
         """Return the means since the last call, rewards per second; terms and slip over robots whose episode continued."""
         period = self.core.task.config.control_period
@@ -330,13 +312,6 @@ class Meter(sb3.StepWatcher):
         means |= {"slip_speed": self._slip / max(self._robots, 1), "episodes": self._episodes, "falls": self._falls}
         self._clear()
         return means
-
-
-def _arrays(name: str, value: Any) -> dict[str, NDArray]:
-    """Return an observation, or anything else, as arrays by name: groups of an observation apart."""
-    if isinstance(value, Mapping):
-        return {f"{name}.{group}": np.asarray(part) for group, part in value.items()}
-    return {name: np.asarray(value)}
 
 
 # ---- what a training writes ------------------------------------------------------------------------------------------
@@ -370,7 +345,7 @@ class TrainingLog:
         self.scores: Mapping[str, float] = rows[-1] if rows else {}
         self.best: Mapping[str, float] = best_of(rows)
         self._episodes = HeldOutEpisodes(training.environment, config) if config.evaluate_every else None
-        model.set_logger(Logger(str(folder), [sb3.ResumedTensorBoard(folder / "tensorboard", steps)]))
+        model.set_logger(Logger(str(folder), [networks.ResumedTensorBoard(folder / "tensorboard", steps)]))
 
     def close(self) -> None:
         """Release the plant of the held-out episodes; the files are complete at any time."""
@@ -400,21 +375,18 @@ class TrainingLog:
         self.model.logger.dump(step=steps)
         if is_better(self.scores, self.best):
             self.best = self.scores
-            self._save(self.training.folder / BEST)
+            self.save(self.training.folder / BEST)
 
     def save_checkpoint(self) -> Path:
         """Write a checkpoint that the training can be resumed from; drop the oldest."""
         checkpoints = self.training.folder / CHECKPOINTS
-        place = self._save(checkpoints / f"step_{self.model.num_timesteps:012d}", to_resume=True)  # names sort by steps
+        place = self.save(checkpoints / f"step_{self.model.num_timesteps:012d}", to_resume=True)  # names sort by steps
         for old in sorted(checkpoints.glob("step_*"))[: -self.config.keep_checkpoints]:
             shutil.rmtree(old)
         return place
 
-    def save_policy(self) -> Path:
-        """Write the present policy as that of the run."""
-        return self._save(self.training.folder / "policy")
-
-    def _save(self, place: Path, *, to_resume: bool = False) -> Path:
+    def save(self, place: Path, *, to_resume: bool = False) -> Path:
+        """Write the present policy into a folder; see :func:`write_policy`."""
         notes = {"environment": self.training.environment}
         if self.scores.get("steps") == self.model.num_timesteps:
             notes |= {"held_out": {name: value for name, value in self.scores.items() if name != "steps"}}
@@ -478,10 +450,10 @@ def write_policy(
     if to_resume:
         torch.save(random_state(), temporary / RANDOM_FILE)
         can_set_state = env.core.plant.capabilities.can_set_state
-        robots = (env.get_state() if can_set_state else None, sb3.episode_starts(model))
+        robots = (env.get_state() if can_set_state else None, networks.episode_starts(model))
         (temporary / ROBOTS_FILE).write_bytes(pickle.dumps(robots))
     noise = float(model.policy.get_parameter("log_std").detach().mean())
-    done = {"steps": model.num_timesteps, "updates": sb3.updates_done(model)}
+    done = {"steps": model.num_timesteps, "updates": networks.updates_done(model)}
     training = {**done, "seed": config.seed, "log_std": noise, **notes}
     write_contract(temporary, "ppo", config.model_dump(mode="json"), env.contract(), training)
     shutil.rmtree(folder, ignore_errors=True)
@@ -503,10 +475,10 @@ def restore_checkpoint(folder: Path, model: PPO, env: Sb3VecEnv) -> None:
     except Exception as error:  # zip, pickle and torch each raise their own kinds for a broken file
         raise InputError(f"{folder}: not a readable checkpoint: {error}") from None
     model.num_timesteps = training["steps"]
-    sb3.set_updates_done(model, training["updates"])
-    sb3.go_on_from(model, env.reset(), np.ones(env.num_envs, bool))
+    networks.set_updates_done(model, training["updates"])
+    networks.go_on_from(model, env.reset(), np.ones(env.num_envs, bool))
     if snapshot is not None:
-        sb3.go_on_from(model, env.set_state(snapshot), starts)
+        networks.go_on_from(model, env.set_state(snapshot), starts)
     set_random_state(state)
 
 
@@ -552,19 +524,3 @@ class StopRequest:
         if self._catching:
             for number, handler in self._previous.items():
                 signal.signal(number, handler)
-
-
-@contextmanager
-def _progress(training: Training, config: PpoConfig, first: int) -> Iterator[Callable[[TrainingProgress], None]]:
-    """Show a progress bar over the steps from the first on; yields a function that is told how far the training is."""
-    with progress(Console(), shown=training.progress) as tell:
-
-        def show(progress: TrainingProgress) -> None:
-            row, held_out = progress.metrics, progress.held_out
-            score = f"reward {row['reward_per_second']:.3f}/s"
-            if "tracking_error" in held_out:
-                score = f"held-out error {held_out['tracking_error']:.3f}"
-            share = (progress.steps - first) / (config.total_steps - first)
-            tell("", f"training: {score}, {row['steps_per_second']:,.0f} steps/s", share)
-
-        yield show

@@ -57,9 +57,6 @@ def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path
     """Put a trained policy into ``model``, so that the finished one would act as it does.
 
     Where its critic is not known, a critic is fitted; the steps of that count.
-
-    Raises:
-        InputError: a policy that does not fit the environment, naming the first difference.
     """
     place, contract = find_policy(source), contract_to_start_from(source)
     check_contract(contract["environment"], env.contract(), str(source))
@@ -73,8 +70,11 @@ def start_from(model: PPO, env: Sb3VecEnv, config: PpoConfig, source: str | Path
     needed = [name for name in own if not name.startswith(ACTOR)]
     if all(name in learner and learner[name].shape == own[name].shape for name in needed):
         model.policy.load_state_dict({**own, **{name: learner[name] for name in needed}})
-    else:
-        fit_critic(model, env, config, load_policy(source, env.contract()))
+    else:  # the policy drives, which counts as training, and a critic is fitted to it
+        ticks = min(env.core.limit, 2 * _horizon(config))
+        observations, _, returns = _demonstrate(env, load_policy(source, env.contract()), config, ticks)
+        _fit(model, observations, None, torch.as_tensor(returns), config.seed)
+        model.num_timesteps += ticks * env.num_envs
 
 
 def _file_weights(place: Path) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
@@ -86,14 +86,6 @@ def _file_weights(place: Path) -> tuple[dict[str, torch.Tensor], dict[str, torch
     constants = {one.name: torch.from_numpy(numpy_helper.to_array(one).copy()) for one in onnx.load(place).graph.initializer}
     acting = {name: value for name, value in constants.items() if name[0].isdigit()}
     return acting, {name.removeprefix(LEARNER): value for name, value in constants.items() if name.startswith(LEARNER)}
-
-
-def fit_critic(model: PPO, env: Sb3VecEnv, config: PpoConfig, policy: Policy) -> None:
-    """Fit the critic of ``model`` to a policy that acts; the environment steps that it drives for this count as training."""
-    ticks = min(env.core.limit, 2 * _horizon(config))
-    observations, _, returns = _demonstrate(env, policy, config, ticks)
-    _fit(model, observations, None, torch.as_tensor(returns), config.seed)
-    model.num_timesteps += ticks * env.num_envs
 
 
 def _horizon(config: PpoConfig) -> int:

@@ -1,4 +1,4 @@
-"""What a sweep is to do: settings x seeds as data, read from a file or made from options."""
+"""What a sweep trains: settings x seeds as data, read from a file or made from options."""
 
 from __future__ import annotations
 
@@ -17,15 +17,13 @@ from pydantic import Field, model_validator
 
 from wlr_gym.base.errors import LARGEST_SEED, InputError
 from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml, require_keys
-from wlr_gym.envs.registry import task_name_of
-from wlr_gym.learning.training import check_environment_settings, settings_of, with_robot
-from wlr_gym.policy.agents import agent_function, apply_changes, for_task, load_agent
+from wlr_gym.learning.training import check_environment_settings, settings_of
+from wlr_gym.policy.agents import agent_function, apply_changes, load_agent
 
 #: Setting of a trial that names one of the plan's ``variants``.
 VARIANT = "variant"
 #: Early stopping: after 1/9 and 1/3 of the steps the best third so far goes on; scores are needed at least so often.
-REDUCTION, RUNGS = 3, 2
-SCORES = REDUCTION**RUNGS
+REDUCTION, SCORES = 3, 9
 #: Characters of a trial's name before it is cut and a hash of its settings added.
 _LONGEST = 120
 
@@ -85,6 +83,36 @@ class SearchPlan(SettingsModel):
     seed: int = Field(0, ge=0)
 
 
+@dataclass(frozen=True)
+class Trial:
+    """One training of a sweep.
+
+    Attributes:
+        settings: dotted name -> value: what this trial sets.
+        seed: of everything random in it.
+    """
+
+    settings: Mapping[str, Any]
+    seed: int
+
+    @property
+    def label(self) -> str:
+        """Its settings as text that a folder may be called: ``learning_rate=0.001,gamma=0.97``."""
+        parts = []
+        for name, value in self.settings.items():
+            text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+            parts.append(f"{name}=" + re.sub(r"[^\w.,+=-]", "_", text))
+        label = ",".join(parts)
+        if len(label) <= _LONGEST:
+            return label
+        return f"{label[:_LONGEST]}-{hashlib.sha256(json.dumps(dict(self.settings)).encode()).hexdigest()[:8]}"
+
+    @property
+    def name(self) -> str:
+        """Name of its run folder: settings and seed."""
+        return ",".join(filter(None, (self.label, f"seed={self.seed}")))
+
+
 Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
 
 
@@ -125,19 +153,16 @@ class SweepPlan(SettingsModel):
         if "seed" in self.space:
             raise InputError("space: 'seed' is none of its settings; give 'seeds'")
         groups: dict[str, Mapping[str, Any]] = {"space": self.space}
-        for name, changes in self.variants.items():
-            groups[f"variants: {name}"] = changes
-            for key in changes:
-                if key == "seed" or key in self.space:
-                    raise InputError(f"variants: '{name}' sets '{key}', which 'seeds' or 'space' sets too")
-        for where, values in groups.items():
-            for key, value in values.items():
-                if key.partition(".")[0] == "tasks":
-                    raise InputError(f"{where}: '{key}' comes too late: 'tasks' is read with the file; name the setting itself")
-                try:
-                    json.dumps(None if isinstance(value, NumberRange) else value)
-                except TypeError as error:
-                    raise InputError(f"{where}: {key}: {value!r} is no setting: {error}; put words into quotes") from None
+        groups |= {f"variants: {name}": changes for name, changes in self.variants.items()}
+        for where, key, value in [(where, *item) for where, group in groups.items() for item in group.items()]:
+            if where != "space" and (key == "seed" or key in self.space):
+                raise InputError(f"{where} sets '{key}', which 'seeds' or 'space' sets too")
+            if key.partition(".")[0] == "tasks":
+                raise InputError(f"{where}: '{key}' comes too late: 'tasks' is read with the file; name the setting itself")
+            try:
+                json.dumps(None if isinstance(value, NumberRange) else value)
+            except TypeError as error:
+                raise InputError(f"{where}: {key}: {value!r} is no setting: {error}; put words into quotes") from None
         ranges = [name for name, values in self.space.items() if isinstance(values, NumberRange)]
         if ranges and (self.search is None or self.search.method == "grid"):
             raise InputError(f"space: {', '.join(ranges)} is a range: give a list, or search with 'random' or 'optuna'")
@@ -160,16 +185,51 @@ class SweepPlan(SettingsModel):
         """Held-out score that decides which settings are best."""
         return self.search.metric if self.search else "tracking_error"
 
+    def known_settings(self) -> list[dict[str, Any]] | None:
+        """Return the settings that are tried, in order: of the grid, or drawn at random; None where results decide (Optuna)."""
+        if self.search is not None and self.search.method == "optuna":
+            return None
+        if self.search is not None and self.search.method == "random":
+            random = np.random.default_rng(self.search.seed)
+            drawn = [self.draw(random) for _ in range(self.search.trials)]
+            return list({Trial(settings, 0).label: settings for settings in drawn}.values())  # each once
+        lists = [values for values in self.space.values() if isinstance(values, list)]
+        return [dict(zip(self.space, values, strict=True)) for values in itertools.product(*lists)]
+
+    def draw(self, random: np.random.Generator) -> dict[str, Any]:
+        """Return random settings out of the space."""
+        return {
+            name: values.draw(random) if isinstance(values, NumberRange) else values[random.integers(len(values))]
+            for name, values in self.space.items()
+        }
+
+    def settings_of(self, trial: Trial) -> dict[str, Any]:
+        """Return all settings of a trial, as ``wlr train`` takes them."""
+        settings, own = copy.deepcopy(self.settings), dict(trial.settings)
+        changes = self.variants.get(own.pop(VARIANT, ""), {}) | own
+        apply_changes(settings, [f"{name}={json.dumps(value)}" for name, value in changes.items()])
+        return settings | {"seed": trial.seed}
+
 
 def read_plan(path: Path, changes: Mapping[str, Any] | None = None) -> SweepPlan:
-    """Read a plan; ``changes`` are fields laid over the file's.
-
-    Raises:
-        InputError: broken, an unknown field, a bad value.
-    """
+    """Read a plan; ``changes`` are fields laid over the file's."""
     content = read_yaml(path)
     require_keys(SweepPlan, content, str(path))
     return parse_config(SweepPlan, merge_changes(content, changes or {}), str(path))
+
+
+def trials_of(settings: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Trial]:
+    """Return the trials of settings x seeds.
+
+    Raises:
+        InputError: two of them have one name.
+    """
+    found: dict[str, Trial] = {}
+    for trial in (Trial(chosen, seed) for chosen in settings for seed in seeds):
+        if (other := found.setdefault(trial.name, trial)) is not trial:
+            same = "the same value is given twice" if other == trial else f"{dict(other.settings)} and {dict(trial.settings)}"
+            raise InputError(f"two trials are called '{trial.name}': {same}")
+    return list(found.values())
 
 
 def resolve(plan: SweepPlan) -> SweepPlan:
@@ -179,130 +239,34 @@ def resolve(plan: SweepPlan) -> SweepPlan:
         InputError: unknown agent, config, environment or setting, a value that no trial can have, or two trials of one name.
     """
     agent_function(plan.agent, "train")
-    own = for_task(plan.settings, task_name_of(plan.environment))
-    settings = with_robot(merge_changes(settings_of(plan.environment, plan.config, plan.agent, plan.init), own))
-    if plan.search is not None and plan.search.early_stopping and isinstance(settings.get("total_steps"), int):
+    settings = settings_of(plan.environment, plan.config, plan.agent, plan.init, settings=plan.settings)
+    early = plan.search is not None and plan.search.early_stopping
+    if early and isinstance(settings.get("total_steps"), int):
         settings.setdefault("evaluate_every", max(1, settings["total_steps"] // SCORES))
     init = plan.init if plan.init is None or not Path(plan.init).exists() else str(Path(plan.init).resolve())
     whole = plan.model_copy(update={"config": None, "settings": settings, "init": init})
-    _check(whole)
+    drawn = whole.draw(np.random.default_rng(0))
+    every_variant = [drawn | {VARIANT: name} for name in whole.variants] if whole.search else []  # a search may try few of them
+    for several in (whole.known_settings() or [drawn], every_variant):
+        for trial in trials_of(several, whole.seed_list)[:: len(whole.seed_list)]:
+            chosen = whole.settings_of(trial)
+            try:
+                check_environment_settings(chosen)
+                if hasattr(load_agent(whole.agent), "check_settings"):  # the agent can tell whether it could begin to train
+                    agent_function(whole.agent, "check_settings")(chosen)
+            except InputError as error:
+                raise InputError(f"trial {trial.name}: {error}") from None
+    if early:
+        _check_early_stopping(whole)
     return whole
 
 
-def _check(plan: SweepPlan) -> None:
-    """Refuse what no trial could do, before any begins."""
-    drawn = draw(plan, np.random.default_rng(0))
-    known = known_settings(plan) or [drawn]
-    variants = [drawn | {VARIANT: name} for name in plan.variants] if plan.search else []  # a search may begin with few of them
-    for several in (known, variants):
-        trials_of(several, plan.seed_list)  # no name twice
-        for settings in several:
-            trial = trial_of(settings, plan.seed_list[0])
-            whole = whole_settings(plan, trial)
-            try:
-                check_environment_settings(whole)
-                check_settings(plan.agent, whole)
-            except InputError as error:
-                raise InputError(f"trial {trial.name}: {error}") from None
-    if plan.search is None or not plan.search.early_stopping:
-        return
+def _check_early_stopping(plan: SweepPlan) -> None:
     total, every = plan.settings.get("total_steps"), plan.settings.get("evaluate_every")
     if not isinstance(total, int) or not isinstance(every, int) or not 0 < every <= total // SCORES:
         raise InputError(
             f"early_stopping: settings 'evaluate_every' = {every} and 'total_steps' = {total}: expected scores at least every "
             "ninth of the steps; set evaluate_every"
         )
-    if "total_steps" in plan.space or any("total_steps" in changes for changes in plan.variants.values()):
+    if any("total_steps" in changes for changes in (plan.space, *plan.variants.values())):
         raise InputError("early_stopping: trials must be comparable at equal steps: 'total_steps' cannot be searched")
-
-
-def check_settings(agent: str, settings: Mapping[str, Any]) -> None:
-    """Refuse settings with which an agent cannot begin to train on this machine, if the agent can tell.
-
-    Raises:
-        InputError: unknown, or a bad value.
-        MissingPackageError: a package is not installed.
-    """
-    if hasattr(load_agent(agent), "check_settings"):
-        agent_function(agent, "check_settings")(settings)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One training of a sweep.
-
-    Attributes:
-        name: of its run folder: settings and seed.
-        settings: dotted name -> value: what this trial sets.
-        seed: of everything random in it.
-    """
-
-    name: str
-    settings: Mapping[str, Any]
-    seed: int
-
-    @property
-    def label(self) -> str:
-        """Its settings without its seed."""
-        return label_of(self.settings)
-
-
-def trial_of(settings: Mapping[str, Any], seed: int) -> Trial:
-    """Return the trial of some settings with a seed."""
-    label = label_of(settings)
-    return Trial(f"{label},seed={seed}" if label else f"seed={seed}", settings, seed)
-
-
-def trials_of(settings: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> list[Trial]:
-    """Return the trials of settings x seeds.
-
-    Raises:
-        InputError: two of them have one name.
-    """
-    trials = [trial_of(chosen, seed) for chosen in settings for seed in seeds]
-    known: dict[str, Trial] = {}
-    for trial in trials:
-        other = known.setdefault(trial.name, trial)
-        if other is not trial:
-            same = "the same value is given twice" if other == trial else f"{dict(other.settings)} and {dict(trial.settings)}"
-            raise InputError(f"two trials are called '{trial.name}': {same}")
-    return trials
-
-
-def label_of(settings: Mapping[str, Any]) -> str:
-    """Return settings as text that a folder may be called: ``learning_rate=0.001,gamma=0.97``."""
-    texts = (value if isinstance(value, str) else json.dumps(value, separators=(",", ":")) for value in settings.values())
-    plain = (re.sub(r"[^\w.,+=-]", "_", text) for text in texts)
-    label = ",".join(f"{name}={text}" for name, text in zip(settings, plain, strict=True))
-    if len(label) <= _LONGEST:
-        return label
-    return f"{label[:_LONGEST]}-{hashlib.sha256(json.dumps(dict(settings)).encode()).hexdigest()[:8]}"
-
-
-def whole_settings(plan: SweepPlan, trial: Trial) -> dict[str, Any]:
-    """Return all settings of a trial, as ``wlr train`` takes them."""
-    settings = copy.deepcopy(plan.settings)
-    own = dict(trial.settings)
-    changes = plan.variants.get(own.pop(VARIANT, ""), {}) | own
-    apply_changes(settings, [f"{name}={json.dumps(value)}" for name, value in changes.items()])
-    return settings | {"seed": trial.seed}
-
-
-def known_settings(plan: SweepPlan) -> list[dict[str, Any]] | None:
-    """Return the settings that are tried, in order: of the grid, or drawn at random; None where results decide (Optuna)."""
-    if plan.search is not None and plan.search.method == "optuna":
-        return None
-    if plan.search is not None and plan.search.method == "random":
-        random = np.random.default_rng(plan.search.seed)
-        drawn = [draw(plan, random) for _ in range(plan.search.trials)]
-        return list({label_of(settings): settings for settings in drawn}.values())  # each once
-    lists = [values for values in plan.space.values() if isinstance(values, list)]
-    return [dict(zip(plan.space, values, strict=True)) for values in itertools.product(*lists)]
-
-
-def draw(plan: SweepPlan, random: np.random.Generator) -> dict[str, Any]:
-    """Return random settings out of the space."""
-    return {
-        name: values.draw(random) if isinstance(values, NumberRange) else values[random.integers(len(values))]
-        for name, values in plan.space.items()
-    }

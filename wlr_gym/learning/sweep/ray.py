@@ -6,29 +6,26 @@ that are over say their scores again, the others go on from their checkpoints, a
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import shutil
 import socket
-from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.base import jobs as jobs_module
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended, Job, follow
 from wlr_gym.learning.curves import METRICS
-from wlr_gym.learning.sweep.plan import REDUCTION, SCORES, SearchPlan, SweepPlan, Trial, trial_of
+from wlr_gym.learning.sweep.book import Book
+from wlr_gym.learning.sweep.plan import REDUCTION, SCORES, SweepPlan, Trial
 from wlr_gym.learning.sweep.trial import job_of
 
 #: Address that means: start Ray on this machine.
 LOCAL = "local"
 #: How often a job is started again after its node was lost.
 RETRIES = 20
-#: Which nodes may be used, as Ray takes it; empty = all.
-NodeSelector = Mapping[str, str]
 #: Score of a trial that failed, worse than any (negative where more is better).
 _WORST = 1e9
 
@@ -48,7 +45,6 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     os.environ.setdefault("RAY_worker_niceness", "0")  # 15 otherwise: trials would stand still beside other work
     import ray
-    from ray import cloudpickle
 
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     try:
@@ -62,170 +58,43 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
     except Exception as error:  # Ray raises that itself where a node takes more than 30 s to start
         what = "Ray cannot be started" if address == LOCAL else "no Ray cluster answers"
         raise InputError(f"--ray {address}: {what}: {next(iter(str(error).splitlines()), type(error).__name__)}") from None
-    whole = (jobs_module, importlib.import_module(__name__))  # sent whole: nodes that lack this package can then say so
-    for module in whole:
-        cloudpickle.register_pickle_by_value(module)
     try:
         yield
     finally:
-        for module in whole:
-            cloudpickle.unregister_pickle_by_value(module)
         ray.shutdown()
 
 
-def spread_on_ray(jobs: Iterable[Job], nodes: NodeSelector, at_once: int | None = None) -> Generator[Ended, None, None]:
+def spread_on_ray(jobs: Iterable[Job], at_once: int | None = None) -> Generator[Ended, None, None]:
     """Run jobs on the connected cluster, a core each; yield how each ended, as it does.
 
     A job whose node is lost is started again on another one.
 
     Args:
         jobs: what to run; their logs lie on storage that all nodes share.
-        nodes: of :func:`fit_nodes`.
         at_once: most jobs at a time; None = as many as the cluster has cores.
     """
     import ray
+    from ray.exceptions import RayError
 
-    left, running = list(jobs)[::-1], {}
-    run = ray.remote(num_cpus=1, max_retries=RETRIES)(run_on_node).options(label_selector=dict(nodes))
+    left, running = list(jobs), {}
+    run = ray.remote(num_cpus=1, max_retries=RETRIES)(lambda job: follow(job, lambda said: None))
     try:
         while left or running:
             while left and (at_once is None or len(running) < at_once):
-                job = left.pop()
+                job = left.pop(0)
                 running[run.remote(job)] = job
-            ready, _ = ray.wait(list(running), num_returns=1)
-            yield Ended(running.pop(ready[0]).name, _error(ready[0]))
+            (ready,), _ = ray.wait(list(running), num_returns=1)
+            try:
+                error = ray.get(ready)
+            except RayError as problem:
+                error = f"Ray: {str(problem).strip().splitlines()[0]}"
+            yield Ended(running.pop(ready).name, error)
     finally:
         for reference in running:
             ray.cancel(reference, force=True)
 
 
-def _error(reference: Any) -> str:
-    import ray
-    from ray.exceptions import RayError
-
-    try:
-        return ray.get(reference)
-    except RayError as error:
-        return f"Ray: {str(error).strip().splitlines()[0]}"
-
-
-def fit_nodes(check: Job, say: Callable[[str], object]) -> NodeSelector:
-    """Run a job on every node of the connected cluster and return the nodes on which it ends well.
-
-    Args:
-        check: finds out whether a node has what is needed.
-        say: told of nodes that are left out, and why.
-
-    Raises:
-        InputError: there is none.
-    """
-    import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-    run = ray.remote(num_cpus=0, max_retries=0)(run_on_node)
-    hosts = {
-        node["NodeID"]: f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})" for node in ray.nodes() if node["Alive"]
-    }
-    asked = {
-        node: run.options(scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)).remote(check) for node in hosts
-    }
-    errors = {node: error for node, reference in asked.items() if (error := _error(reference))}
-    for node, error in errors.items():
-        say(f"node {hosts[node]} is left out: {error}")
-    if len(errors) == len(hosts):
-        raise InputError(f"no node of the cluster can train; {hosts[next(iter(errors))]}: {next(iter(errors.values()))}")
-    return {"ray.io/node-id": f"!in({','.join(errors)})"} if errors else {}
-
-
-def run_on_node(job: Job, hear: Callable[[dict[str, Any]], object] = lambda message: None) -> str:
-    """Run a job on the node where this is called, and ``hear`` what it says; return its error, empty where all went well."""
-    try:
-        importlib.import_module("wlr_gym")
-    except ImportError as error:
-        return f"{error}; it needs wlr-gym[train], the version that started this"
-    folder = os.path.dirname(job.log)
-    if not os.path.isdir(folder):
-        return f"it does not see {folder}: all nodes must share that storage"
-    return follow(job, hear)
-
-
 # ---- searches by Ray Tune --------------------------------------------------------------------------------------------
-
-
-def search_with_tune(
-    plan: SweepPlan,
-    out: Path,
-    first: Sequence[Mapping[str, Any]],
-    stopped: Container[str],
-    nodes: NodeSelector,
-    at_once: int | None,
-    began: Callable[[Trial], object],
-    ended: Callable[[Trial, str, bool], object],
-) -> None:
-    """Search on the connected cluster; each settings is trained with the first seed.
-
-    Args:
-        plan: with a search.
-        out: folder of the sweep.
-        first: settings that are tried first: all of a grid or of random ones, or what Optuna chose before an interruption.
-        stopped: names of trials that were stopped early before.
-        nodes: of :func:`fit_nodes`.
-        at_once: most trials at a time; None = as many as the cluster has cores.
-        began: told of each trial that begins.
-        ended: told of each trial that is over, its error, and whether it was stopped early.
-    """
-    for name, value in _QUIET.items():
-        os.environ.setdefault(name, value)
-    import optuna
-    from ray import tune
-    from ray.tune.schedulers import ASHAScheduler
-    from ray.tune.search.optuna import OptunaSearch
-
-    search = plan.search
-    assert search is not None
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    mode: dict[str, Any] = {"metric": search.metric, "mode": "min" if METRICS[search.metric] else "max"}
-    searcher = OptunaSearch(
-        space={name: _distribution(values) for name, values in plan.space.items()},
-        # a resumed search draws other numbers than those that are known already
-        sampler=optuna.samplers.TPESampler(seed=search.seed + len(first)),
-        points_to_evaluate=[_coded(plan, settings, json.dumps) for settings in first] or None,
-        **mode,
-    )
-    total = plan.settings.get("total_steps", 0)
-    stopper = ASHAScheduler(
-        time_attr="steps",
-        max_t=total - 1,  # no rung at the end: a trial that gets there writes its policy
-        stop_last_trials=False,
-        grace_period=total // SCORES,
-        reduction_factor=REDUCTION,
-        **mode,
-    ) if search.early_stopping else None  # fmt: skip
-    selector: dict[str, Any] = {"bundle_label_selector": [dict(nodes)]} if nodes else {}
-    storage = out.resolve() / ".ray_tune"
-    tuner = tune.Tuner(
-        tune.with_resources(
-            _trainable(plan, search, out.resolve(), stopped), tune.PlacementGroupFactory([{"CPU": 1.0}], **selector)
-        ),
-        tune_config=tune.TuneConfig(
-            search_alg=searcher,
-            scheduler=stopper,
-            num_samples=max(search.trials, len(first)) if search.method == "optuna" else len(first),
-            max_concurrent_trials=at_once,
-        ),
-        run_config=tune.RunConfig(
-            name="search",
-            storage_path=str(storage),
-            failure_config=tune.FailureConfig(max_failures=RETRIES),  # nodes that are lost; a trial's own error raises nothing
-            callbacks=[_watch(plan, total if search.early_stopping else 0, began, ended)],
-            verbose=0,
-        ),
-    )
-    try:
-        tuner.fit()
-    finally:
-        shutil.rmtree(storage, ignore_errors=True)
-
 
 #: No files of its own for each trial, no warnings, and Ctrl-C ends it.
 _QUIET = {
@@ -237,44 +106,98 @@ _QUIET = {
 }
 
 
-def _trainable(plan: SweepPlan, search: SearchPlan, out: Path, stopped: Container[str]) -> Callable[[Mapping[str, Any]], None]:
-    """Return what Tune runs on a node: a trial's job, whose scores it hears."""
+def search_with_tune(book: Book, at_once: int | None) -> None:
+    """Search on the connected cluster; each settings is trained with the first seed, and told to the sweep's book.
+
+    Args:
+        book: of the sweep. What it has begun is tried first: all of a grid or of random settings, or what Optuna chose before
+            an interruption.
+        at_once: most trials at a time; None = as many as the cluster has cores.
+    """
+    os.environ.update(_QUIET | {name: os.environ[name] for name in _QUIET if name in os.environ})
+    import optuna
+    from ray import tune
+    from ray.tune.schedulers import ASHAScheduler
+    from ray.tune.search.optuna import OptunaSearch
+
+    plan, first = book.plan, book.begun()
+    search = plan.search
+    assert search is not None
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    mode: dict[str, Any] = {"metric": search.metric, "mode": "min" if METRICS[search.metric] else "max"}
+    searcher = OptunaSearch(
+        space={name: _distribution(values) for name, values in plan.space.items()},
+        # a resumed search draws other numbers than those that are known already
+        sampler=optuna.samplers.TPESampler(seed=search.seed + len(first)),
+        points_to_evaluate=[_coded(plan, settings, json.dumps) for settings in first] or None,
+        **mode,
+    )
+    total = plan.settings.get("total_steps", 0) if search.early_stopping else 0
+    stopper = None
+    if search.early_stopping:  # max_t: no rung at the end, a trial that gets there writes its policy
+        rungs: dict[str, Any] = {"max_t": total - 1, "grace_period": total // SCORES, "reduction_factor": REDUCTION}
+        stopper = ASHAScheduler(time_attr="steps", stop_last_trials=False, **rungs, **mode)
+    storage = book.folder.resolve() / ".ray_tune"
+    trainable = _trainable(plan, book.folder.resolve(), book.stopped)
+    tuner = tune.Tuner(
+        tune.with_resources(trainable, {"cpu": 1}),
+        tune_config=tune.TuneConfig(
+            search_alg=searcher,
+            scheduler=stopper,
+            num_samples=max(search.trials, len(first)) if search.method == "optuna" else len(first),
+            max_concurrent_trials=at_once,
+        ),
+        run_config=tune.RunConfig(
+            name="search",
+            storage_path=str(storage),
+            failure_config=tune.FailureConfig(max_failures=RETRIES),  # nodes that are lost; a trial's own error raises nothing
+            callbacks=[_watch(book, total)],
+            verbose=0,
+        ),
+    )
+    try:
+        tuner.fit()
+    finally:
+        shutil.rmtree(storage, ignore_errors=True)
+
+
+def _trainable(plan: SweepPlan, out: Path, stopped: Container[str]) -> Callable[[Mapping[str, Any]], None]:
+    """Return what Tune runs on a node: a trial's job, whose scores it hears; of one that was stopped before, those it has."""
 
     def train(config: Mapping[str, Any]) -> None:
         from ray import tune
 
         trial = _trial(plan, config)
-        job = job_of(plan, trial, out, report=True, train=trial.name not in stopped)
-        error = run_on_node(job, lambda scores: tune.report(dict(scores)))
+        job = job_of(plan, trial, out, "say" if trial.name in stopped else "train and say")
+        error = follow(job, lambda scores: tune.report(dict(scores)))
         if error:
-            tune.report({search.metric: _WORST if METRICS[search.metric] else -_WORST, "error": error})
+            tune.report({plan.metric: _WORST if METRICS[plan.metric] else -_WORST, "error": error})
 
     return train
 
 
-def _watch(plan: SweepPlan, total: int, began: Callable[[Trial], object], ended: Callable[[Trial, str, bool], object]) -> Any:
+def _watch(book: Book, total: int) -> Any:
     """Return a callback that tells which trials begin, and how they ended: early, where that was before ``total`` steps."""
     from ray import tune
 
     class Watch(tune.Callback):
-        began: Callable[[Trial], object]
-        ended: Callable[[Trial, str, bool], object]
+        book: Book
 
         def __getstate__(self) -> dict[str, Any]:
             return {}  # Tune keeps copies of its settings, which need not tell anybody
 
         def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-            self.began(_trial(plan, trial.config))
+            self.book.begin(_trial(self.book.plan, trial.config))
 
         def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
             last = trial.last_result or {}
-            self.ended(_trial(plan, trial.config), last.get("error", ""), last.get("steps", total) < total)
+            self.book.end(_trial(self.book.plan, trial.config), last.get("error", ""), last.get("steps", total) < total)
 
         def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-            self.ended(_trial(plan, trial.config), f"Ray: {trial.get_error()}", False)
+            self.book.end(_trial(self.book.plan, trial.config), f"Ray: {trial.get_error()}", False)
 
     watch = Watch()
-    watch.began, watch.ended = began, ended  # here, not in the class: that is copied with all that it refers to
+    watch.book = book  # here, not in the class: that is copied with all that it refers to
     return watch
 
 
@@ -295,4 +218,4 @@ def _coded(plan: SweepPlan, settings: Mapping[str, Any], code: Callable[[Any], A
 
 
 def _trial(plan: SweepPlan, config: Mapping[str, Any]) -> Trial:
-    return trial_of(_coded(plan, config, json.loads), plan.seed_list[0])
+    return Trial(_coded(plan, config, json.loads), plan.seed_list[0])

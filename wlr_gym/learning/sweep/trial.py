@@ -8,9 +8,7 @@ import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, Literal
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
@@ -19,7 +17,7 @@ from wlr_gym.base.jobs import PATIENCE, Job, Send, import_modules, serve
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.learning.curves import read_curve
-from wlr_gym.learning.sweep.plan import SweepPlan, Trial, check_settings, draw, trial_of, whole_settings
+from wlr_gym.learning.sweep.plan import SweepPlan, Trial
 from wlr_gym.learning.training import can_resume, resume_training, run_training
 from wlr_gym.policy import Training, TrainingProgress
 
@@ -28,40 +26,29 @@ LOGS = "logs"
 LOCKS = ".locks"
 
 
-def job_of(plan: SweepPlan, trial: Trial, out: Path, *, report: bool = False, train: bool = True) -> Job:
-    """Return the job that trains a trial.
+def job_of(plan: SweepPlan, trial: Trial, out: Path, do: Literal["train", "train and say", "say"] = "train") -> Job:
+    """Return the job of a trial.
 
     Args:
         plan, trial: what to train.
         out: folder of the sweep.
-        report: let the job say each held-out score.
-        train: False = say the scores that there are, no more.
+        do: train it; train it and say its held-out scores, those of before and new ones; or only say those that it has.
     """
-    out, module = out.resolve(), plan.environment.rpartition(":")[0]  # of an id such as ``my_tasks:WLR-Climb-v0``
+    out = out.resolve()
     task = {
+        "plan": plan.model_dump(mode="json"),
+        "settings": dict(trial.settings),
+        "seed": trial.seed,
         "out": str(out),
-        "name": trial.name,
-        "environment": plan.environment,
-        "agent": plan.agent,
-        "settings": whole_settings(plan, trial),
-        "init": plan.init,
-        "imports": [*plan.imports, *([module] if module else [])],
-        "report": report,
-        "train": train,
+        "do": do,
         "version": __version__,
         "command": sys.argv,
     }
     return Job(trial.name, "wlr_gym.learning.sweep.trial", task, str(out / LOGS / f"{trial.name}.txt"))
 
 
-def check_job(plan: SweepPlan, out: Path) -> Job:
-    """Return a job that ends well where trials can be trained: the same version, all packages, the modules to import."""
-    job = job_of(plan, trial_of(draw(plan, np.random.default_rng(0)), plan.seed_list[0]), out)
-    return Job("check", job.module, {**job.task, "check": True}, str(out.resolve() / LOGS / "check.txt"))
-
-
 def train_trial(task: Mapping[str, Any], send: Send) -> None:
-    """Train what a task of :func:`job_of` says, from where its run folder is.
+    """Do what a task of :func:`job_of` says, from where its run folder is.
 
     Raises:
         InputError: this machine has another version, another process trains the trial, or the training refuses its settings.
@@ -69,42 +56,36 @@ def train_trial(task: Mapping[str, Any], send: Send) -> None:
     """
     if task["version"] != __version__:
         raise InputError(f"{platform.node()} has wlr_gym {__version__}, the sweep was started with {task['version']}")
-    import_modules(task["imports"])
-    if "check" in task:
-        check_settings(task["agent"], task["settings"])
-        return
+    plan, trial, do = SweepPlan(**task["plan"]), Trial(task["settings"], task["seed"]), task["do"]
+    module = plan.environment.rpartition(":")[0]  # of an id such as ``my_tasks:WLR-Climb-v0``
+    import_modules([*plan.imports, *([module] if module else [])])
     sys.argv[:] = task["command"]  # the run folder says how the sweep was started, not how its processes are
     out, told = Path(task["out"]), -1.0
-    folder = out / TRIALS / task["name"]
+    folder = out / TRIALS / trial.name
 
     def tell(scores: Mapping[str, float]) -> None:
         """Say held-out scores, each once."""
         nonlocal told
-        if task["report"] and scores and scores["steps"] > told:
+        if "say" in do and scores and scores["steps"] > told:
             told = scores["steps"]
             send(dict(scores))
-
-    with locked(out / LOCKS / task["name"], 2 * PATIENCE):
-        for row in scores_of(folder):  # what a trial that is resumed has already
-            tell(row)
-        if task["train"] and not is_complete(folder):
-            _train(task, folder, tell)
-        for row in scores_of(folder):  # what the end of the training added
-            tell(row)
-
-
-def _train(task: Mapping[str, Any], folder: Path, tell: Send) -> None:
-    """Train, or resume from the newest checkpoint; what has none is trained from the beginning."""
 
     def on_update(progress: TrainingProgress) -> None:
         tell(progress.held_out)
 
-    if can_resume(folder):
-        resume_training(folder, on_update=on_update)
-        return
-    shutil.rmtree(folder, ignore_errors=True)
-    training = Training(task["environment"], folder, task["settings"], progress=False, init=task["init"], on_update=on_update)
-    run_training(task["agent"], training)
+    with locked(out / LOCKS / trial.name, 2 * PATIENCE):
+        for row in scores_of(folder):  # what a trial that is resumed has already
+            tell(row)
+        if do == "say" or is_complete(folder):
+            return
+        if can_resume(folder):
+            resume_training(folder, on_update=on_update)
+        else:  # without a checkpoint it is trained from the beginning
+            shutil.rmtree(folder, ignore_errors=True)
+            settings = plan.settings_of(trial)
+            run_training(plan.agent, Training(plan.environment, folder, settings, False, None, False, plan.init, on_update))
+        for row in scores_of(folder):  # what the end of the training added
+            tell(row)
 
 
 def scores_of(folder: Path) -> list[dict[str, float]]:
