@@ -325,6 +325,4 @@ def _revealed(hidden: PatchEffect, found: Sequence[EffectEntry], answer: Diagnos
         inside = "the interval holds it" if low <= truth <= high else "outside the interval"
         off = f"{round(100.0 * (value / truth - 1.0)):+d} %; {inside}"
         rows.append((parameter, f"{number(truth)}{unit}", f"{number(value)}{unit}{interval}", off))
-    names = ", ".join(plain(name) for name in answer.extra)
-    extra = paragraph(f"Named beside it, but not there: {names}.") if names else ""
-    return table(("", "hidden in the robot", "found by the gap workflow", "right?"), rows) + extra
+    return table(("", "hidden in the robot", "found by the gap workflow", "right?"), rows)
