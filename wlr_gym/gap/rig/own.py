@@ -330,7 +330,8 @@ def _compiled(rig: Rig) -> tuple[Callable[..., Any], Callable[..., None]]:
         "readings": njit(rig.readings),
     }
     exec(compile(source, f"<rig {rig.name}>", "exec"), scope)  # the driver above, and names that were checked
-    return namedtuple("p", list(rig.numbers)), njit(scope["simulate"])
+    driver: Any = njit(scope["simulate"])
+    return namedtuple("p", list(rig.numbers)), driver
 
 
 # ---- the problem -----------------------------------------------------------------------------------------------------
