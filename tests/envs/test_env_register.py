@@ -99,15 +99,6 @@ def test_workers_of_a_vector_environment_know_the_task(registry, task):
     assert (observation == gym.make_vec(env_id, num_envs=2).reset(seed=0)[0]).all()
 
 
-def test_the_interface_of_stable_baselines3_takes_a_spec(registry, task):
-    pytest.importorskip("stable_baselines3")
-    from wlr_gym.envs import Sb3VecEnv
-
-    spec = gym.spec(register_task(task))
-    assert Sb3VecEnv(spec, 2, episode_length=0.2).core.limit == 10
-    assert Sb3VecEnv(spec.id, 2).core.limit == 50
-
-
 @pytest.mark.slow
 def test_a_pickled_batch_of_stable_baselines3_knows_the_task_elsewhere(registry, task, tmp_path):
     """So does the evaluation once the file is gone: the spec holds the whole task."""
