@@ -121,8 +121,14 @@ def _weighted_fit(rows: Any, values: Any, weights: Any, answer: Any, inverse: An
 @inner_kernel
 def _median(values: Any) -> float:
     """The median of what is known; NaN where too few rays are."""
-    known = values[~np.isnan(values)]
-    return np.median(known) if known.shape[0] >= _MINIMUM_SHARE * RAYS else math.nan
+    known, count = np.empty(values.shape[0]), 0
+    for value in values:
+        if not math.isnan(value):
+            known[count] = value
+            count += 1
+    if count < _MINIMUM_SHARE * RAYS:
+        return math.nan
+    return np.median(known[:count])
 
 
 @inner_kernel

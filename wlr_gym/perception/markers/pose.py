@@ -125,7 +125,8 @@ def solve_pose(
         residual = float(np.sqrt(np.mean(np.sum(((measured - centres) * np.array(camera.focal)) ** 2, axis=1))))
         explained = max(_MODEL_ERROR, _TOLERATED * target.slack * camera.focal[0] / place[2])
         if not suspicious or (not wrong and residual < explained):
-            used = np.isin(np.arange(len(target.markers)), indices)
+            used = np.zeros(len(target.markers), bool)
+            used[indices] = True
             return TargetPose(turn, place, covariance * max(1.0, chi_square), used, residual, chi_square)
         indices.remove(suspicious[0])
     return None

@@ -115,11 +115,11 @@ class Tracker:
         found, seen = self._follow(frame) if self._track else (None, {})
         if found is None:
             found, seen = self._search(frame.image)
-        without = replace(no_pose(frame, LOST, self.body), floor=self.floor_pose, floor_seen=floor_seen)
         if found is None or shift > _MOVED_BY:
             self._track = []
             dark = found is None and math.isinf(shift)  # nothing at all is seen
-            return replace(without, status=MOVED if shift > _MOVED_BY and not dark else LOST)
+            status = MOVED if shift > _MOVED_BY and not dark else LOST
+            return replace(no_pose(frame, status, self.body), floor=self.floor_pose, floor_seen=floor_seen)
         self._track = [*self._track[-1:], (frame.time, found)]
         if self.camera.readout and not self._follow_camera:
             found = self._at_frame_time(found, seen)
@@ -128,10 +128,12 @@ class Tracker:
         pose, covariance = pose_in_floor(found, self.floor_pose)
         if not (_HEIGHTS[0] < pose[2] < _HEIGHTS[1] and math.cos(pose[4]) * math.cos(pose[5]) > _LEAST_COSINE):
             self._track = []
-            return replace(without, status=IMPOSSIBLE, centres=centres)
-        return replace(
-            without, status=OK if found.used.all() else PARTIAL, pose=pose, covariance=covariance,
-            markers=int(found.used.sum()), residual=found.residual, centres=centres, seen=used, in_camera=found,
+            nothing = no_pose(frame, IMPOSSIBLE, self.body)
+            return replace(nothing, centres=centres, floor=self.floor_pose, floor_seen=floor_seen)
+        status, count = OK if found.used.all() else PARTIAL, int(found.used.sum())
+        return Sample(
+            frame.index, frame.time, status, pose, covariance, count, found.residual, centres, used, found, self.floor_pose,
+            floor_seen,
         )  # fmt: skip
 
     def _follow(self, frame: VideoFrame) -> tuple[TargetPose | None, dict[int, Detection]]:
