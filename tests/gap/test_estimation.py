@@ -121,12 +121,12 @@ def test_runs_that_differ_by_what_the_numbers_can_explain_scatter_less_than_assu
 def test_columns_are_the_responses():
     problem = Toy()
     model = nominal_model(problem).with_effect(candidate(problem, "drag", ["left"]), (0.3,))
-    residuals, columns = linearise(model, RUNS)
+    now, columns = linearise(model, RUNS)
     step = model.effects[0][0].unknowns[0].step
     for r in RUNS:
         for row, name in zip(columns[r], QUANTITIES, strict=False):
-            assert row.reshape(residuals[r].shape) == pytest.approx(-STRENGTH * problem.shape(name)[r], abs=1e-5)
-        assert columns[r][3].reshape(residuals[r].shape) == pytest.approx(-step * problem.shape("drag left")[r], abs=1e-5)
+            assert row.reshape(now.residuals[r].shape) == pytest.approx(-STRENGTH * problem.shape(name)[r], abs=1e-5)
+        assert columns[r][3].reshape(now.residuals[r].shape) == pytest.approx(-step * problem.shape("drag left")[r], abs=1e-5)
 
 
 def test_columns_at_a_bound_are_taken_inwards():
@@ -608,9 +608,9 @@ def test_what_is_detectable_is_a_size():
 def test_what_is_left_hides_more_effects():
     """What the screen calls visible requires as much as is asked of an effect."""
     responded, candidates = screened(Toy(white=1.5))[1:]
-    assert all(score.visible for score in screen(candidates, responded))
-    hidden = [score for score in screen(candidates, responded, 1e9) if not score.visible]
-    assert len(hidden) == len(screen(candidates, responded))
+    scores = screen(candidates, responded)
+    assert all(score.visible for score in scores)
+    assert not any(score.is_visible(1e9) for score in scores)
 
 
 def test_noisier_data_show_less():

@@ -38,7 +38,7 @@ def errors(run, values, clock=None):
     return found, np.sqrt(np.nanmean(found**2, axis=0))
 
 
-def worst(run, replays, kinds=""):
+def worst(run, replays, kinds=("",)):
     """Largest RMS residual of a channel, in noise units."""
     _, rms = errors(run, replays.values)
     return max(rms[k] for k, name in enumerate(CHANNELS) if name.startswith(kinds))
