@@ -71,12 +71,13 @@ def run(options: ReplayOptions) -> int:
     if not on_robot:
         options.refuse_robot_options("add --backend dynamixel")
     check_number("--segment", options.segment, "s", above=LEAD)
-    runs, films = read_runs(options.runs), []
     if (path := options.video) is not None:
         if on_robot:
             raise InputError("--video: a film needs a simulator; --backend dynamixel has none")
         check_video(path)
-        films = [path.with_name(f"{path.stem}_{one.name}{path.suffix}") for one in runs] if len(runs) > 1 else [path]
+    runs, films = read_runs(options.runs), [] if path is None else [path]
+    if path is not None and len(runs) > 1:
+        films = [path.with_name(f"{path.stem}_{one.name}{path.suffix}") for one in runs]
     patch = options.patch()
     options.refuse_results(options.out, ERRORS_FILE)
     for film in films:

@@ -76,8 +76,11 @@ def spread_on_ray(jobs: Iterable[Job], at_once: int | None = None) -> Generator[
     import ray
     from ray.exceptions import RayError
 
+    def follow_quietly(job: Job) -> str:
+        return follow(job, lambda said: None)
+
     left, running = list(jobs), {}
-    run = ray.remote(num_cpus=1, max_retries=RETRIES)(lambda job: follow(job, lambda said: None))
+    run = ray.remote(num_cpus=1, max_retries=RETRIES)(follow_quietly)
     try:
         while left or running:
             while left and (at_once is None or len(running) < at_once):
