@@ -17,24 +17,22 @@ import json
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from scipy.stats import quantile_test
 
 from studies.bench.blind.cases import strange
+from studies.tables import hand_over, markdown_table, plain_console
 from wlr_gym.base.errors import InputError, check_name
-from wlr_gym.base.files import keep_request, make_output_folder, write_text
+from wlr_gym.base.files import keep_request, make_output_folder
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.text import tally
-from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
-from wlr_gym.cli.terminal import print_json
 from wlr_gym.envs.tasks.randomization import load_randomization
 from wlr_gym.gap.analysis import BAD_DATA, NOT_EXCITED
 from wlr_gym.gap.decision import Decided
@@ -177,53 +175,6 @@ Say = Callable[[str], object]
 
 
 @dataclass(frozen=True)
-class AdaptStudy:
-    """One study.
-
-    Attributes:
-        out: folder for its lines and its work. cases: see :func:`studies.bench.adapt.cases`.
-        drives, seconds: episodes of every contender, and their length (s).
-        steps, episodes, excitations, budget_runs: see :class:`wlr_gym.learning.adaptation.Asked`.
-        contenders: who takes part.
-    """
-
-    out: Path
-    cases: tuple[AdaptCase, ...]
-    drives: int = 24
-    seconds: float = 10.0
-    steps: int = 7_500_000
-    episodes: int = 256
-    excitations: tuple[str, ...] = ("straight", "turns", "stop_and_go", "posture")
-    budget_runs: int = 1
-    contenders: tuple[str, ...] = tuple(CONTENDERS)
-
-    def quick(self) -> AdaptStudy:
-        """Return the study at a tiny size: it shows that it runs."""
-        short = {"drives": 2, "seconds": 1.0, "steps": 16_384, "episodes": 8, "budget_runs": 0}
-        return replace(self, excitations=self.excitations[:3], **short)
-
-    def asked(self, case: AdaptCase) -> Asked:
-        """Return what an adaptation is asked in a case."""
-        own = load_robot()
-        return Asked(
-            policy=POLICY,
-            identity=identity(read_subjects([POLICY])[0]),
-            environment=ENVIRONMENT,
-            robot=robot_hash(own),
-            driven="emulated",
-            effects=[dict(one) for one in case.effects],
-            backend="mujoco",
-            excitations=self.excitations,
-            budget_runs=self.budget_runs,
-            drives=self.drives,
-            drive_seconds=self.seconds,
-            steps=self.steps,
-            episodes=self.episodes,
-            seed=case.copy,
-        )
-
-
-@dataclass(frozen=True)
 class AdaptStudyOptions(JsonOption):
     out: Path
     """Folder for results; an interrupted study resumes from it."""
@@ -235,20 +186,52 @@ class AdaptStudyOptions(JsonOption):
     """Tiny sizes: shows that it runs; the numbers mean nothing."""
 
 
+#: How much of each is driven and trained; see :class:`wlr_gym.learning.adaptation.Asked` for all but the first two, which are
+#: every contender's episodes and their length (s).
+FULL: Mapping[str, Any] = {
+    "drives": 24, "seconds": 10.0, "steps": 7_500_000, "episodes": 256,
+    "excitations": ["straight", "turns", "stop_and_go", "posture"], "budget_runs": 1,
+}  # fmt: skip
+QUICK: Mapping[str, Any] = {
+    "drives": 2, "seconds": 1.0, "steps": 16_384, "episodes": 8,
+    "excitations": ["straight", "turns", "stop_and_go"], "budget_runs": 0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class AdaptStudy:
+    """One study: its folder, its cases, who takes part, and its sizes, as in :data:`FULL`."""
+
+    out: Path
+    cases: tuple[AdaptCase, ...]
+    contenders: tuple[str, ...] = tuple(CONTENDERS)
+    sizes: Mapping[str, Any] = field(default_factory=lambda: FULL)
+
+    def asked(self, case: AdaptCase) -> Asked:
+        """Return what an adaptation is asked in a case."""
+        sizes = dict(self.sizes)
+        return Asked(
+            policy=POLICY,
+            identity=identity(read_subjects([POLICY])[0]),
+            environment=ENVIRONMENT,
+            robot=robot_hash(load_robot()),
+            driven="emulated",
+            effects=[dict(one) for one in case.effects],
+            backend="mujoco",
+            drive_seconds=sizes.pop("seconds"),
+            seed=case.copy,
+            **sizes,
+        )
+
+
 def run(options: AdaptStudyOptions) -> int:
     """Adapt a policy to robots with hidden faults, and others beside it; print and write the table."""
     for name in options.contenders:
         check_name("contender", name, CONTENDERS)
-    say = Console(soft_wrap=True, markup=False, highlight=False).print
-    study = AdaptStudy(options.out, chosen_cases(options.cases), contenders=options.contenders)
-    lines = run_adapt_study(study.quick() if options.quick else study, say)
-    text = markdown(lines)
-    write_text(options.out / "adapt.md", text)
-    say(text)
-    if options.json:
-        print_json(lines)
-    say(f"written: {options.out / LINES_FILE}, {options.out / 'adapt.md'}")
-    return OK
+    sizes = QUICK if options.quick else FULL
+    study = AdaptStudy(options.out, chosen_cases(options.cases), options.contenders, sizes)
+    lines = run_adapt_study(study, plain_console.print)
+    return hand_over(options.out / "adapt.md", markdown(lines), lines, options.json, options.out / LINES_FILE)
 
 
 def run_adapt_study(study: AdaptStudy, say: Say = print) -> list[dict[str, Any]]:
@@ -258,13 +241,11 @@ def run_adapt_study(study: AdaptStudy, say: Say = print) -> list[dict[str, Any]]
         InputError: a folder that cannot be written to, or one of a study of another size.
     """
     make_output_folder(study.out)
-    size = {"drives": study.drives, "seconds": study.seconds, "steps": study.steps, "episodes": study.episodes}
-    size |= {"excitations": list(study.excitations), "budget_runs": study.budget_runs}
-    keep_request(study.out / "size.json", size)
+    keep_request(study.out / "size.json", study.sizes)
     there = read_lines(study.out / LINES_FILE)
     for case, contender in _order(study, there):
         began = time.monotonic()
-        line = _line(study, case, contender, say)
+        line = _line(study, case, contender)
         line |= {"wall_seconds": round(time.monotonic() - began, 1), "commit": git_commit()}
         with (study.out / LINES_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
@@ -297,37 +278,41 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 def _order(study: AdaptStudy, lines: Sequence[Mapping[str, Any]]) -> Iterator[tuple[AdaptCase, str]]:
     """Yield what is left: cheap contenders of all cases, then the others; ``lines`` grows meanwhile."""
     done = {(one["case"], one["contender"]) for one in lines}
-    for case in study.cases:
-        for name in CHEAP:
-            if name in study.contenders and (case.name, name) not in done:
-                yield case, name
-    for case in sorted(study.cases, key=lambda one: -truth_helps(lines, one.name)):
-        for name in study.contenders:
-            if name not in CHEAP and (case.name, name) not in done:
-                yield case, name
+
+    def left(cases: Iterable[AdaptCase], names: Iterable[str]) -> Iterator[tuple[AdaptCase, str]]:
+        return ((case, name) for case in cases for name in names if (case.name, name) not in done)
+
+    yield from left(study.cases, [name for name in CHEAP if name in study.contenders])
+    by_use = sorted(study.cases, key=lambda one: -truth_helps(lines, one.name))
+    yield from left(by_use, [name for name in study.contenders if name not in CHEAP])
 
 
 def truth_helps(lines: Sequence[Mapping[str, Any]], case: str) -> float:
     """Return by what share of the old policy's error the truth helps in a case; NaN-free: 0 where it is not known."""
     means = {one["contender"]: float(np.mean(one["errors"])) for one in lines if one["case"] == case}
-    if "none" not in means or "truth" not in means:
-        return 0.0
-    return 1.0 - means["truth"] / means["none"]
+    return 1.0 - means["truth"] / means["none"] if {"none", "truth"} <= means.keys() else 0.0
 
 
 # ---- one contender in one case ---------------------------------------------------------------------------------------
 
 
-def _line(study: AdaptStudy, case: AdaptCase, contender: str, say: Say) -> dict[str, Any]:
+def _line(study: AdaptStudy, case: AdaptCase, contender: str) -> dict[str, Any]:
     own, hidden = load_robot(), load_patch([dict(one) for one in case.effects])
     robot = EmulatedRobot(own, hidden, "mujoco", PHYSICS_STEP, case.parameters(own))
     progress = open_folder(study.out / "work" / case.name, study.asked(case), lambda text, share: None, 1)
     progress.save()
-    work = {"none": lambda: (POLICY, {}), "truth": lambda: (_truth(progress, case, hidden, own), {})}
-    work |= {"wide": lambda: (_wide(study, own), {}), "ours": lambda: _ours(progress, robot, own)}
-    work |= {"calibrated": lambda: _calibrated(progress, robot, own)}
-    policy, said = work[contender]()
-    seeds = [FIRST_SEED + 1000 * case.copy + k for k in range(study.drives)]
+    policy, said = POLICY, {}
+    if contender == "truth":
+        make_output_folder(progress.out / "truth_model")
+        randomization, folder = task_randomization(ENVIRONMENT), progress.out / "truth_model"
+        policy = _train(progress, "truth", uncertainty_of(exact_result(case, own), hidden, randomization, own, folder).training)
+    elif contender == "wide":
+        policy = _wide(study, own)
+    elif contender == "ours":
+        policy, said = _ours(progress, robot, own)
+    elif contender == "calibrated":
+        policy, said = _calibrated(progress, robot, own)
+    seeds = [FIRST_SEED + 1000 * case.copy + k for k in range(study.sizes["drives"])]
     step = f"drives_{'none' if policy == POLICY else contender}"  # the old policy drives every episode once
     driven = episodes_of(progress, step, {"driven": policy}, robot, seeds)["driven"]
     return {
@@ -349,14 +334,6 @@ def _train(progress: Progress, name: str, family: Family) -> str:
     return str(progress.out / name / "policy")
 
 
-def _truth(progress: Progress, case: AdaptCase, hidden: Patch, own: Robot) -> str:
-    """Return the policy that is trained on with the fault and the copy's own numbers, as exact as they are."""
-    folder = progress.out / "truth_model"
-    make_output_folder(folder)
-    found = uncertainty_of(exact_result(case, own), hidden, task_randomization(ENVIRONMENT), own, folder)
-    return _train(progress, "truth", found.training)
-
-
 def exact_result(case: AdaptCase, own: Robot) -> Result:
     """Return what a gap result would say that knew everything."""
     true, nominal = case.parameters(own).values[0], Parameters.nominal(own).values[0]
@@ -371,18 +348,8 @@ def exact_result(case: AdaptCase, own: Robot) -> Result:
         }
         for one in case.effects
     ]
-    return Result.model_validate(
-        {
-            "verdict": "effect_found",
-            "effects": effects,
-            "equivalent": [],
-            "calibration": calibration,
-            "localisation": {},
-            "gap": None,
-            "runs": {"fit": [], "heldout": []},
-            "patch": "patch.yaml",
-        }
-    )
+    nothing = {"equivalent": [], "localisation": {}, "gap": None, "runs": {"fit": [], "heldout": []}, "patch": "patch.yaml"}
+    return Result.model_validate(nothing | {"verdict": "effect_found", "effects": effects, "calibration": calibration})
 
 
 def _wide(study: AdaptStudy, own: Robot) -> str:
@@ -409,8 +376,7 @@ def _calibrated(progress: Progress, robot: EmulatedRobot, own: Robot) -> tuple[s
     decided, _ = find_uncertainty(progress, robot, own)
     if decided.result is None or decided.result.verdict in (BAD_DATA, NOT_EXCITED):
         return POLICY, {"kept": "old"}
-    folder = progress.out / "calibrated"
-    inner = Progress(folder, progress.asked, progress.tell)
+    inner = Progress(progress.out / "calibrated", progress.asked, progress.tell)
     result = calibration_alone(decided, progress.out / "runs")
     found = uncertainty_of(result, Patch(), task_randomization(ENVIRONMENT), own, inner.folder("model"))
     return _trained(inner, found, own)
@@ -480,12 +446,10 @@ def better(case: Mapping[str, Line], ours: str, theirs: str) -> Estimate:
 def markdown(lines: Sequence[Line]) -> str:
     """Return the tables as Markdown."""
     table = by_case(lines)
-    header = ["case", "shared law", *(f"{CONTENDERS[name]}" for name in CONTENDERS), "found", "kept", "regained (%)"]
-    header += ["driven for it (s)", "took (min)"]
-    rows = [_row(name, case) for name, case in table.items()]
-    text = [f"Contenders driven by commit: {tally(Counter(line['commit'] for line in lines))}.", ""]
-    text += ["| " + " | ".join(header) + " |", "|" + "---|" * len(header), *("| " + " | ".join(row) + " |" for row in rows)]
-    return "\n".join([*text, "", *summary(table), ""])
+    header = ["case", "shared law", *CONTENDERS.values(), "found", "kept", "regained (%)", "driven for it (s)", "took (min)"]
+    cases = markdown_table(header, [_row(name, case) for name, case in table.items()])
+    commits = tally(Counter(line["commit"] for line in lines))
+    return "\n".join([f"Contenders driven by commit: {commits}.", "", *cases, "", *summary(table), ""])
 
 
 def summary(table: Table) -> list[str]:

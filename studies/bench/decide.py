@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from rich.console import Console
 
 from studies.bench.blind.cases import CAMERA_SHARE, NAMED, OF_CAMERA, hide, named
 from studies.bench.blind.commands import BlindScript
@@ -25,15 +24,14 @@ from studies.bench.blind.dataset import BlindRobot, copy_of, write
 from studies.bench.blind.drive import BlindProfile
 from studies.bench.blind.score import FAILED, at_least, at_most, found_names
 from studies.bench.gap import read_result
+from studies.tables import hand_over, markdown_table, plain_console
 from wlr_gym.base.errors import Interval
-from wlr_gym.base.files import keep_request, make_output_folder, write_json, write_text
+from wlr_gym.base.files import keep_request, make_output_folder, write_json
 from wlr_gym.base.jobs import Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.text import tally
-from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
-from wlr_gym.cli.terminal import print_json
 from wlr_gym.data.excitations import Motion, excite
 from wlr_gym.data.runs import next_run, read_meta
 from wlr_gym.gap.decision import Budget, Decided, Recorded, decide, motions_to_drive
@@ -173,15 +171,8 @@ class DecideStudyOptions(JsonOption):
 
 def run(options: DecideStudyOptions) -> int:
     """Let the gap workflow choose what robots with hidden effects drive, and others beside it; print and write the tables."""
-    say = Console(soft_wrap=True, markup=False, highlight=False).print
-    lines = run_decide_study(options.out, options.cases, options.contenders, options.processes, say)
-    text = markdown(lines)
-    write_text(options.out / "decide.md", text)
-    say(text)
-    if options.json:
-        print_json(lines)
-    say(f"written: {options.out / LINES_FILE}, {options.out / 'decide.md'}")
-    return OK
+    lines = run_decide_study(options.out, options.cases, options.contenders, options.processes, plain_console.print)
+    return hand_over(options.out / "decide.md", markdown(lines), lines, options.json, options.out / LINES_FILE)
 
 
 def run_decide_study(
@@ -197,8 +188,11 @@ def run_decide_study(
     request = {"first_seed": FIRST_SEED, "severity": SEVERITY, "further": FURTHER, "start": list(START), "eight": list(EIGHT)}
     keep_request(out / "study.json", request)
     asked = [(one, contender) for one in cases(count) for contender in dict.fromkeys(contenders)]
-    left = {f"{one.name}_{contender}": (one, contender) for one, contender in asked if not _is_done(out, one, contender)}
-    jobs = []
+    left, jobs = {}, []
+    for one, contender in asked:
+        file = _file(out, one, contender)
+        if not file.is_file() or read_result(file)["ended"] == FAILED:
+            left[file.stem] = one, contender
     for name, (one, contender) in left.items():
         task = {"out": str(out.resolve()), "index": one.seed - FIRST_SEED, "contender": contender}
         jobs.append(Job(name, "studies.bench.decide", task, str((out / "work" / f"{name}.log").resolve())))
@@ -208,7 +202,9 @@ def run_decide_study(
         if ended.error:
             write_json(file, _line(*left[ended.name]) | {"ended": FAILED, "right": False, "found": [], "message": ended.error})
         rest = (time.monotonic() - begin) / done * (len(jobs) - done) / 60.0
-        say(f"{done}/{len(jobs)}  {ended.name}: {_said(read_result(file))}; about {rest:.0f} min to go")
+        line = read_result(file)
+        said = f"{FAILED}, {line['message']}" if line["ended"] == FAILED else _cell(line)
+        say(f"{done}/{len(jobs)}  {ended.name}: {said}; about {rest:.0f} min to go")
     lines = [read_result(_file(out, one, contender)) for one, contender in asked]
     write_json(out / LINES_FILE, lines)
     return lines
@@ -216,18 +212,6 @@ def run_decide_study(
 
 def _file(out: Path, one: DecideCase, contender: str) -> Path:
     return out / "lines" / f"{one.name}_{contender}.json"
-
-
-def _is_done(out: Path, one: DecideCase, contender: str) -> bool:
-    file = _file(out, one, contender)
-    return file.is_file() and read_result(file)["ended"] != FAILED
-
-
-def _said(line: Line) -> str:
-    if line["ended"] == FAILED:
-        return f"{FAILED}, {line['message']}"
-    rightly = "right" if line["right"] else "not right"
-    return f"{line['ended']}, {', '.join(line['found']) or line['verdict']}: {rightly}, {line['seconds']:.0f} s of driving"
 
 
 def _work(task: Mapping[str, Any], send: Send) -> None:
@@ -244,31 +228,29 @@ def _work(task: Mapping[str, Any], send: Send) -> None:
 def markdown(lines: Sequence[Line]) -> str:
     """Return how often each contender decided rightly after how much driving, pairs of contenders, and every case."""
     taking_part = [name for name in CONTENDERS if any(one["contender"] == name for one in lines)]
-    text = [f"Robots analysed by commit: {tally(Counter(one['commit'] for one in lines))}.", ""]
-    text += [
-        "| drives | decided rightly, of robots with an effect | wrongly | failed | driving per right decision |"
-        " nothing hidden: rightly | false alarms |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    text += [_row(name, [one for one in lines if one["contender"] == name]) for name in taking_part]
-    text += ["", *(_pair(lines, other) for other in taking_part[1:] if taking_part[0] == "chosen")]
-    text += ["", "| hidden | camera | " + " | ".join(taking_part) + " |", "|---|---|" + "---|" * len(taking_part)]
+    headings = ("drives", "decided rightly, of robots with an effect", "wrongly", "failed", "driving per right decision",
+                "nothing hidden: rightly", "false alarms")  # fmt: skip
+    rows = []
     for case in dict.fromkeys(one["case"] for one in lines):
         own = {one["contender"]: one for one in lines if one["case"] == case}
         first = next(iter(own.values()))
-        cells = [_cell(own[name]) for name in taking_part]
-        text.append(
-            f"| {', '.join(first['hidden']) or 'nothing'} | {'yes' if first['camera'] else 'no'} | {' | '.join(cells)} |"
-        )
-    return "\n".join(text) + "\n"
+        hidden = ", ".join(first["hidden"]) or "nothing"
+        rows.append((hidden, "yes" if first["camera"] else "no", *(_cell(own[name]) for name in taking_part)))
+    parts = [
+        [f"Robots analysed by commit: {tally(Counter(one['commit'] for one in lines))}."],
+        markdown_table(headings, [_row(name, [one for one in lines if one["contender"] == name]) for name in taking_part]),
+        [_pair(lines, other) for other in taking_part[1:] if taking_part[0] == "chosen"],
+        markdown_table(("hidden", "camera", *taking_part), rows),
+    ]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
 
-def _row(name: str, lines: Sequence[Line]) -> str:
+def _row(name: str, lines: Sequence[Line]) -> tuple[str, ...]:
     hiding, nulls = [one for one in lines if one["hidden"]], [one for one in lines if not one["hidden"]]
     right = at_least(sum(one["right"] for one in hiding), len(hiding))
     wrong = at_most(sum(one["ended"] == "decided" and not one["right"] for one in hiding), len(hiding))
     driving = sum(one.get("seconds", 0.0) for one in hiding)
-    cells = (
+    return (
         CONTENDERS[name],
         f"{right.hits}/{right.count} (at least {right.bound:.0%})" if hiding else "-",
         f"{wrong.hits} (at most {wrong.bound:.0%})" if hiding else "-",
@@ -277,7 +259,6 @@ def _row(name: str, lines: Sequence[Line]) -> str:
         f"{sum(one['right'] for one in nulls)}/{len(nulls)}",
         str(sum(bool(one["found"]) for one in nulls)),
     )
-    return f"| {' | '.join(cells)} |"
 
 
 def _pair(lines: Sequence[Line], other: str) -> str:
@@ -295,9 +276,8 @@ def _pair(lines: Sequence[Line], other: str) -> str:
 def _cell(line: Line) -> str:
     if line["ended"] == FAILED:
         return FAILED
-    return (
-        f"{'right' if line['right'] else ', '.join(line['found']) or line['verdict']}, {line['ended']}, {line['seconds']:.0f} s"
-    )
+    answer = "right" if line["right"] else ", ".join(line["found"]) or line["verdict"]
+    return f"{answer}, {line['ended']}, {line['seconds']:.0f} s"
 
 
 if __name__ == "__main__":

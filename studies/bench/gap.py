@@ -11,36 +11,34 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
+import operator
 import os
 import shutil
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from rich.console import Console
 
 from studies.bench.blind.cases import FIRST_SCORED_SEED, FURTHER_NULLS, SETS, BlindCase, case
 from studies.bench.blind.score import FAILED, score
+from studies.tables import hand_over, markdown_table, plain_console
 from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.base.files import make_output_folder, write_json, write_text
-from wlr_gym.base.jobs import Ended, Job, Send, serve, spread
+from wlr_gym.base.jobs import Job, Send, serve, spread
 from wlr_gym.base.paths import data_directory
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.text import duration, tally
-from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption, ray_address
-from wlr_gym.cli.terminal import print_json
 
 #: Folder of a data set, folder for the analysis' files -> contents of result.json.
 Analyser = Callable[[Path, Path], Mapping[str, Any]]
 #: Of a result: what the score is made of.
 _ANSWER = ("verdict", "message", "effects", "equivalent", "gap", "wall_seconds", "blind_test")
-_MODULE = "studies.bench.gap"
 #: Sets of a whole test.
 ALL_SETS = SETS + FURTHER_NULLS
 
@@ -68,15 +66,16 @@ class Plan:
     def cases(self) -> list[BlindCase]:
         """Return the data sets, in the order they are analysed: the further nulls spread among the others."""
         cases = [case(index, self.first_seed) for index in range(self.sets)]
-        return sorted(cases, key=self._turn)
-
-    def _turn(self, one: BlindCase) -> float:
-        index = one.seed - self.first_seed
-        return index / SETS if index < SETS else (index - SETS) / FURTHER_NULLS
+        turns = [index / SETS if index < SETS else (index - SETS) / FURTHER_NULLS for index in range(self.sets)]
+        return [one for _, one in sorted(zip(turns, cases, strict=True), key=lambda pair: pair[0])]
 
     def result_file(self, one: BlindCase) -> Path:
         """Return where the result of a set is kept."""
         return self.out / "results" / f"{one.name}.json"
+
+    def log_file(self, one: BlindCase) -> Path:
+        """Return where the output of a set's process goes; it stays where the analysis failed."""
+        return self.out / "work" / f"{one.name}.log"
 
 
 @dataclass(frozen=True)
@@ -95,16 +94,9 @@ class BlindTestOptions(JsonOption):
 
 def run(options: BlindTestOptions) -> int:
     """Test the gap workflow on data sets with hidden truths; print and write its score."""
-    say = Console(soft_wrap=True, markup=False, highlight=False).print
-    plan = Plan(options.out, options.sets, options.processes)
-    report = run_blind_test(plan, say=say, answers=options.answers, ray=ray_address(options.ray))
-    text = markdown(report)
-    write_text(options.out / "score.md", text)
-    say(text)
-    if options.json:
-        print_json(report)
-    say(f"written: {', '.join(str(options.out / name) for name in ('score.json', 'score.md', 'answers.json'))}")
-    return OK
+    out, plan = options.out, Plan(options.out, options.sets, options.processes)
+    report = run_blind_test(plan, say=plain_console.print, answers=options.answers, ray=ray_address(options.ray))
+    return hand_over(out / "score.md", markdown(report), report, options.json, out / "score.json", out / "answers.json")
 
 
 def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
@@ -120,7 +112,7 @@ def analyse_folder(folder: Path, out: Path) -> Mapping[str, Any]:
 def run_blind_test(
     plan: Plan,
     analyser: str = "studies.bench.gap:analyse_folder",
-    say: Callable[[str], None] = print,
+    say: Callable[[str], object] = print,
     answers: Path | None = None,
     ray: str | None = None,
 ) -> dict[str, Any]:
@@ -295,51 +287,34 @@ def read_result(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[str], None], ray: str | None) -> None:
-    """Work through the sets, in processes of their own, and say after each how long the rest will take."""
-    begin, named = time.monotonic(), {one.name: one for one in cases}
-    jobs = [_job(plan, one, analyser) for one in cases]
-    with _spreading(plan, ray) as spread_out:
-        for done, ended in enumerate(spread_out(jobs), 1):
-            passed = time.monotonic() - begin
-            rest = passed / done * (len(cases) - done)
-            line = _outcome(plan, named[ended.name], ended.error)
+def _run(plan: Plan, cases: Sequence[BlindCase], analyser: str, say: Callable[[str], object], ray: str | None) -> None:
+    """Work through the sets, each in a process of its own, and say after each how long the rest will take."""
+    begin, jobs = time.monotonic(), []
+    for one in cases:
+        task = {**vars(plan), "out": str(plan.out.resolve()), "index": one.seed - plan.first_seed, "analyser": analyser}
+        plan.log_file(one).unlink(missing_ok=True)
+        jobs.append(Job(one.name, "studies.bench.gap", task, str(plan.log_file(one).resolve())))
+    with ExitStack() as stack:
+        if ray is None:
+            ended = spread(jobs, plan.processes)
+        else:
+            from wlr_gym.learning.sweep.ray import LOCAL, connected, spread_on_ray
+
+            stack.enter_context(connected(ray, plan.processes if ray == LOCAL else None))
+            ended = spread_on_ray(jobs, plan.processes)
+        named = {one.name: one for one in cases}
+        for done, end in enumerate(ended, 1):
+            one = named[end.name]
+            file, message = plan.result_file(one), _without(plan.out, end.error)
+            if not file.is_file():  # its process died
+                write_json(file, {"verdict": FAILED, "message": message, "blind_test": _origin(plan, one)})
+            result, passed = read_result(file), time.monotonic() - begin
+            if result["verdict"] != FAILED:
+                plan.log_file(one).unlink(missing_ok=True)
             write_answers(plan.out)
-            say(f"{done}/{len(cases)}  {line}  {duration(passed)} passed, about {duration(rest)} to go")
-
-
-@contextmanager
-def _spreading(plan: Plan, ray: str | None) -> Iterator[Callable[[Sequence[Job]], Iterator[Ended]]]:
-    """Yield what runs jobs: processes of this machine, or a Ray cluster."""
-    if ray is None:
-        yield lambda jobs: spread(jobs, plan.processes)
-        return
-    from wlr_gym.learning.sweep.ray import LOCAL, connected, spread_on_ray
-
-    with connected(ray, plan.processes if ray == LOCAL else None):
-        yield lambda jobs: spread_on_ray(jobs, plan.processes)
-
-
-def _job(plan: Plan, one: BlindCase, analyser: str) -> Job:
-    """Return the job of one set: what it breaks or leaks is gone with its process, and it can be stopped."""
-    task = {**vars(plan), "out": str(plan.out.resolve()), "index": one.seed - plan.first_seed, "analyser": analyser}
-    _log_file(plan, one).unlink(missing_ok=True)
-    return Job(one.name, _MODULE, task, str(_log_file(plan, one).resolve()))
-
-
-def _log_file(plan: Plan, one: BlindCase) -> Path:
-    return plan.out / "work" / f"{one.name}.log"
-
-
-def _outcome(plan: Plan, one: BlindCase, error: str) -> str:
-    """Say how a set went; a process that died without a result has failed."""
-    file, log = plan.result_file(one), _log_file(plan, one)
-    if not file.is_file():
-        write_json(file, {"verdict": "failed", "message": _without(plan.out, error), "blind_test": _origin(plan, one)})
-    result = read_result(file)
-    if result["verdict"] != "failed":
-        log.unlink(missing_ok=True)
-    return f"{one.name}: {result['verdict']}, {result.get('wall_seconds', 0):.0f} s"
+            said = f"{one.name}: {result['verdict']}, {result.get('wall_seconds', 0):.0f} s"
+            rest = passed / done * (len(cases) - done)
+            say(f"{done}/{len(cases)}  {said}  {duration(passed)} passed, about {duration(rest)} to go")
 
 
 def _work(task: Mapping[str, Any], send: Send) -> None:
@@ -364,7 +339,7 @@ def run_case(plan: Plan, one: BlindCase, analyser: Analyser) -> None:
         result = {"verdict": "refused", "message": _without(plan.out, str(error)), "traceback": traceback.format_exc()}
     except Exception as error:
         message = _without(plan.out, f"{type(error).__name__}: {error}")
-        result = {"verdict": "failed", "message": message, "traceback": traceback.format_exc()}
+        result = {"verdict": FAILED, "message": message, "traceback": traceback.format_exc()}
     result |= {"wall_seconds": time.monotonic() - begin, "blind_test": origin}
     write_json(plan.result_file(one), _plain(result))
     if not plan.keep_data:
@@ -398,6 +373,8 @@ def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = ()) -> str:
 
 #: Whether a target is reached: ``not shown`` is a value that reaches it with a 95 % bound that does not; empty: no target.
 Met = Literal["yes", "no", "not shown", ""]
+#: On which side of a number its 95 % bound lies, and its target: that of good things "at least".
+Side = Literal["at least", "at most"]
 
 
 @dataclass(frozen=True)
@@ -413,118 +390,106 @@ class ScoreLine:
 def lines(report: Mapping[str, Any]) -> list[ScoreLine]:
     """Return the numbers that the workflow is judged by, in the order of the targets."""
     alarms, single, pairs, outside = report["false_alarms"], report["single"], report["pairs"], report["outside"]
+    left, size, sure = report["left"], single["mean_set_size"], single["confidence"]
+    mean_size = ScoreLine("mean size of that set, where found", "-", "<= 1.5")
+    if size is not None:
+        mean_size = replace(mean_size, value=f"{size:.3g}", met="yes" if size <= 1.5 else "no")
+    confidence = f"{sure['mean_confidence']:.2f}, right {sure['right']:.2f} of {sure['count']}" if sure["count"] else "-"
     return [
-        _at_most("false alarms, nominal robot", alarms["none"]),
-        _at_most("false alarms, parameters only", alarms["parameters"]),
-        _at_most("false alarms, all", alarms["all"], 0.02),
-        _at_least("right name first, severity >= 2", single["top1"], 0.95),
-        _at_least("right name first, severity 1", single["top1_at_one"], 0.80),
-        _at_least("truth in the equivalence set", single["in_set"], 0.95),
-        _set_size(single["mean_set_size"]),
-        _at_most("a further name beside the right one", single["extra_name"]),
-        _confidence(single["confidence"]),
-        _at_least("right place, where named", single["place"], 0.98),
-        _at_least("both of a pair named", pairs["both"], 0.85),
-        _at_least("both of a pair and nothing else", pairs["exact"]),
-        _median("median error of size", single["size_error"], most=0.03),
-        _median("median error of place or form", single["shape_error"]),
-        _at_least("order of a ripple", single["order"]),
-        _coverage(single["interval_coverage"]),
-        _median("median gap reduction, where found", single["gap_reduction"], least=0.9),
-        _median("median gap reduction, misses as 0", single["gap_reduction_of_all"], least=0.9),
-        _median("median error left, noise floors: named rightly, severity >= 2", report["left"]["named"]),
-        _median("median error left, noise floors: nothing hidden", report["left"]["nothing hidden"]),
-        _none("gap grew, interval below 0", single["gap_grew_surely"]),
-        _none("gap grew by more than 2 %", single["gap_grew"]),
-        _at_least("outside the library: formula or unknown, no name", outside["unknown"], 0.95),
-        _at_least("outside the library: not misnamed", outside["not_misnamed"]),
-        _at_least("bad data caught", report["bad_data"], 1.0),
-        _none("good data refused", alarms["refused_good_data"]),
-        _none("analyses that crashed", report["crashed"]),
+        judged("false alarms, nominal robot", alarms["none"], "at most"),
+        judged("false alarms, parameters only", alarms["parameters"], "at most"),
+        judged("false alarms, all", alarms["all"], "at most", 0.02),
+        judged("right name first, severity >= 2", single["top1"], "at least", 0.95),
+        judged("right name first, severity 1", single["top1_at_one"], "at least", 0.80),
+        judged("truth in the equivalence set", single["in_set"], "at least", 0.95),
+        mean_size,
+        judged("a further name beside the right one", single["extra_name"], "at most"),
+        ScoreLine("mean confidence of the first name", confidence),
+        judged("right place, where named", single["place"], "at least", 0.98),
+        judged("both of a pair named", pairs["both"], "at least", 0.85),
+        judged("both of a pair and nothing else", pairs["exact"], "at least"),
+        judged("median error of size", single["size_error"], "at most", 0.03),
+        judged("median error of place or form", single["shape_error"], "at most"),
+        judged("order of a ripple", single["order"], "at least"),
+        coverage(single["interval_coverage"]),
+        judged("median gap reduction, where found", single["gap_reduction"], "at least", 0.9),
+        judged("median gap reduction, misses as 0", single["gap_reduction_of_all"], "at least", 0.9),
+        judged("median error left, noise floors: named rightly, severity >= 2", left["named"], "at most"),
+        judged("median error left, noise floors: nothing hidden", left["nothing hidden"], "at most"),
+        never("gap grew, interval below 0", single["gap_grew_surely"]),
+        never("gap grew by more than 2 %", single["gap_grew"]),
+        judged("outside the library: formula or unknown, no name", outside["unknown"], "at least", 0.95),
+        judged("outside the library: not misnamed", outside["not_misnamed"], "at least"),
+        judged("bad data caught", report["bad_data"], "at least", 1.0),
+        never("good data refused", alarms["refused_good_data"]),
+        never("analyses that crashed", report["crashed"]),
     ]
 
 
-def _met(reached: bool, shown: bool) -> Met:
-    return ("yes" if shown else "not shown") if reached else "no"
+def judged(what: str, numbers: Mapping[str, Any], side: Side, target: float | None = None) -> ScoreLine:
+    """Hold a share, or a median, and its 95 % bound against a target."""
+    is_share = "share" in numbers
+    found = numbers["share" if is_share else "median"]
+    bound = numbers["bound95" if is_share else {"at least": "at_least95", "at most": "at_most95"}[side]]
+    reaches = operator.ge if side == "at least" else operator.le
+    goal = "" if target is None else f"{'>=' if side == 'at least' else '<='} {target:{'.0%' if is_share else 'g'}}"
+    if not numbers["count"]:
+        return ScoreLine(what, "-", goal)
+    if is_share:
+        value = _share(numbers, side)
+    else:
+        value = f"{found:.3g} of {numbers['count']} ({'no bound' if bound is None else f'{side} {bound:.3g}'})"
+    if target is None:
+        return ScoreLine(what, value)
+    shown = bound is not None and reaches(bound, target)
+    return ScoreLine(what, value, goal, "no" if not reaches(found, target) else "yes" if shown else "not shown")
 
 
-def _share(share: Mapping[str, Any], bound: str) -> str:
+def never(what: str, share: Mapping[str, Any]) -> ScoreLine:
+    """Something that must not happen in any of these sets: no bound could show that it never does."""
+    met: Met = "" if not share["count"] else "no" if share["hits"] else "yes"
+    return ScoreLine(what, _share(share, "at most"), "0", met)
+
+
+def coverage(share: Mapping[str, Any]) -> ScoreLine:
+    """Intervals may be too narrow or too wide."""
+    met: Met = ""
+    if share["count"]:
+        shown = share["bound95"] >= 0.92 and share["bound95_above"] <= 0.98
+        met = "no" if not 0.92 <= share["share"] <= 0.98 else "yes" if shown else "not shown"
+    return ScoreLine("95 % intervals that hold", _share(share, "at least"), "92-98 %", met)
+
+
+def _share(share: Mapping[str, Any], side: Side) -> str:
     if not share["count"]:
         return "-"
-    return f"{share['hits']}/{share['count']} = {share['share']:.0%} ({bound} {share['bound95']:.0%})"
-
-
-def _at_least(what: str, share: Mapping[str, Any], target: float | None = None) -> ScoreLine:
-    value = _share(share, "at least")
-    if target is None:
-        return ScoreLine(what, value)
-    met = _met(share["share"] >= target, share["bound95"] >= target) if share["count"] else ""
-    return ScoreLine(what, value, f">= {target:.0%}", met)
-
-
-def _at_most(what: str, share: Mapping[str, Any], target: float | None = None) -> ScoreLine:
-    value = _share(share, "at most")
-    if target is None:
-        return ScoreLine(what, value)
-    met = _met(share["share"] <= target, share["bound95"] <= target) if share["count"] else ""
-    return ScoreLine(what, value, f"<= {target:.0%}", met)
-
-
-def _none(what: str, share: Mapping[str, Any]) -> ScoreLine:
-    """Something that must not happen in any of these sets: no bound could show that it never does."""
-    return ScoreLine(what, _share(share, "at most"), "0", _met(not share["hits"], True) if share["count"] else "")
-
-
-def _coverage(coverage: Mapping[str, Any]) -> ScoreLine:
-    """Intervals may be too narrow or too wide."""
-    line = _at_least("95 % intervals that hold", coverage)
-    if not coverage["count"]:
-        return ScoreLine(line.what, line.value, "92-98 %")
-    shown = coverage["bound95"] >= 0.92 and coverage["bound95_above"] <= 0.98
-    return ScoreLine(line.what, line.value, "92-98 %", _met(0.92 <= coverage["share"] <= 0.98, shown))
-
-
-def _median(what: str, numbers: Mapping[str, Any], most: float | None = None, least: float | None = None) -> ScoreLine:
-    target = f"<= {most:g}" if most is not None else f">= {least:g}" if least is not None else ""
-    if not numbers["count"]:
-        return ScoreLine(what, "-", target)
-    word, bound = ("at least", numbers["at_least95"]) if least is not None else ("at most", numbers["at_most95"])
-    value = f"{numbers['median']:.3g} of {numbers['count']} ({'no bound' if bound is None else f'{word} {bound:.3g}'})"
-    if most is not None:
-        return ScoreLine(what, value, target, _met(numbers["median"] <= most, bound is not None and bound <= most))
-    if least is not None:
-        return ScoreLine(what, value, target, _met(numbers["median"] >= least, bound is not None and bound >= least))
-    return ScoreLine(what, value)
-
-
-def _set_size(size: float | None) -> ScoreLine:
-    what, target = "mean size of that set, where found", "<= 1.5"
-    return ScoreLine(what, "-", target) if size is None else ScoreLine(what, f"{size:.3g}", target, _met(size <= 1.5, True))
-
-
-def _confidence(numbers: Mapping[str, Any]) -> ScoreLine:
-    value = f"{numbers['mean_confidence']:.2f}, right {numbers['right']:.2f} of {numbers['count']}" if numbers["count"] else "-"
-    return ScoreLine("mean confidence of the first name", value)
+    return f"{share['hits']}/{share['count']} = {share['share']:.0%} ({side} {share['bound95']:.0%})"
 
 
 def markdown(report: Mapping[str, Any]) -> str:
     """Return the report as Markdown tables: numbers beside targets, severities, confusion matrix."""
-    rows = [f"Sets analysed by commit: {tally(report['commits'])}.", ""]
-    rows += ["| | measured (95 % bound) | target | met |", "|---|---|---|---|"]
-    rows += [f"| {line.what} | {line.value} | {line.target} | {line.met} |" for line in lines(report)]
-    rows += ["", "| severity | sets | found | right name first | in the set |", "|---|---|---|---|---|"]
-    for severity, shares in report["single"]["by_severity"].items():
-        cells = [f"{shares[key]['share']:.0%}" for key in ("found", "top1", "in_set")]
-        rows.append(f"| {severity} | {shares['found']['count']} | {' | '.join(cells)} |")
-    rows += ["", "| recorded | false alarms | right name first, severity >= 2 |", "|---|---|---|"]
-    for recorded, shares in report["by_recording"].items():
-        rows.append(f"| {recorded} | {_share(shares['alarms'], 'at most')} | {_share(shares['top1'], 'at least')} |")
-    rows += ["", "Single effects from severity 1 on; in brackets laws outside the library:", ""]
-    rows += ["| hidden | what the results say |", "|---|---|"]
-    for hidden, said in sorted(report["confusion"].items()):
-        ordered = sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0]))
-        rows.append(f"| {hidden} | {tally(dict(ordered))} |")
-    return "\n".join(rows) + "\n"
+    judgements = [(line.what, line.value, line.target, line.met) for line in lines(report)]
+    severities = [
+        (severity, shares["found"]["count"], *(f"{shares[key]['share']:.0%}" for key in ("found", "top1", "in_set")))
+        for severity, shares in report["single"]["by_severity"].items()
+    ]
+    recorded = [
+        (kind, _share(shares["alarms"], "at most"), _share(shares["top1"], "at least"))
+        for kind, shares in report["by_recording"].items()
+    ]
+    confusion = [
+        (hidden, tally(dict(sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0])))))
+        for hidden, said in sorted(report["confusion"].items())
+    ]
+    parts = [
+        [f"Sets analysed by commit: {tally(report['commits'])}."],
+        markdown_table(("", "measured (95 % bound)", "target", "met"), judgements),
+        markdown_table(("severity", "sets", "found", "right name first", "in the set"), severities),
+        markdown_table(("recorded", "false alarms", "right name first, severity >= 2"), recorded),
+        ["Single effects from severity 1 on; in brackets laws outside the library:"],
+        markdown_table(("hidden", "what the results say"), confusion),
+    ]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
 
 if __name__ == "__main__":

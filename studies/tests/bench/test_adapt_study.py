@@ -44,7 +44,7 @@ def test_it_resumes_contender_by_contender_where_the_truth_helps_most_first(tmp_
     errors = {("a", "none"): 1.0, ("a", "truth"): 0.95, ("b", "none"): 1.0, ("b", "truth"): 0.5}
     order = []
 
-    def worked(study, case, contender, say):
+    def worked(study, case, contender):
         order.append((case.name, contender))
         if len(order) == 3:
             raise KeyboardInterrupt
@@ -61,7 +61,7 @@ def test_it_resumes_contender_by_contender_where_the_truth_helps_most_first(tmp_
     assert [name for name, contender in order[-4:]] == ["b", "b", "a", "a"]
     assert len(lines) == 10
     with pytest.raises(InputError, match="steps: 7500000, requested 7"):
-        adapt.run_adapt_study(adapt.AdaptStudy(tmp_path, chosen, steps=7), lambda text: None)
+        adapt.run_adapt_study(adapt.AdaptStudy(tmp_path, chosen, sizes={**adapt.FULL, "steps": 7}), lambda text: None)
 
 
 def test_regained_is_the_share_of_what_the_truth_wins():

@@ -282,13 +282,13 @@ def test_a_test_of_any_length_must_have_the_same_truths(tmp_path, first, second)
 
 def test_a_value_without_its_bound_is_not_shown():
     good = {"hits": 0, "count": 3, "share": 0.0, "bound95": 0.63}
-    assert gap._at_most("alarms", good, 0.05).met == "not shown"
-    assert gap._at_most("alarms", {**good, "bound95": 0.049}, 0.05).met == "yes"
-    assert gap._at_most("alarms", {**good, "hits": 1, "share": 0.33}, 0.05).met == "no"
-    assert gap._at_least("names", {"hits": 9, "count": 10, "share": 0.9, "bound95": 0.6}, 0.85).met == "not shown"
-    assert gap._none("crashes", good).met == "yes"
-    assert gap._none("crashes", {**good, "hits": 1}).met == "no"
-    assert gap._at_most("alarms", good).met == ""
+    assert gap.judged("alarms", good, "at most", 0.05).met == "not shown"
+    assert gap.judged("alarms", {**good, "bound95": 0.049}, "at most", 0.05).met == "yes"
+    assert gap.judged("alarms", {**good, "hits": 1, "share": 0.33}, "at most", 0.05).met == "no"
+    assert gap.judged("names", {"hits": 9, "count": 10, "share": 0.9, "bound95": 0.6}, "at least", 0.85).met == "not shown"
+    assert gap.never("crashes", good).met == "yes"
+    assert gap.never("crashes", {**good, "hits": 1}).met == "no"
+    assert gap.judged("alarms", good, "at most").met == ""
 
 
 @pytest.mark.parametrize(
@@ -297,7 +297,7 @@ def test_a_value_without_its_bound_is_not_shown():
 )
 def test_intervals_may_be_too_wide_as_well(share, low, high, met):
     numbers = {"hits": 1, "count": 1, "share": share, "bound95": low, "bound95_above": high}
-    assert gap._coverage(numbers).met == met
+    assert gap.coverage(numbers).met == met
 
 
 @pytest.mark.parametrize(
@@ -305,9 +305,9 @@ def test_intervals_may_be_too_wide_as_well(share, low, high, met):
 )
 def test_medians_are_held_to_their_bounds(median, bound, met):
     numbers = {"median": median, "at_least95": bound, "at_most95": None, "count": 7}
-    assert gap._median("reduction", numbers, least=0.8).met == met
+    assert gap.judged("reduction", numbers, "at least", 0.8).met == met
     mirrored = {"median": -median, "at_most95": None if bound is None else -bound, "at_least95": None, "count": 7}
-    assert gap._median("error", mirrored, most=-0.8).met == met
+    assert gap.judged("error", mirrored, "at most", -0.8).met == met
 
 
 @pytest.mark.parametrize(
