@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 from rich.console import Console
 
-from studies.bench.measure import Measurement, Size, machine
+from studies.bench.measure import YES_NO, Measurement, Size, machine, speed_cells
 from wlr_gym.base.errors import InputError, Interval, check_folder, check_name
 from wlr_gym.base.files import refuse_existing, require_ending, write_json
 from wlr_gym.base.progress import progress
@@ -124,31 +124,15 @@ def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console,
 
 
 def _print_speed(rows: Sequence[Measurement], console: Console) -> None:
-    """Print what was measured; a peer is named below what it is held against, one unit of all rows in the title."""
-    units = {row.unit for row in rows}
-    cells = []
-    for row in rows:
-        found = row.as_dict()
-        peer = f"{found['peer']['median']:,.0f}" if row.peer else "-"
-        ratio = "{median:.3g} [{min:.3g}..{max:.3g}]".format(**found["ratio"]) if row.peer else "-"
-        ratio = f">= {ratio}" if row.at_least else ratio
-        bar = "-" if row.bar is None else f">= {row.bar:.3g}" if row.peer else f"< {row.bar:g}"
-        what = f"{row.what}\n  peer: {row.peer_name}" if row.peer else row.what
-        form = "{median:.2f} [{min:.2f}..{max:.2f}]" if row.unit in ("s", "-") else "{median:,.0f}"
-        ours = form.format(**found["ours"])
-        cells.append((what, ours if len(units) == 1 else f"{ours} {row.unit}", peer, ratio, bar, YES_NO[row.met]))
-    title = f"{rows[0].name}, {units.pop()}" if len(units) == 1 else rows[0].name
-    print_table(console, ("what", "ours", "peer", "ratio [min..max]", "bar", "met"), cells, title)
-
-
-YES_NO = {True: "yes", False: "NO", None: "-"}
+    cells = [(row.what, *speed_cells(row.as_dict()), YES_NO[row.met]) for row in rows]
+    print_table(console, ("what", "ours", "peer", "ratio [min..max]", "bar", "met"), cells, rows[0].name)
 
 
 def _print_convergence(rows: Sequence[Deviation], console: Console) -> None:
-    cells = [
-        (row.case, row.quantity, str(row.value),
-         *(f"{1e3 * value:.2g}" for value in (row.median, row.percentile_90, row.worst))) for row in rows
-    ]  # fmt: skip
+    cells = []
+    for row in rows:
+        millimetres = (f"{1e3 * value:.2g}" for value in (row.median, row.percentile_90, row.worst))
+        cells.append((row.case, row.quantity, str(row.value), *millimetres))
     title = "convergence: deviation of the position after 1 s, mm (64 robots)"
     print_table(console, ("case", "quantity", "value", "median", "90 %", "worst"), cells, title)
 

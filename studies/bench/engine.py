@@ -287,12 +287,12 @@ def measure_engine(size: Size) -> EngineReport:
         warm_up=False,
         tell=lambda share: size.tell(first + (1.0 - first) * share),
     )
-    return EngineReport(reference, [_result(setting, poses[setting], reference, speeds[setting]) for setting in runs])
-
-
-def _result(setting: EngineSetting, pose: Array, reference: Reference, speed: tuple[float, ...]) -> EngineResult:
-    apart = distance(pose, reference.pose, _hip())
-    return EngineResult(setting, float(np.sqrt(np.mean(apart**2))), float(apart.max()), is_upright(pose), speed)
+    results = []
+    for setting, pose in poses.items():
+        apart = distance(pose, reference.pose, _hip())
+        error, worst = float(np.sqrt(np.mean(apart**2))), float(apart.max())
+        results.append(EngineResult(setting, error, worst, is_upright(pose), speeds[setting]))
+    return EngineReport(reference, results)
 
 
 def _hip() -> Array:
@@ -307,15 +307,14 @@ def make_reference(
 ) -> Reference:
     """Return the mean of the limits of both simulators; both are of first order in the step, which is halved once."""
     options = [PlantOptions(physics_step=step, sensor_noise=False) for step in (*engine, *peer)]
-    coarse, fine = (_drive(GibbsAppellPlant(load_robot(), len(chosen), one, sweeps=8), chosen) for one in options[:2])
-    limits = []
+    plants: list[Plant] = [GibbsAppellPlant(load_robot(), len(chosen), one, sweeps=8) for one in options[:2]]
     for one in options[2:]:
         plant = MujocoPlant(load_robot(), len(chosen), one)
         # less virtual mass at the contacts, whose push off the floor grows as the step shrinks
         plant._batch.divide_virtual_mass(VIRTUAL_MASS_DIVISOR)
-        limits.append(_drive(plant, chosen))
-    peer_coarse, peer_fine = limits
-    ours, theirs = _extrapolated(coarse, fine), _extrapolated(peer_coarse, peer_fine)
+        plants.append(plant)
+    coarse, fine, peer_coarse, peer_fine = (_drive(plant, chosen) for plant in plants)
+    ours, theirs = _unit(2.0 * fine - coarse), _unit(2.0 * peer_fine - peer_coarse)
     hip, pose = _hip(), _unit(0.5 * (ours + theirs))
     convergence = np.maximum(distance(fine, ours, hip), distance(peer_fine, theirs, hip))
     _, state = start(load_robot(), chosen)
@@ -326,10 +325,6 @@ def make_reference(
         if motion.distance is not None
     }
     return Reference(pose, distance(ours, theirs, hip), convergence, closed)
-
-
-def _extrapolated(coarse: Array, fine: Array) -> Array:
-    return _unit(2.0 * fine - coarse)
 
 
 def _unit(pose: Array) -> Array:
@@ -500,10 +495,9 @@ def _fastest(results: Iterable[EngineResult], level: float) -> EngineResult | No
 def _standard(results: Iterable[EngineResult], call: str, threads: int) -> EngineResult | None:
     """Return the setting of 1 ms with everything else at its default."""
     for one in results:
-        setting = one.setting
-        kind = (setting.cone, setting.contact, setting.integrator)
-        usual = setting.side == "engine" or kind == KINDS[0]
-        if usual and setting.step == 1e-3 and setting.call == call and setting.threads == threads and setting.is_usual:
+        own = one.setting
+        usual = own.is_usual and (own.side == "engine" or (own.cone, own.contact, own.integrator) == KINDS[0])
+        if usual and (own.step, own.call, own.threads) == (1e-3, call, threads):
             return one
     return None
 
@@ -584,12 +578,9 @@ def _draw(axes: Axes, rows: list[dict[str, Any]], label: str, colour: str, marke
         if chosen:
             axes.plot(*zip(*map(_point, chosen), strict=True), color=colour, markersize=5, linewidth=1.2, **style)
         for one in chosen if not (is_second and usual) else ():
-            text = f"{1e3 * one['step']:g}" if usual else _unusual(one)
+            number = f", {one['iterations']}{'p' if one['side'] == 'engine' else 'i'}"
+            text = f"{1e3 * one['step']:g}{'' if usual else number}"
             axes.annotate(text, _point(one), (6, -3), textcoords="offset points", fontsize=7.5, color=colour, va="center")
-
-
-def _unusual(one: dict[str, Any]) -> str:
-    return f"{1e3 * one['step']:g}, {one['iterations']}{'p' if one['side'] == 'engine' else 'i'}"
 
 
 def _draw_pair(axes: Axes, shown: Sequence[dict[str, Any]]) -> None:

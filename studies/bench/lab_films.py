@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from studies.bench.lab_renderer import Lab, frames, lens, true_places
-from studies.bench.measure import machine
+from studies.bench.measure import YES_NO, machine
 from studies.bench.vision import FilmedDrive, lab_drive, pose_at, true_slip
 from wlr_gym.base.errors import InputError, Interval, require_package
 from wlr_gym.base.files import write_json
@@ -69,8 +69,7 @@ def run(options: LabFilmsOptions) -> int:
     found = score(results)
     report = {"machine": machine(), "seed": options.seed, "score": found, "films": [asdict(result) for result in results]}
     write_json(options.out / "score.json", report)
-    words = {True: "yes", False: "NO", None: "-"}
-    rows = [(what, value, bar, words[met]) for what, value, bar, met in bars(found)]
+    rows = [(what, value, bar, YES_NO[met]) for what, value, bar, met in bars(found)]
     print_table(console, ("what", "found", "bar", "met"), rows, f"{options.count} films of a lab")
     if options.json:
         print_json(report)

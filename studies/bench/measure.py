@@ -13,11 +13,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from wlr_gym.base.provenance import git_commit, versions
 
 #: Runs some work and returns its rate (1/s) or its time (s).
 Contender = Callable[[], float]
 Name = TypeVar("Name", bound=Hashable)
+#: Whether a bar is met, in words.
+YES_NO = {True: "yes", False: "NO", None: "-"}
 #: Called with the share of a measurement that is done.
 TellShare = Callable[[float], None]
 
@@ -59,8 +63,12 @@ class Measurement:
 
     @property
     def ratios(self) -> tuple[float, ...]:
-        """Ours over the peer's, pair by pair; empty without a peer."""
-        return tuple(_ratio(a, b) for a, b in zip(self.ours, self.peer, strict=True)) if self.peer else ()
+        """Ours over the peer's, pair by pair; empty without a peer.
+
+        Where it got nothing done: infinite, or 0 if ours did not either.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return tuple(np.nan_to_num(np.divide(self.ours, self.peer), posinf=math.inf).tolist()) if self.peer else ()
 
     @property
     def met(self) -> bool | None:
@@ -77,13 +85,6 @@ class Measurement:
             "ratio": summary(self.ratios) if self.peer else None, "bar": self.bar, "met": self.met,
             "other_peers": dict(self.others or {}), "at_least": self.at_least,
         }  # fmt: skip
-
-
-def _ratio(ours: float, peer: float) -> float:
-    """Ours over the peer's; infinite where only the peer got nothing done, 0 where neither did."""
-    if peer == 0.0:
-        return math.inf if ours > 0.0 else 0.0
-    return ours / peer
 
 
 def summary(values: Sequence[float]) -> dict[str, Any]:
@@ -125,9 +126,12 @@ def rate(work: Callable[[], object], amount: float) -> float:
 
 def machine() -> dict[str, Any]:
     """Return what the numbers depend on: date, processor, cores, load at the start, versions, commit."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return {
         "date": datetime.now(UTC).date().isoformat(),
-        "processor": _processor(),
+        "processor": names[0] if names else platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "load_average": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
         "system": f"{platform.system()} {platform.machine()}",
@@ -136,9 +140,30 @@ def machine() -> dict[str, Any]:
     }
 
 
-def _processor() -> str:
-    information = Path("/proc/cpuinfo")
-    if not information.is_file():
-        return platform.processor() or platform.machine()
-    names = [line.partition(":")[2].strip() for line in information.read_text().splitlines() if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+def speed_cells(row: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    """Return what tables say of a measurement, as of ``as_dict``: ours, the peer's, the ratio [min..max], the bar."""
+    peer, ratio, bar, least = row["peer"], row["ratio"], row["bar"], row.get("at_least")
+    ours = _value(row["ours"], row["unit"])
+    limit = "-" if bar is None else f">= {bar:g}" if peer else f"< {bar:g} {row['unit']}"
+    limit = f"{limit}: missed" if row["met"] is False else limit
+    if not peer:
+        return ours, "-", "-", limit
+    theirs = f"{_value(peer, row['unit'])} ({row['peer_name']})"
+    apart = "{median:.3g} [{min:.3g}..{max:.3g}]".format(**ratio)
+    # of a peer that was given up the time is a lower bound
+    return ours, f"none; given up at {theirs}" if least else theirs, f">= {apart}" if least else apart, limit
+
+
+def _value(found: Mapping[str, Any], unit: str) -> str:
+    if unit == "s" and found["min"] < found["max"]:
+        return "{median:.3g} s [{min:.3g}..{max:.3g}]".format(**found)
+    per = {"1/s": "/s", "1/h": "/h"}.get(unit, f" {unit}")
+    return f"{short(found['median'])}{per}".rstrip()
+
+
+def short(value: float) -> str:
+    """Return ``2.5 M``, ``2.5 k`` or ``2.5``."""
+    for size, letter in ((1e6, "M"), (1e3, "k")):
+        if value >= size:
+            return f"{value / size:.3g} {letter}"
+    return f"{value:.3g}"

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from studies.bench.engine import AT_DEFAULTS, LEVELS, level_name, reference_text, save_picture, settings_table
+from studies.bench.measure import short, speed_cells
+from studies.tables import markdown_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT / "docs" / "data" / "bench.json"
@@ -25,7 +27,7 @@ README_RATIOS = (level_name(LEVELS[0]), AT_DEFAULTS)
 TIMES = "\N{MULTIPLICATION SIGN}"
 #: Measurements with a table of their own, or none.
 APART = ("batch", "camera")
-BATCH = re.compile(r"(\d+) robots, (\w+), (\d+) threads?")
+BATCH = re.compile(r"(\d+) robots, (\w+, \d+ threads?)")
 
 Row = dict[str, Any]
 
@@ -45,26 +47,22 @@ _ORDER = ("engine", "mujoco", "env_step", "ppo", "learning", "bus", "import", "s
 
 def speed_table(rows: Iterable[Row]) -> list[str]:
     """Return the table of everything that has a peer or a bar, as lines of Markdown."""
-    rows = [row for row in rows if row["name"] not in APART and (row["peer"] or row["bar"])]
-    lines = ["| what | ours | peer | ratio [min..max] | bar | command | measured |", "|---|---|---|---|---|---|---|"]
-    for row in rows:
-        cells = (row["what"], _value(row["ours"], row["unit"]), _peer(row), _ratio(row), _bar(row))
-        lines.append(f"| {' | '.join(cells)} | `python -m studies.bench {row['name']}` | {_condition(row['measured'])} |")
-    return lines
+    cells = [
+        (row["what"], *speed_cells(row), f"`python -m studies.bench {row['name']}`", _condition(row["measured"]))
+        for row in rows
+        if row["name"] not in APART and (row["peer"] or row["bar"])
+    ]
+    return markdown_table(("what", "ours", "peer", "ratio [min..max]", "bar", "command", "measured"), cells)
 
 
 def batch_table(rows: Iterable[Row]) -> list[str]:
     """Return substeps per second by batch size as lines of Markdown; none where they were not measured."""
-    found = {}
+    found: dict[str, dict[str, str]] = {}
     for row in rows:
         if row["name"] == "batch" and (match := BATCH.fullmatch(row["what"])):
-            found[match[2], int(match[3]), int(match[1])] = row["ours"]["median"]
-    counts = sorted({count for *_, count in found})
-    lines = [f"| robots | {' | '.join(map(str, counts))} |", "|---" * (len(counts) + 1) + "|"]
-    for precision, threads in dict.fromkeys((precision, threads) for precision, threads, _ in found):
-        cells = [_short(found[precision, threads, count]) for count in counts]
-        lines.append(f"| {precision}, {threads} thread{'s' * (threads > 1)} | {' | '.join(cells)} |")
-    return lines
+            found.setdefault(match[2], {})[match[1]] = short(row["ours"]["median"])
+    counts = sorted({count for one in found.values() for count in one}, key=int)
+    return markdown_table(("robots", *counts), [(how, *(one[count] for count in counts)) for how, one in found.items()])
 
 
 def machine_lines(rows: Iterable[Row]) -> list[str]:
@@ -78,41 +76,6 @@ def machine_lines(rows: Iterable[Row]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def _value(found: Row, unit: str) -> str:
-    if unit == "s" and found["min"] < found["max"]:
-        return f"{found['median']:.3g} s [{found['min']:.3g}..{found['max']:.3g}]"
-    per = {"1/s": "/s", "1/h": "/h"}.get(unit, f" {unit}")
-    return f"{_short(found['median'])}{per}".rstrip()
-
-
-def _short(value: float) -> str:
-    for size, letter in ((1e6, "M"), (1e3, "k")):
-        if value >= size:
-            return f"{value / size:.3g} {letter}"
-    return f"{value:.3g}"
-
-
-def _peer(row: Row) -> str:
-    if not row["peer"]:
-        return "-"
-    given_up = "none; given up at " if row.get("at_least") else ""
-    return f"{given_up}{_value(row['peer'], row['unit'])} ({row['peer_name']})"
-
-
-def _ratio(row: Row) -> str:
-    if not row["ratio"]:
-        return "-"
-    least = ">= " if row.get("at_least") else ""  # a peer that was given up: its time is a lower bound
-    return f"{least}{row['ratio']['median']:.3g} [{row['ratio']['min']:.3g}..{row['ratio']['max']:.3g}]"
-
-
-def _bar(row: Row) -> str:
-    if row["bar"] is None:
-        return "-"
-    limit = f">= {row['bar']:g}" if row["peer"] else f"< {row['bar']:g} {row['unit']}"
-    return limit if row["met"] else f"{limit}: missed"
-
-
 def _condition(found: Row) -> str:
     load = "" if not found["load_average"] else f", load {found['load_average'][0]:.1f}"
     return f"{found['date']}, {found['rounds']} round{'s' * (found['rounds'] > 1)}{load}"
@@ -122,9 +85,7 @@ def engine_lines(engine: dict[str, Any]) -> list[str]:
     """Return when engine and MuJoCo were measured, the limits of the reference, and every setting, as lines of Markdown."""
     found = engine["measured"]
     head = f"Measured {_condition(found)}, {found['processor']}; speed: median [smallest..largest] of the rounds."
-    headings, rows = settings_table(engine)
-    table = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
-    return [head, reference_text(engine), "", table[0], f"|{'---|' * len(headings)}", *table[1:]]
+    return [head, reference_text(engine), "", *markdown_table(*settings_table(engine))]
 
 
 def made() -> dict[str, list[str]]:

@@ -5,14 +5,14 @@ And the engine's convergence: the position after one second against a reference 
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 import wlr_gym  # noqa: F401  (registers the environments)
 from studies.bench.measure import Contender, Measurement, Size, against_fastest, interleave, rate
 from studies.bench.mujoco_loop import BACKEND, ServoBatch, build_servo_model, register_backend
+from wlr_gym.base.text import counted
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, standing_state
 from wlr_gym.physics.plants.gibbs_appell.plant import SWEEPS, GibbsAppellPlant
@@ -98,15 +99,11 @@ def _stepping(env: gym.Env, steps: int) -> Contender:
 
 def measure_batch(size: Size) -> list[Measurement]:
     """Substeps per second by batch size, precision and threads; for information."""
-    counts: Sequence[int] = (1, 4) if size.quick else (1, 8, 64, 512, 4096)
-    cases = [(count, precision, threads) for precision in PRECISIONS for threads in (1, 2) for count in counts]
-    ticks = {count: max(5, 5_000 // count) if not size.quick else 2 for count in counts}
-    contenders = {
-        f"{count} robots, {precision}, {threads} thread{'s' * (threads > 1)}": _plant(
-            "gibbs_appell", count, ticks[count], precision, threads
-        )
-        for count, precision, threads in cases
-    }
+    contenders = {}
+    for precision, threads, count in itertools.product(PRECISIONS, (1, 2), (1, 4) if size.quick else (1, 8, 64, 512, 4096)):
+        ticks = size(max(5, 5_000 // count), 2)
+        name = f"{count} robots, {precision}, {counted(threads, 'thread')}"
+        contenders[name] = _plant("gibbs_appell", count, ticks, precision, threads)
     values = interleave(contenders, min(size.rounds, 3), tell=size.tell)
     return [Measurement("batch", name, "1/s", series) for name, series in values.items()]
 
@@ -115,22 +112,20 @@ def measure_mujoco(size: Size) -> list[Measurement]:
     """Substeps per second on one thread: the plant against the same MuJoCo steps alone, a servo model, and the engine."""
     count, ticks = size(256, 2), size(10, 1)
     contenders = {
-        "plant": _plant("mujoco", count, ticks),
-        "alone": _steps_alone(count, ticks),
-        "servos": _servos(count, ticks),
+        "MuJoCo plant": _plant("mujoco", count, ticks),
+        "the same steps, MuJoCo alone": _steps_alone(count, ticks),
+        "mujoco.batch, servo actuators": _servos(count, ticks),
         "engine": _plant("gibbs_appell", count, ticks),
     }
     values = interleave(contenders, size.rounds, tell=size.tell)
-    what = f"substeps of 1 ms, {count} robots, 1 thread"
-    return [
-        Measurement(
-            "mujoco", f"plant, {what}", "1/s", values["plant"], values["alone"], "the same steps, MuJoCo alone", LEAST_RATIO
-        ),
-        Measurement(
-            "mujoco", f"plant, {what}", "1/s", values["plant"], values["servos"], "mujoco.batch, servo actuators", LEAST_RATIO
-        ),
-        Measurement("mujoco", f"engine, {what}", "1/s", values["engine"], values["plant"], "MuJoCo plant"),
-    ]
+    plant, alone, servos, _ = contenders
+
+    def row(what: str, ours: str, peer: str, bar: float | None) -> Measurement:
+        text = f"{what}, substeps of 1 ms, {count} robots, 1 thread"
+        return Measurement("mujoco", text, "1/s", values[ours], values[peer], peer, bar)
+
+    pairs = (("plant", plant, alone, LEAST_RATIO), ("plant", plant, servos, LEAST_RATIO), ("engine", "engine", plant, None))
+    return [row(*pair) for pair in pairs]
 
 
 def _plant(backend: str, count: int, ticks: int, precision: str = "float64", threads: int = 1) -> Contender:
@@ -219,9 +214,7 @@ class Deviation:
     percentile_90: float
     worst: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain JSON types."""
-        return asdict(self)
+    as_dict = asdict
 
 
 def measure_convergence(size: Size) -> list[Deviation]:
@@ -233,19 +226,19 @@ def measure_convergence(size: Size) -> list[Deviation]:
 
 def _case(case: str, count: int, ticks: int, size: Size) -> list[Deviation]:
     travel = partial(_travel, case, _goals(case, ticks, count))
+
+    def deviation(quantity: str, value: float | str, difference: Array) -> Deviation:
+        found = np.percentile(np.linalg.norm(difference, axis=1), (50, 90, 100))
+        return Deviation(case, quantity, value, *found.tolist())
+
     reference = travel(1e-4 if size.quick else 1e-5, 8)
-    found = [_deviation(case, "step", step, travel(step, SWEEPS) - reference) for step in STEPS]
     exact = travel(1e-3, 300)
-    found += [_deviation(case, "sweeps", sweeps, travel(1e-3, sweeps) - exact) for sweeps in (2, 3, 4, 6, 8)]
     rounding = travel(1e-3, SWEEPS, "float32") - travel(1e-3, SWEEPS)
-    return [*found, _deviation(case, "precision", "float32", rounding)]
-
-
-def _deviation(case: str, quantity: str, value: float | str, difference: Array) -> Deviation:
-    distance = np.linalg.norm(difference, axis=1)
-    return Deviation(
-        case, quantity, value, float(np.median(distance)), float(np.percentile(distance, 90)), float(distance.max())
-    )
+    return [
+        *(deviation("step", step, travel(step, SWEEPS) - reference) for step in STEPS),
+        *(deviation("sweeps", sweeps, travel(1e-3, sweeps) - exact) for sweeps in (2, 3, 4, 6, 8)),
+        deviation("precision", "float32", rounding),
+    ]
 
 
 def _goals(case: str, ticks: int, count: int) -> list[Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,6 +28,8 @@ from wlr_gym.envs.tasks.task import read_task  # noqa: E402
 from wlr_gym.policy import load_agent_config  # noqa: E402
 
 EPOCHS = 4
+#: Behind a peer's name.
+ON_MUJOCO = " on MuJoCo"
 #: Reward per second of simulated time, exploration included, from which the task counts as learnt: both tracking kernels are
 #: beyond 0.93 then, where errors at the scales of the tracking error (0.02 m/s, 0.06 rad/s) would give 0.90 and 0.91.
 SOLVED = 1.7
@@ -89,18 +91,16 @@ def measure_learning(size: Size) -> list[Measurement]:
     rates = {name: tuple(3600.0 / run.seconds for run in series) for name, series in runs.items()}
     rates["ours"] = tuple(rate if run.solved else 0.0 for rate, run in zip(rates["ours"], runs["ours"], strict=True))
     row = _against_peers("learning", f"times learnt (reward {SOLVED:g}/s), {robots} robots", "1/h", rates, 5.0)
-    given_up = any(not run.solved for name in peers if _on_mujoco(name) == row.peer_name for run in runs[name])
-    return [replace(row, at_least=given_up), *(row for name, series in runs.items() for row in _details(name, series))]
-
-
-def _details(name: str, runs: Sequence[_Run]) -> list[Measurement]:
-    given_up = sum(not run.solved for run in runs)
-    who = f"{name}, not learnt in {given_up} of {len(runs)}" if given_up else name
-    return [
-        Measurement("learning", f"wall time, {who}", "s", tuple(run.seconds for run in runs)),
-        Measurement("learning", f"processor time, {who}", "s", tuple(run.processor_seconds for run in runs)),
-        Measurement("learning", f"frames, {who}", "", tuple(float(run.frames) for run in runs)),
-    ]
+    rows = [replace(row, at_least=any(not run.solved for run in runs[row.peer_name.removesuffix(ON_MUJOCO)]))]
+    for name, series in runs.items():
+        given_up = sum(not run.solved for run in series)
+        who = f"{name}, not learnt in {given_up} of {len(series)}" if given_up else name
+        rows += [
+            Measurement("learning", f"wall time, {who}", "s", tuple(run.seconds for run in series)),
+            Measurement("learning", f"processor time, {who}", "s", tuple(run.processor_seconds for run in series)),
+            Measurement("learning", f"frames, {who}", "", tuple(float(run.frames) for run in series)),
+        ]
+    return rows
 
 
 @contextmanager
@@ -123,12 +123,8 @@ def _vectors(robots: int, workers: tuple[int, ...]) -> Any:
 
 
 def _against_peers(name: str, what: str, unit: str, values: Mapping[str, tuple[float, ...]], bar: float) -> Measurement:
-    peers = {_on_mujoco(peer): series for peer, series in values.items() if peer != "ours"}
+    peers = {f"{peer}{ON_MUJOCO}": series for peer, series in values.items() if peer != "ours"}
     return against_fastest(name, what, unit, values["ours"], peers, bar)
-
-
-def _on_mujoco(peer: str) -> str:
-    return f"{peer} on MuJoCo"
 
 
 def _updates(vector: VecEnv, size: Size, *, ours: bool) -> Contender:

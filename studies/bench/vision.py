@@ -9,7 +9,7 @@ from __future__ import annotations
 import atexit
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -433,22 +433,19 @@ class VisionResult:
 
 
 def measure_vision(size: Size) -> list[VisionResult]:
-    """Measure everything."""
+    """Measure everything, on one thread of OpenCV."""
     import cv2
 
-    threads = cv2.getNumThreads()
+    threads, results = cv2.getNumThreads(), []
     cv2.setNumThreads(1)
+    parts = measure_centres, measure_poses, measure_recall, measure_false_poses, measure_rate, measure_drives
     try:
-        parts: Sequence[Callable[[Size], list[VisionResult]]] = (
-            measure_centres, measure_poses, measure_recall, measure_false_poses, measure_rate, measure_drives,
-        )  # fmt: skip
-        results: list[VisionResult] = []
         for done, part in enumerate(parts):
             size.tell(done / len(parts))
             results += part(size)
-        return results
     finally:
         cv2.setNumThreads(threads)
+    return results
 
 
 # ---- centres ---------------------------------------------------------------------------------------------------------
@@ -486,7 +483,9 @@ def _centre_error(camera: Camera, look: Look, seed: int) -> float:
     radii = np.array(ring_radii(code))
     circles = np.array([[0.0, 0.0, *(radius * radii)]])
     facet = Facet(np.zeros(3), np.eye(3)[:2], (0.05, 0.05), 225.0, circles=circles).moved(centre, rotation)
-    crop, corner = _crop(camera, project(camera, centre[None])[0])
+    corner, seen = np.round(project(camera, centre[None])[0]) - 60, (2 * 60, 2 * 60)  # only the pixels around it are drawn
+    shifted = (camera.centre[0] - corner[0], camera.centre[1] - corner[1])
+    crop = camera.model_copy(update={"width": seen[0], "height": seen[1], "centre": shifted})
     image = Renderer(crop, ScenePose(np.zeros(3), np.eye(3)), []).frame([[facet]], look, seed)
     middle = project(camera, centre[None])[0] - corner + rng.uniform(-1, 1, 2)
     edge = project(camera, centre + radius * rotation[:, :2].T) - project(camera, centre[None])
@@ -499,14 +498,6 @@ def _centre_error(camera: Camera, look: Look, seed: int) -> float:
     weights = 1 / np.trace(found.covariances[used], axis1=1, axis2=2)
     error = np.average((found.centres - expected)[used], axis=0, weights=weights)
     return float(np.hypot(*error) * camera.focal[0])
-
-
-def _crop(camera: Camera, middle: Array) -> tuple[Camera, Array]:
-    """A camera that sees only the pixels around ``middle``, and its upper left corner."""
-    half = 60
-    corner = np.round(middle) - half
-    centre = (camera.centre[0] - corner[0], camera.centre[1] - corner[1])
-    return camera.model_copy(update={"width": 2 * half, "height": 2 * half, "centre": centre}), corner
 
 
 # ---- poses -----------------------------------------------------------------------------------------------------------
@@ -683,13 +674,9 @@ def paper_pose(
     pixels = [pixel for point in near if (pixel := _contour_mean(image, point)) is not None]
     if len(pixels) < len(near):
         return None
-    inverse = np.linalg.inv(camera.matrix)
     eye = -floor_rotation.T @ floor_position
-    points = []
-    for pixel in pixels:
-        ray = floor_rotation.T @ inverse @ np.array([*pixel, 1.0])
-        points.append((eye + ray * (height - eye[2]) / ray[2])[:2])
-    places = np.array(points)
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.matrix).T @ floor_rotation
+    places = (eye + rays * ((height - eye[2]) / rays[:, 2])[:, None])[:, :2]
     x, y = places.mean(axis=0)
     layout = body.positions[:, :2] - body.positions[:, :2].mean(axis=0)
     offset = places - places.mean(axis=0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from studies.paper.experiments import (
     no_slip_travel,
 )
 from studies.paper.quantities import State
+from studies.tables import markdown_table
 from wlr_gym.physics.effects import Patch, apply_patch, load_patch
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -121,19 +123,8 @@ _RPM = 60.0 / (2.0 * math.pi)
 
 
 @dataclass(frozen=True)
-class Claim:
-    """One claim: number, what is claimed, the paper's number, when it holds, and how it is checked (-> ours, verdict)."""
-
-    number: int
-    text: str
-    paper: str
-    holds_if: str
-    check: Callable[[PaperEvidence], tuple[str, str]]
-
-
-@dataclass(frozen=True)
 class CheckedClaim:
-    """A claim with what came out."""
+    """One claim: number, what is claimed, the paper's number, when it holds, what came out here, and the verdict."""
 
     number: int
     text: str
@@ -143,15 +134,30 @@ class CheckedClaim:
     verdict: str
 
 
+#: What came out, and the verdict.
+Finding = tuple[str, str]
+#: Number of a claim -> how it is checked, in the paper's order.
+CLAIMS: dict[int, Callable[[PaperEvidence], CheckedClaim]] = {}
+
+
+def _claim(number: int, text: str, paper: str, holds_if: str) -> Callable[[Callable[[PaperEvidence], Finding]], None]:
+    """Let a function check a claim."""
+
+    def add(check: Callable[[PaperEvidence], Finding]) -> None:
+        CLAIMS[number] = lambda evidence: CheckedClaim(number, text, paper, holds_if, *check(evidence))
+
+    return add
+
+
 def check_all(evidence: PaperEvidence) -> list[CheckedClaim]:
     """Check every claim of :data:`CLAIMS`."""
-    return [CheckedClaim(claim.number, claim.text, claim.paper, claim.holds_if, *claim.check(evidence)) for claim in CLAIMS]
+    return [check(evidence) for check in CLAIMS.values()]
 
 
 def claims_table(claims: Sequence[CheckedClaim]) -> list[str]:
     """Return checked claims as lines of a Markdown table."""
-    head = ["| # | claim | paper | holds if | here | verdict |", "|---|---|---|---|---|---|"]
-    return head + [f"| {c.number} | {c.text} | {c.paper} | {c.holds_if} | {c.ours} | **{c.verdict}** |" for c in claims]
+    rows = [(c.number, c.text, c.paper, c.holds_if, c.ours, f"**{c.verdict}**") for c in claims]
+    return markdown_table(("#", "claim", "paper", "holds if", "here", "verdict"), rows)
 
 
 # ---- the checks ------------------------------------------------------------------------------------------------------
@@ -166,20 +172,25 @@ def _after(record: Record, time: float) -> int:
     return int(np.searchsorted(record.time, time - 1e-9))
 
 
-def _slip_error(test: str, paper: float) -> Callable[[PaperEvidence], tuple[str, str]]:
-    def check(e: PaperEvidence) -> tuple[str, str]:
-        error = 100 * float(error_of_ignoring_slip(e.robot, e.plant[test])[0])
-        near = abs(abs(error) - paper) < 1.5
-        return f"{error:.2f} % with rigid Coulomb friction", HOLDS if near else OPEN
-
-    return check
+def _slip_error(e: PaperEvidence, test: str, paper: float) -> Finding:
+    error = 100 * float(error_of_ignoring_slip(e.robot, e.plant[test])[0])
+    near = abs(abs(error) - paper) < 1.5
+    return f"{error:.2f} % with rigid Coulomb friction", HOLDS if near else OPEN
 
 
-def _wording(e: PaperEvidence) -> tuple[str, str]:
+_claim(1, "ignoring slip gives an error, first test", "11.5 %", "error within 1.5 points, either sign")(
+    partial(_slip_error, test="test_1", paper=11.5)
+)
+_claim(2, "the same, second test", "5 %", "the same")(partial(_slip_error, test="test_2", paper=5.0))
+
+
+@_claim(3, "the error is that of neglecting slip", "-", "one of the two is meant")
+def _wording(e: PaperEvidence) -> Finding:
     return "abstract: error of neglecting slip; conclusion: of a constant slip coefficient. One number cannot be both", FAILS
 
 
-def _lateral(e: PaperEvidence) -> tuple[str, str]:
+@_claim(4, "lateral displacement", "1.1 and 5.2 cm", "both within 5 mm")
+def _lateral(e: PaperEvidence) -> Finding:
     own = [1000 * abs(float(e.plant[test].end[0, 1])) for test in TESTS]
     k = variant_row("more drag left")
     uneven = [100 * float(e.variants[test].end[k, 1]) for test in TESTS]
@@ -196,7 +207,11 @@ def _half_way(record: Record, robot: int) -> float:
     return float(x[reached] / x[-1])
 
 
-def _early_drift(e: PaperEvidence) -> tuple[str, str]:
+@_claim(
+    5, "first test: lateral displacement at the beginning, when the wheels slip", "-",
+    "half of it in the first third of the path; partly: front axle below a quarter of the weight",
+)  # fmt: skip
+def _early_drift(e: PaperEvidence) -> Finding:
     record = e.variants["test_1"]
     share = _half_way(record, variant_row("more drag left"))
     load = float(e.plant["test_1"].force[_after(e.plant["test_1"], 0.0), 0, :2, 2].sum())
@@ -208,7 +223,8 @@ def _early_drift(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _late_drift(e: PaperEvidence) -> tuple[str, str]:
+@_claim(6, "second test: large lateral displacement at the end of the path", "-", "half of it in the last third of the path")
+def _late_drift(e: PaperEvidence) -> Finding:
     record = e.variants["test_2"]
     share = _half_way(record, variant_row("left front wheel 2 % small"))
     base = float(e.ideal["test_2"].posture.wheelbase[-1])
@@ -218,7 +234,8 @@ def _late_drift(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _posture_and_slip(e: PaperEvidence) -> tuple[str, str]:
+@_claim(7, "posture strongly changes slip", "-", "first test's error over three times the second's, and a point")
+def _posture_and_slip(e: PaperEvidence) -> Finding:
     errors = [100 * e.variant_error(test, "drag") for test in TESTS]
     loads = [float(e.ideal[test].inverse_dynamics().normal[0, 0]) for test in TESTS]
     return (
@@ -228,7 +245,8 @@ def _posture_and_slip(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _centre_of_mass(e: PaperEvidence) -> tuple[str, str]:
+@_claim(8, "equipment at the body's centre reduces slip", "-", "least error when centred")
+def _centre_of_mass(e: PaperEvidence) -> Finding:
     labels = ("centre of mass 3 cm back", "drag", "centre of mass 3 cm ahead")
     errors = [100 * e.variant_error("test_1", label) for label in labels]
     at_centre_least = abs(errors[1]) < min(abs(errors[0]), abs(errors[2]))
@@ -236,7 +254,8 @@ def _centre_of_mass(e: PaperEvidence) -> tuple[str, str]:
     return said, _graded(at_centre_least)
 
 
-def _coefficient(e: PaperEvidence) -> tuple[str, str]:
+@_claim(9, "leg angles reduce the friction coefficient", "-", "mu depends on the legs")
+def _coefficient(e: PaperEvidence) -> Finding:
     c = reduced.constants_of(Parameters.nominal(e.robot))
     start = State(alpha=TESTS["test_1"].start[0], beta=TESTS["test_1"].start[1])
     as_printed = replace(c, m_l=c.m_l + c.m_w, m_w=0.0)  # legs and wheels as one mass at mid-leg
@@ -245,7 +264,11 @@ def _coefficient(e: PaperEvidence) -> tuple[str, str]:
     return f"mu is the floor's; the force limit mu F_n changes: front {loads[0]:.2f} to {loads[1]:.2f} N times mu", FAILS
 
 
-def _four_turns(e: PaperEvidence) -> tuple[str, str]:
+@_claim(
+    10, "four wheel turns; 18.32 rpm, 214.58 rev/min2, 3.44 rpm", "4 turns",
+    "every wheel within 0.05 of four turns; partly: the front ones",
+)  # fmt: skip
+def _four_turns(e: PaperEvidence) -> Finding:
     turns = np.array([e.plant[test].joint_position[-1, 0, WHEEL_SLICE] / (2 * math.pi) for test in TESTS])
     four = np.abs(turns - 4.0) < 0.05
     return (
@@ -256,7 +279,8 @@ def _four_turns(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _rear_speed(e: PaperEvidence) -> tuple[str, str]:
+@_claim(11, "rear wheel speed grows with the body's", "-", "grows, never backwards; partly: grows")
+def _rear_speed(e: PaperEvidence) -> Finding:
     record = e.plant["test_1"]
     speed = record.joint_velocity[:, 0, 6] * _RPM
     backwards = float(speed[_after(record, 0.0) : _after(record, 1.0)].min())
@@ -268,7 +292,8 @@ def _rear_speed(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _rear_stops(e: PaperEvidence) -> tuple[str, str]:
+@_claim(12, "second test: motors 5 and 8 stop when the legs are done", "0", "below 1 rpm at 6.5 s")
+def _rear_stops(e: PaperEvidence) -> Finding:
     record = e.plant["test_2"]
     at = _after(record, 6.5)
     speed = float(record.joint_velocity[at, 0, 6]) * _RPM
@@ -276,7 +301,8 @@ def _rear_stops(e: PaperEvidence) -> tuple[str, str]:
     return said, _graded(abs(speed) < 1.0)
 
 
-def _legs_stop(e: PaperEvidence) -> tuple[str, str]:
+@_claim(13, "leg motors stop at the end of their rotation", "-", "within 0.15 s of the profile")
+def _legs_stop(e: PaperEvidence) -> Finding:
     record = e.plant["test_1"]
     moving = np.abs(record.joint_velocity[:, 0, 2]) > 0.1 * LEG_SPEED
     last = float(record.time[moving].max(initial=0.0))
@@ -284,7 +310,8 @@ def _legs_stop(e: PaperEvidence) -> tuple[str, str]:
     return f"{last:.2f} s (120 degrees at 15 counts: {profile:.2f} s)", _graded(abs(last - profile) < 0.15)
 
 
-def _leg_torque(e: PaperEvidence) -> tuple[str, str]:
+@_claim(14, "leg torque falls as the body stabilises", "-", "less at the end than at the start; partly: one axle")
+def _leg_torque(e: PaperEvidence) -> Finding:
     torque = e.ideal["test_1"].inverse_dynamics().leg_torque / 2
     less = np.abs(torque[-1]) < np.abs(torque[0])
     return (
@@ -294,7 +321,8 @@ def _leg_torque(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _free_wheel_torque(e: PaperEvidence) -> tuple[str, str]:
+@_claim(15, "a small torque on the free rear wheels from legs and surface", "small", "below 2 % of the stall torque")
+def _free_wheel_torque(e: PaperEvidence) -> Finding:
     largest = max(float(np.abs(e.ideal[test].u_dot[:, 9:]).max()) * e.ideal[test].constants.I_o for test in TESTS)
     return (
         f"motor 0; I_o theta'' of the rear wheels up to {1000 * largest:.1f} mN m in a 0.1 s leg start, else their drag",
@@ -302,7 +330,8 @@ def _free_wheel_torque(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _wheel_torque(e: PaperEvidence) -> tuple[str, str]:
+@_claim(16, "wheel motors need little torque", "small", "below 5 % of the stall torque")
+def _wheel_torque(e: PaperEvidence) -> Finding:
     away = []
     for test in TESTS:
         motion = e.ideal[test]
@@ -314,7 +343,8 @@ def _wheel_torque(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _height(e: PaperEvidence) -> tuple[str, str]:
+@_claim(17, "the body's height changes", "-", "over 1 cm in both tests")
+def _height(e: PaperEvidence) -> Finding:
     rise = [100 * float(np.ptp(e.ideal[test].posture.height)) for test in TESTS]
     own = [100 * float(np.ptp(e.plant[test].position[:, 0, 2])) for test in TESTS]
     return f"{rise[0]:.2f} and {rise[1]:.2f} cm by geometry; {own[0]:.2f} and {own[1]:.2f} cm with legs that give", _graded(
@@ -322,7 +352,8 @@ def _height(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _pitch(e: PaperEvidence) -> tuple[str, str]:
+@_claim(18, "the body pitches in the tests", "-", "over 1 degree in both tests; partly: in one")
+def _pitch(e: PaperEvidence) -> Finding:
     most = [math.degrees(float(e.ideal[test].posture.pitch.max())) for test in TESTS]
     own = [math.degrees(float(np.abs(e.plant[test].attitude[:, 0, 1]).max())) for test in TESTS]
     return f"{most[0]:.2f} (nose down) and {most[1]:.2f} degrees by geometry; {own[0]:.2f} and {own[1]:.2f} simulated", _graded(
@@ -330,7 +361,8 @@ def _pitch(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _roll(e: PaperEvidence) -> tuple[str, str]:
+@_claim(19, "the body does not roll", "0", "below 0.1 degrees; partly: if symmetric")
+def _roll(e: PaperEvidence) -> Finding:
     own = max(math.degrees(float(np.abs(e.plant[test].attitude[:, 0, 2]).max())) for test in TESTS)
     k = variant_row("more drag left")
     uneven = max(math.degrees(float(np.abs(e.variants[test].attitude[:, k, 2]).max())) for test in TESTS)
@@ -342,7 +374,8 @@ def _roll(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _two_simulations(e: PaperEvidence) -> tuple[str, str]:
+@_claim(20, "Webots and MATLAB agree", "-", "within 1 cm")
+def _two_simulations(e: PaperEvidence) -> Finding:
     record = e.plant["test_2"]
     apart = 100 * float(no_slip_travel(e.robot, record, True)[-1, 0] - no_slip_travel(e.robot, record, False)[-1, 0])
     return (
@@ -352,7 +385,8 @@ def _two_simulations(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _heavier(e: PaperEvidence) -> tuple[str, str]:
+@_claim(21, "a heavier robot slips less", "-", "less slip with 2 kg more, against any cause; partly: against drag")
+def _heavier(e: PaperEvidence) -> Finding:
     light, heavy = (100 * e.variant_error("test_1", label) for label in ("drag", "2 kg more"))
     return (
         f"against gear drag, yes: {light:.1f} to {heavy:.1f} % with 2 kg more; inertia alone does not slip at any mass",
@@ -360,14 +394,16 @@ def _heavier(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _grip(e: PaperEvidence) -> tuple[str, str]:
+@_claim(22, "tyres or floor with more friction reduce slip", "-", "less with every step of mu")
+def _grip(e: PaperEvidence) -> Finding:
     errors = [100 * e.variant_error("test_1", label) for label in ("mu 0.3", "drag", "mu 0.9")]
     less = abs(errors[2]) < abs(errors[1]) < abs(errors[0])
     said = f"first test with drag, mu 0.3, 0.6, 0.9: {errors[0]:.1f}, {errors[1]:.1f}, {errors[2]:.1f} %"
     return said, _graded(less)
 
 
-def _oversteer(e: PaperEvidence) -> tuple[str, str]:
+@_claim(23, "free rear wheels prevent oversteer", "-", "less than half the yaw of driven ones; partly: for one axle")
+def _oversteer(e: PaperEvidence) -> Finding:
     free, driven = np.degrees(e.free), np.degrees(e.driven)
     less = np.abs(free) < 0.5 * np.abs(driven)
     return (
@@ -377,7 +413,8 @@ def _oversteer(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _limits(e: PaperEvidence) -> tuple[str, str]:
+@_claim(24, "motors stay within Table II", "7.3 / 1.5 N m, 66 / 61 rpm", "below stall torque and 12 V speed")
+def _limits(e: PaperEvidence) -> Finding:
     hip = max(float(np.abs(e.plant[test].torque[..., LEG_SLICE]).max()) for test in TESTS)
     wheel = max(float(np.abs(e.plant[test].torque[..., WHEEL_SLICE]).max()) for test in TESTS)
     rates = [np.abs(e.plant[test].joint_velocity[e.plant[test].time > 0.0]) * _RPM for test in TESTS]
@@ -389,56 +426,6 @@ def _limits(e: PaperEvidence) -> tuple[str, str]:
     )
 
 
-def _fewer(e: PaperEvidence) -> tuple[str, str]:
+@_claim(25, "Gibbs-Appell needs fewer equations: twelve independent coordinates", "12", "twelve are independent")
+def _fewer(e: PaperEvidence) -> Finding:
     return "nine velocities suffice; the twelve are dependent (rank 9), and three equations of the body are missing", FAILS
-
-
-CLAIMS: tuple[Claim, ...] = (
-    Claim(
-        1, "ignoring slip gives an error, first test", "11.5 %", "error within 1.5 points, either sign",
-        _slip_error("test_1", 11.5),
-    ),
-    Claim(2, "the same, second test", "5 %", "the same", _slip_error("test_2", 5.0)),
-    Claim(3, "the error is that of neglecting slip", "-", "one of the two is meant", _wording),
-    Claim(4, "lateral displacement", "1.1 and 5.2 cm", "both within 5 mm", _lateral),
-    Claim(
-        5, "first test: lateral displacement at the beginning, when the wheels slip", "-",
-        "half of it in the first third of the path; partly: front axle below a quarter of the weight", _early_drift,
-    ),
-    Claim(
-        6, "second test: large lateral displacement at the end of the path", "-", "half of it in the last third of the path",
-        _late_drift,
-    ),
-    Claim(
-        7, "posture strongly changes slip", "-", "first test's error over three times the second's, and a point",
-        _posture_and_slip,
-    ),
-    Claim(8, "equipment at the body's centre reduces slip", "-", "least error when centred", _centre_of_mass),
-    Claim(9, "leg angles reduce the friction coefficient", "-", "mu depends on the legs", _coefficient),
-    Claim(
-        10, "four wheel turns; 18.32 rpm, 214.58 rev/min2, 3.44 rpm", "4 turns",
-        "every wheel within 0.05 of four turns; partly: the front ones", _four_turns,
-    ),
-    Claim(11, "rear wheel speed grows with the body's", "-", "grows, never backwards; partly: grows", _rear_speed),
-    Claim(12, "second test: motors 5 and 8 stop when the legs are done", "0", "below 1 rpm at 6.5 s", _rear_stops),
-    Claim(13, "leg motors stop at the end of their rotation", "-", "within 0.15 s of the profile", _legs_stop),
-    Claim(
-        14, "leg torque falls as the body stabilises", "-", "less at the end than at the start; partly: one axle", _leg_torque
-    ),
-    Claim(
-        15, "a small torque on the free rear wheels from legs and surface", "small", "below 2 % of the stall torque",
-        _free_wheel_torque,
-    ),
-    Claim(16, "wheel motors need little torque", "small", "below 5 % of the stall torque", _wheel_torque),
-    Claim(17, "the body's height changes", "-", "over 1 cm in both tests", _height),
-    Claim(18, "the body pitches in the tests", "-", "over 1 degree in both tests; partly: in one", _pitch),
-    Claim(19, "the body does not roll", "0", "below 0.1 degrees; partly: if symmetric", _roll),
-    Claim(20, "Webots and MATLAB agree", "-", "within 1 cm", _two_simulations),
-    Claim(21, "a heavier robot slips less", "-", "less slip with 2 kg more, against any cause; partly: against drag", _heavier),
-    Claim(22, "tyres or floor with more friction reduce slip", "-", "less with every step of mu", _grip),
-    Claim(
-        23, "free rear wheels prevent oversteer", "-", "less than half the yaw of driven ones; partly: for one axle", _oversteer
-    ),
-    Claim(24, "motors stay within Table II", "7.3 / 1.5 N m, 66 / 61 rpm", "below stall torque and 12 V speed", _limits),
-    Claim(25, "Gibbs-Appell needs fewer equations: twelve independent coordinates", "12", "twelve are independent", _fewer),
-)  # fmt: skip

@@ -5,7 +5,7 @@ The figures are the paper's 7-11 and 13-17 with every model side by side, and wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ from studies.paper.slip_search import (
     SearchFinding,
 )
 from studies.paper.verdicts import verdict_table
+from studies.tables import markdown_table
 from wlr_gym.base.files import write_json, write_text
 from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
 from wlr_gym.physics.plants import SIMULATORS
@@ -111,32 +112,35 @@ def _heading(test: PaperTest, kind: int, what: str) -> str:
     return f"Fig. {test.figures[kind]} ({test.title}): {what}"
 
 
-#: Column of a joint, and which motors of the paper it stands for.
-_LEGS = ((0, "front legs (motors 2, 3)"), (2, "rear legs (motors 1, 4)"))
-_WHEELS = ((4, "front wheels (motors 6, 7)"), (6, "rear wheels, free (motors 5, 8)"))
+#: Column of a joint, its column in u11, and which motors of the paper it stands for: legs above wheels.
+_JOINTS = (
+    ((0, 5, "front legs (motors 2, 3)"), (2, 6, "rear legs (motors 1, 4)")),
+    ((4, 7, "front wheels (motors 6, 7)"), (6, 9, "rear wheels, free (motors 5, 8)")),
+)
+
+
+def _joint_panels(axes: Panels) -> Iterator[tuple[Axes, int, int, str]]:
+    """Yield panel, column of the joint, its column in u11 and title of the four kinds of joints."""
+    return ((axes[row, k], *joint) for row, joints in enumerate(_JOINTS) for k, joint in enumerate(joints))
 
 
 def rotation_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
     """Figures 7 and 13: rotation of each joint, left side."""
     figure, axes = _panels(_heading(ideal.test, 0, "rotation of the joints"), 2, 2)
-    legs = (ideal.front, ideal.rear)
-    for k, (joint, title) in enumerate(_LEGS):
-        _draw_ideal(axes[0, k], ideal, np.degrees(legs[k]))
-        _draw(axes[0, k], records, lambda r, j=joint: np.degrees(r.joint_position[:, 0, j]), title, "rotation (degrees)")
-    for k, (joint, title) in enumerate(_WHEELS):
-        _draw_ideal(axes[1, k], ideal, ideal.wheels[:, joint - 4] / (2 * np.pi))
-        _draw(axes[1, k], records, lambda r, j=joint: r.joint_position[:, 0, j] / (2 * np.pi), title, "rotation (turns)")
+    angles = {0: ideal.front, 2: ideal.rear, 4: ideal.wheels[:, 0], 6: ideal.wheels[:, 2]}
+    for panel, joint, _, title in _joint_panels(axes):
+        one, label = (180 / np.pi, "rotation (degrees)") if joint < 4 else (0.5 / np.pi, "rotation (turns)")
+        _draw_ideal(panel, ideal, one * angles[joint])
+        _draw(panel, records, lambda r, j=joint, one=one: one * r.joint_position[:, 0, j], title, label)
     return _over_time(figure, axes)
 
 
 def speed_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
     """Figures 8 and 14: speed of each joint, left side."""
     figure, axes = _panels(_heading(ideal.test, 1, "speed of the joints"), 2, 2)
-    columns = {0: 5, 2: 6, 4: 7, 6: 9}
-    for row, joints in enumerate((_LEGS, _WHEELS)):
-        for k, (joint, title) in enumerate(joints):
-            _draw_ideal(axes[row, k], ideal, ideal.u[:, columns[joint]] * _RPM)
-            _draw(axes[row, k], records, lambda r, j=joint: r.joint_velocity[:, 0, j] * _RPM, title, "speed (rpm)")
+    for panel, joint, column, title in _joint_panels(axes):
+        _draw_ideal(panel, ideal, ideal.u[:, column] * _RPM)
+        _draw(panel, records, lambda r, j=joint: r.joint_velocity[:, 0, j] * _RPM, title, "speed (rpm)")
     return _over_time(figure, axes)
 
 
@@ -148,22 +152,21 @@ def torque_figure(records: Sequence[Record], ideal: IdealMotion, measured: FromM
         measured: inverse dynamics of the first simulator's record; None = none.
     """
     figure, axes = _panels(_heading(ideal.test, 2, "motor torque of the joints"), 2, 2, 2.8)
-    inverse = ideal.inverse_dynamics()
     source = next((record for record in records if record.model != REDUCED), None)
-    for row, joints in enumerate((_LEGS, _WHEELS)):
-        for k, (joint, title) in enumerate(joints):
-            values = inverse.leg_torque[:, k] / 2 if row == 0 else inverse.wheel_torque[:, joint - 4]
-            _draw_ideal(axes[row, k], ideal, values)
-            _draw(axes[row, k], records, lambda r, j=joint: r.torque[:, 0, j], title + ", each", "torque (N m)")
-            if measured is None or source is None:
-                continue
-            right = measured.right.leg_torque[:, k] / 2 if row == 0 else measured.right.wheel_torque[:, joint - 4]
-            as_printed = measured.leg_torque_printed[:, k] / 2 if row == 0 else measured.wheel_torque_printed[:, joint - 4]
-            for values, colour, label in (
-                (right, WINE, "corrected (19)-(24) from the motion: behind the gears"),
-                (as_printed, GREEN, "printed (19)-(24)"),
-            ):
-                axes[row, k].plot(source.time, values, color=colour, linewidth=0.8, label=label)
+
+    def of_joint(legs: Array, wheels: Array, joint: int) -> Array:
+        return legs[:, joint // 2] / 2 if joint < 4 else wheels[:, joint - 4]
+
+    inverse = ideal.inverse_dynamics()
+    for panel, joint, _, title in _joint_panels(axes):
+        _draw_ideal(panel, ideal, of_joint(inverse.leg_torque, inverse.wheel_torque, joint))
+        _draw(panel, records, lambda r, j=joint: r.torque[:, 0, j], f"{title}, each", "torque (N m)")
+        if measured is not None and source is not None:
+            right = of_joint(measured.right.leg_torque, measured.right.wheel_torque, joint)
+            label = "corrected (19)-(24) from the motion: behind the gears"
+            panel.plot(source.time, right, color=WINE, linewidth=0.8, label=label)
+            as_printed = of_joint(measured.leg_torque_printed, measured.wheel_torque_printed, joint)
+            panel.plot(source.time, as_printed, color=GREEN, linewidth=0.8, label="printed (19)-(24)")
     return _over_time(figure, axes)
 
 
@@ -283,15 +286,12 @@ def figures_of_test(
     return named | {f"{ideal.test.name}_slip.png": slip_figure(ordered, ideal)}
 
 
-# ---- report and numbers ----------------------------------------------------------------------------------------------
+# ---- agreement of the models -----------------------------------------------------------------------------------------
 
 
 Records = Mapping[str, Mapping[str, Record]]
 #: label of a finding -> observable -> lowest and highest of its matches.
 Decisive = Mapping[str, Mapping[str, tuple[float, float]]]
-
-
-# ---- agreement of the models -----------------------------------------------------------------------------------------
 
 
 def agreement(records: Records) -> dict[str, dict[str, dict[str, float]]]:
@@ -375,7 +375,13 @@ def write_report(
     write_json(folder / "search.json", {"findings": [finding.as_dict() for finding in findings], "decisive": decisive})
     lines = ["# The paper, repeated", "", "## The two tests", "", *_ends_table(robot, records), ""]
     if apart:
-        lines += ["## How far the models are from Gibbs-Appell", "", *_agreement_table(apart), ""]
+        rows = [
+            (model, name, f"{100 * found['position']:.3f} %", f"{found['yaw_degrees']:.4f} degrees",
+             f"{100 * found['leg_torque']:.2f} %", f"{100 * found['wheel_torque']:.2f} %")
+            for model, tests in apart.items() for name, found in tests.items()
+        ]  # fmt: skip
+        table = markdown_table(("model", "test", "position", "yaw", "leg torque", "wheel torque"), rows)
+        lines += ["## How far the models are from Gibbs-Appell", "", *table, ""]
     lines += ["## Claims", "", *claims_table(claims), ""]
     if findings:
         lines += ["## What could explain the paper's slip", "", *question_lines(findings, decisive), ""]
@@ -384,36 +390,20 @@ def write_report(
 
 
 def _ends_table(robot: Robot, records: Records) -> list[str]:
-    lines = [
-        "| model | test | x (m) | y (mm) | error of ignoring slip | front, rear turns | most slip of a wheel (mm) |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    def number(value: float, digits: int, unit: str = "") -> str:
+        return f"{value:.{digits}f}{unit}" if np.isfinite(value) else "not measured"
+
+    rows = []
     for model, tests in records.items():
         for name, record in tests.items():
             x, y = record.end[0]
-            turns = record.joint_position[-1, 0, [4, 6]] / (2 * np.pi)
+            front, rear = record.joint_position[-1, 0, [4, 6]] / (2 * np.pi)
             error = 100 * float(error_of_ignoring_slip(robot, record)[0])
             slipped = 1e3 * float(np.abs(record.slip_path[-1, 0, :, 0]).max())
-            lines.append(
-                f"| {model} | {name} | {_number(x, 4)} | {_number(1e3 * y, 2)} | {_number(error, 2, ' %')} | "
-                f"{turns[0]:.3f}, {turns[1]:.3f} | {_number(slipped, 2)} |"
-            )
-    return lines
-
-
-def _number(value: float, digits: int, unit: str = "") -> str:
-    return f"{value:.{digits}f}{unit}" if np.isfinite(value) else "not measured"
-
-
-def _agreement_table(apart: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
-    lines = ["| model | test | position | yaw | leg torque | wheel torque |", "|---|---|---|---|---|---|"]
-    for model, tests in apart.items():
-        for name, found in tests.items():
-            lines.append(
-                f"| {model} | {name} | {100 * found['position']:.3f} % | {found['yaw_degrees']:.4f} degrees | "
-                f"{100 * found['leg_torque']:.2f} % | {100 * found['wheel_torque']:.2f} % |"
-            )
-    return lines
+            ends = number(x, 4), number(1e3 * y, 2), number(error, 2, " %")
+            rows.append((model, name, *ends, f"{front:.3f}, {rear:.3f}", number(slipped, 2)))
+    headings = "model", "test", "x (m)", "y (mm)", "error of ignoring slip", "front, rear turns", "most slip of a wheel (mm)"
+    return markdown_table(headings, rows)
 
 
 def question_lines(findings: Sequence[SearchFinding], decisive: Mapping[str, Decisive]) -> list[str]:
@@ -426,40 +416,29 @@ def question_lines(findings: Sequence[SearchFinding], decisive: Mapping[str, Dec
         "",
     ]
     for reading in READINGS:
-        lines += [f"### Reading: {reading.doc}", "", *_closest(findings, reading), "", *_ranges(findings, reading)]
+        closest = []
+        for count in sorted({len(finding.names) for finding in findings}):
+            alike = sorted((f for f in findings if len(f.names) == count), key=lambda f: f.closest(reading))
+            closest += [(count, f.label, f"{f.closest(reading):.2f}", len(f.matches(reading))) for f in alike[:3]]
+        lines += [f"### Reading: {reading.doc}", "", *markdown_table(("at once", "closest", "miss", "matches"), closest), ""]
+        matches = slip_search.matching(findings, reading)
+        lines += [_ranges(finding, reading) for finding in matches] or ["No match."]
+        lines.append("")
         found = decisive.get(reading.name, {})
         if len(found) > 1:
-            lines += [*_decisive(found), ""]
+            headings = [f"{meaning} ({unit})" for meaning, unit in OBSERVABLES.values()]
+            rows = [
+                (label, *("{:.2f} to {:.2f}".format(*values[name]) for name in OBSERVABLES)) for label, values in found.items()
+            ]
+            lines += ["What the matching robots would show elsewhere (lowest to highest):", ""]
+            lines += [*markdown_table(("explanation", *headings), rows), ""]
     return lines
 
 
-def _closest(findings: Sequence[SearchFinding], reading: PaperReading) -> list[str]:
-    lines = ["| at once | closest | miss | matches |", "|---|---|---|---|"]
-    for count in sorted({len(finding.names) for finding in findings}):
-        of_count = sorted((f for f in findings if len(f.names) == count), key=lambda f: f.closest(reading))
-        for finding in of_count[:3]:
-            lines.append(f"| {count} | {finding.label} | {finding.closest(reading):.2f} | {len(finding.matches(reading))} |")
-    return lines
-
-
-def _ranges(findings: Sequence[SearchFinding], reading: PaperReading) -> list[str]:
-    lines: list[str] = []
-    for finding in slip_search.matching(findings, reading):
-        entry: dict[str, Any] = finding.as_dict()["readings"][reading.name]
-        ranges = "; ".join(
-            f"{name} {span['low']:.3g} to {span['high']:.3g} {span['unit']}".rstrip(" -")
-            for name, span in entry["ranges"].items()
-        )
-        lines += [f"- **{finding.label}** ({entry['matches']} matches): {ranges}"]
-    return [*lines, ""] if lines else ["No match.", ""]
-
-
-def _decisive(found: Decisive) -> list[str]:
-    head = ["What the matching robots would show elsewhere (lowest to highest):", ""]
-    names = list(OBSERVABLES)
-    head += ["| explanation | " + " | ".join(f"{OBSERVABLES[name][0]} ({OBSERVABLES[name][1]})" for name in names) + " |"]
-    head += ["|---" * (len(names) + 1) + "|"]
-    return head + [
-        f"| {label} | " + " | ".join(f"{values[name][0]:.2f} to {values[name][1]:.2f}" for name in names) + " |"
-        for label, values in found.items()
-    ]
+def _ranges(finding: SearchFinding, reading: PaperReading) -> str:
+    """Say within which range of every dial the matches of a finding lie."""
+    entry: dict[str, Any] = finding.as_dict()["readings"][reading.name]
+    ranges = (
+        f"{name} {span['low']:.3g} to {span['high']:.3g} {span['unit']}".rstrip(" -") for name, span in entry["ranges"].items()
+    )
+    return f"- **{finding.label}** ({entry['matches']} matches): {'; '.join(ranges)}"

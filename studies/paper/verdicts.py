@@ -101,8 +101,8 @@ class Equation:
     verdicts: tuple[str, ...]
     remark: str
     correction: str
-    printed: Callable[..., Any]
-    corrected: Callable[..., Any]
+    printed: Callable[..., Any] | None
+    corrected: Callable[..., Any] | None
     repaired: Callable[..., Any] | None = None
 
 
@@ -198,15 +198,11 @@ def _function(names: Mapping[str, Any], number: int) -> Callable[..., Any] | Non
     return next((value for name, value in names.items() if name.startswith(f"eq{number}_")), None)
 
 
-def _equation(number: int, title: str, section: str, verdicts: tuple[str, ...], remark: str, correction: str) -> Equation:
-    as_printed, right = (_function(vars(module), number) for module in (printed, corrected))
-    assert as_printed is not None
-    assert right is not None
-    return Equation(number, title, section, verdicts, remark, correction, as_printed, right, _function(globals(), number))
-
-
 #: Every equation by its number.
-EQUATIONS: dict[int, Equation] = {row[0]: _equation(*row) for row in _rows()}
+EQUATIONS: dict[int, Equation] = {
+    row[0]: Equation(*row, *(_function(names, row[0]) for names in (vars(printed), vars(corrected), globals())))
+    for row in _rows()
+}
 
 
 def verdict_table() -> list[str]:
@@ -214,17 +210,9 @@ def verdict_table() -> list[str]:
     groups: dict[tuple[tuple[str, ...], str, str], list[Equation]] = {}
     for equation in EQUATIONS.values():
         groups.setdefault((equation.verdicts, equation.remark, equation.correction), []).append(equation)
-    head = ["| | equation | verdict | why | correct |", "|---|---|---|---|---|"]
-    return head + [
-        f"| {', '.join(f'({e.number})' for e in same)} | {'; '.join(e.title for e in same)} | {', '.join(verdicts)} "
-        f"| {_cell(remark)} | {_code(right)} |"
-        for (verdicts, remark, right), same in groups.items()
-    ]
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("*", "\\*")
-
-
-def _code(text: str) -> str:
-    return f"`{text}`".replace("|", "\\|")
+    lines = ["| | equation | verdict | why | correct |", "|---|---|---|---|---|"]
+    for (verdicts, remark, right), same in groups.items():
+        numbers, titles = ", ".join(f"({e.number})" for e in same), "; ".join(e.title for e in same)
+        why, form = remark.replace("|", "\\|").replace("*", "\\*"), right.replace("|", "\\|")
+        lines.append(f"| {numbers} | {titles} | {', '.join(verdicts)} | {why} | `{form}` |")
+    return lines
