@@ -19,7 +19,7 @@ nor v occurs anywhere else: M (a0, w', leg_rate', wheel_rate') + bias(w, leg_rat
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -103,28 +103,20 @@ def leg_frame() -> tuple[Matrix, Matrix]:
     return sp.Matrix([COS_Q, 0, -SIN_Q]), sp.Matrix([SIN_Q, 0, COS_Q])
 
 
-def with_pitch_rate(vector: Matrix, rate: Expression) -> Matrix:
-    """Turn on the pitch axis relative to the platform: same x and z components, pitch component ``rate``."""
-    return sp.Matrix([vector[0], rate, vector[2]])
+def rotation(rate: Expression, rate_dot: Expression) -> tuple[Matrix, Matrix]:
+    """Angular velocity and acceleration of a leg or a wheel, which turns on the pitch axis relative to the platform.
 
-
-def leg_rotation() -> tuple[Matrix, Matrix]:
-    """Angular velocity and acceleration of the leg; its components change in the turning body frame, hence w x."""
-    omega = with_pitch_rate(W, LEG_RATE)
-    return omega, with_pitch_rate(W_DOT, LEG_RATE_DOT) + W.cross(omega)
-
-
-def wheel_rotation() -> tuple[Matrix, Matrix]:
-    """Angular velocity and acceleration of the wheel, likewise."""
-    omega = with_pitch_rate(W, WHEEL_RATE)
-    return omega, with_pitch_rate(W_DOT, WHEEL_RATE_DOT) + W.cross(omega)
+    The components change in the turning body frame, hence w x.
+    """
+    omega = sp.Matrix([W[0], rate, W[2]])
+    return omega, sp.Matrix([W_DOT[0], rate_dot, W_DOT[2]]) + W.cross(omega)
 
 
 def acceleration_along_leg(distance: Expression) -> Matrix:
     """Acceleration of the leg's point ``distance`` from the hip: affine in the distance."""
     hip = sp.Matrix(ASSEMBLY_PARAMETERS[:3])
     axis, _ = leg_frame()
-    return acceleration_at(acceleration_at(A0, hip, W, W_DOT), distance * axis, *leg_rotation())
+    return acceleration_at(acceleration_at(A0, hip, W, W_DOT), distance * axis, *rotation(LEG_RATE, LEG_RATE_DOT))
 
 
 def translation_by_moments() -> Expression:
@@ -151,8 +143,8 @@ def rotation_of_assembly() -> Expression:
     axis, across = leg_frame()
     leg_inertia = leg_ixx * across * across.T + leg_iyy * PITCH_AXIS * PITCH_AXIS.T + leg_izz * axis * axis.T
     rotors = armature_leg * (LEG_RATE_DOT - W_DOT[1]) ** 2 + armature_wheel * (WHEEL_RATE_DOT - LEG_RATE_DOT) ** 2
-    leg = rotational_gibbs(leg_inertia, *leg_rotation())
-    wheel = rotational_gibbs(sp.diag(transverse, spin, transverse), *wheel_rotation())
+    leg = rotational_gibbs(leg_inertia, *rotation(LEG_RATE, LEG_RATE_DOT))
+    wheel = rotational_gibbs(sp.diag(transverse, spin, transverse), *rotation(WHEEL_RATE, WHEEL_RATE_DOT))
     return leg + wheel + HALF * rotors
 
 
@@ -393,52 +385,34 @@ class Printer:
         return [base] * int(exponent)
 
 
-@dataclass(frozen=True)
-class Function:
-    """One function to generate."""
+def function_source(
+    name: str, doc: str, program: Program, parameters: tuple[sp.Symbol, ...], state: tuple[sp.Symbol, ...]
+) -> str:
+    """Return the Python source of a function that computes a program's results, as ruff would format it."""
+    printer, matrix, bias = Printer(program, parameters), program.mass_matrix, program.bias
 
-    name: str
-    doc: str
-    program: Program
-    parameters: tuple[sp.Symbol, ...]
-    state: tuple[sp.Symbol, ...]
-    results: Callable[[Program, Printer], dict[str, str]]
+    def entries(items: Mapping[Any, Expression]) -> str:
+        return "\n".join(["{", *(f"        {key}: {printer.text(value)}," for key, value in items.items()), "    }"])
 
-    def source(self) -> str:
-        """Python source, as ruff would format it."""
-        printer = Printer(self.program, self.parameters)
-        results = self.results(self.program, printer)
-        kinds = ", ".join(RESULT_KINDS.get(result, "Value") for result in results)
-        arguments = [f"    {argument}: Value," for argument in (*self.parameters, *self.state)]
-        steps = [f"    {symbol} = {printer.text(definition)}" for symbol, definition in self.program.steps.items()]
-        returns = [f"    {result} = {text}" for result, text in results.items()]
-        head = [f"def {self.name}(", *arguments, f") -> tuple[{kinds}]:", f"    {self.doc}"]
-        return "\n".join([*head, *steps, *returns, f"    return {', '.join(results)}", ""])
-
-
-def base_results(program: Program, printer: Printer) -> dict[str, str]:
-    """Source text of the rows and columns of the base."""
-    mass = {key: value for key, value in program.mass_matrix.items() if key[1] in BASE}
-    bias = {row: value for row, value in program.bias.items() if row in BASE}
-    return {"base_mass": _entries(printer, mass), "base_bias": _entries(printer, bias)}
-
-
-def assembly_results(program: Program, printer: Printer) -> dict[str, str]:
-    """Source text of everything ``assembly_terms`` returns."""
-    matrix, bias = program.mass_matrix, program.bias
-    coupling = {row: value for (row, column), value in matrix.items() if column == LEG and row in BASE}
-    return base_results(program, printer) | {
-        "leg_coupling": _entries(printer, coupling),
-        "leg_leg": printer.text(matrix[LEG, LEG]),
-        "leg_wheel": printer.text(matrix[LEG, WHEEL]),
-        "wheel_wheel": printer.text(matrix[WHEEL, WHEEL]),
-        "leg_bias": printer.text(bias[LEG]),
-        "wheel_bias": "0.0",
+    results = {
+        "base_mass": entries({key: value for key, value in matrix.items() if key[1] in BASE}),
+        "base_bias": entries({row: value for row, value in bias.items() if row in BASE}),
     }
-
-
-def _entries(printer: Printer, items: Mapping[Any, Expression]) -> str:
-    return "\n".join(["{", *(f"        {key}: {printer.text(value)}," for key, value in items.items()), "    }"])
+    if (LEG, LEG) in matrix:
+        results |= {
+            "leg_coupling": entries({row: value for (row, column), value in matrix.items() if column == LEG and row in BASE}),
+            "leg_leg": printer.text(matrix[LEG, LEG]),
+            "leg_wheel": printer.text(matrix[LEG, WHEEL]),
+            "wheel_wheel": printer.text(matrix[WHEEL, WHEEL]),
+            "leg_bias": printer.text(bias[LEG]),
+            "wheel_bias": "0.0",
+        }
+    kinds = ", ".join(RESULT_KINDS.get(result, "Value") for result in results)
+    arguments = [f"    {argument}: Value," for argument in (*parameters, *state)]
+    steps = [f"    {symbol} = {printer.text(definition)}" for symbol, definition in program.steps.items()]
+    returns = [f"    {result} = {text}" for result, text in results.items()]
+    head = [f"def {name}(", *arguments, f") -> tuple[{kinds}]:", f"    {doc}"]
+    return "\n".join([*head, *steps, *returns, f"    return {', '.join(results)}", ""])
 
 
 def source() -> str:
@@ -451,11 +425,9 @@ def source() -> str:
     prove(platform, derive_platform())
     prove(assembly, derive_assembly())
     state = (SIN_Q, COS_Q, *W, LEG_RATE, WHEEL_RATE)
-    functions = (
-        Function("platform_terms", PLATFORM_DOC, platform, PLATFORM_PARAMETERS, (*W,), base_results),
-        Function("assembly_terms", ASSEMBLY_DOC, assembly, ASSEMBLY_PARAMETERS, state, assembly_results),
-    )
-    return "\n\n".join((HEADER, *(function.source() for function in functions)))
+    of_platform = function_source("platform_terms", PLATFORM_DOC, platform, PLATFORM_PARAMETERS, (*W,))
+    of_assembly = function_source("assembly_terms", ASSEMBLY_DOC, assembly, ASSEMBLY_PARAMETERS, state)
+    return f"{HEADER}\n\n{of_platform}\n\n{of_assembly}"
 
 
 def main() -> None:

@@ -132,7 +132,7 @@ def _robot(one: DecideCase) -> BlindRobot:
     copy = copy_of(sheet, one.seed, soft=True)
     registers = excite(START[0]).profile
     profile = BlindProfile(registers.wheel_acceleration, registers.leg_velocity, registers.leg_acceleration)
-    return BlindRobot(sheet, copy, hide([] if one.effect is None else [one.effect], copy), profile, one.camera)
+    return BlindRobot(sheet, copy, hide([] if one.effect is None else [one.effect]), profile, one.camera)
 
 
 def _script(motion: Motion) -> BlindScript:

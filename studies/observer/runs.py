@@ -193,14 +193,3 @@ def plain_odometry(runs: Runs) -> Array:
     """Velocity (T + 1, N, 2) as the wheels' encoders alone tell it: their mean ahead, none to the side."""
     forward = runs.robot.wheel.radius * runs.sensed("joint_velocity")[..., 4:].mean(axis=-1)
     return np.stack([forward, np.zeros_like(forward)], axis=-1)
-
-
-def imu_only(runs: Runs) -> Array:
-    """Velocity (T + 1, N, 2) by integrating the accelerometer from rest, less what it reads at the start."""
-    force, rate = runs.sensed("accelerometer"), runs.sensed("gyro")[..., 2]
-    acceleration = force[..., :2] - force[:1, :, :2]
-    out = np.zeros_like(acceleration)
-    for tick in range(1, len(out)):
-        v, w = out[tick - 1], rate[tick][:, None]
-        out[tick] = v + PERIOD * (acceleration[tick - 1 : tick + 1].mean(axis=0) + w * np.stack([v[:, 1], -v[:, 0]], axis=-1))
-    return out

@@ -34,6 +34,8 @@ DRIVEN += [("slope", "climb"), ("slippery", "commands"), ("changing", "commands"
 PLAYED = [(p, f) for p in ("velocity_blind", "velocity_slip_aware") for f in ("slippery", "ice", "split")]
 #: What is taken from the compiled observer's state of each step.
 TAKEN = ("rolling", "load", "traction", "force", "slope", "turned", "yaw_rate", "shaken", "legs", "inclined", "guess")
+#: Noises that are learnt: of the leak its wander, with the legs, with turning; of the velocity; at the start.
+NOISES = ("leak_wander", "leak_legs", "leak_turn", "alias", "velocity_legs", "start_speed", "start_leak")
 Batch = dict[str, Tensor]
 
 
@@ -85,7 +87,6 @@ class Trust(nn.Module):
             self.gate.bias[:MEMORY] = -2.0
             self.output.weight.mul_(0.1)
             self.output.bias[:] = torch.tensor([6.0, 6.0, -5.0, 0.0, 0.0])
-        # leak: wander, with the legs, with turning; velocity: alias, with the legs; at the start: speed, leak
         self.noise = nn.Parameter(torch.log(torch.tensor([0.01, 0.02, 2.0, 0.25, 0.3, 0.05, 0.05])))
 
     def judge(self, clues: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,7 +101,6 @@ class Trust(nn.Module):
         gate, output = (layer.weight.detach().numpy() for layer in (self.gate, self.output))
         seen = CLUES + CLUES_ALIKE
         noise = np.exp(self.noise.detach().numpy().astype(float))
-        names = ("leak_wander", "leak_legs", "leak_turn", "alias", "velocity_legs", "start_speed", "start_leak")
         return {
             "gate": np.concatenate([gate[:, :CLUES], gate[:, seen : seen + 2 * MEMORY]], axis=1),
             "gate_alike": np.concatenate([gate[:, CLUES:seen], gate[:, seen + 2 * MEMORY :]], axis=1),
@@ -108,7 +108,7 @@ class Trust(nn.Module):
             "output": np.concatenate([output[:, MEMORY : MEMORY + CLUES], output[:, :MEMORY]], axis=1),
             "output_alike": output[:, MEMORY + CLUES :],
             "output_bias": self.output.bias.detach().numpy(),
-            **dict(zip(names, noise, strict=True)),
+            **dict(zip(NOISES, noise, strict=True)),
         }
 
     def start_from(self, arrays: Any) -> None:
@@ -116,8 +116,7 @@ class Trust(nn.Module):
         own, alike, out = (torch.from_numpy(np.array(arrays[name])) for name in ("gate", "gate_alike", "output"))
         gate = [own[:, :CLUES], alike[:, :CLUES_ALIKE], own[:, CLUES:], alike[:, CLUES_ALIKE:]]
         output = [out[:, CLUES:], out[:, :CLUES], torch.from_numpy(np.array(arrays["output_alike"]))]
-        names = ("leak_wander", "leak_legs", "leak_turn", "alias", "velocity_legs", "start_speed", "start_leak")
-        noise = np.array([float(arrays[name]) for name in names])
+        noise = np.array([float(arrays[name]) for name in NOISES])
         with torch.no_grad():
             self.gate.weight.copy_(torch.cat(gate, 1))
             self.output.weight.copy_(torch.cat(output, 1))
@@ -129,14 +128,11 @@ class Trust(nn.Module):
 def begin(d: Batch, net: Trust) -> Batch:
     """State at the reset: mean, error of the position (heading frame), covariances (p, v, l: six numbers), memories."""
     n = d["load"].shape[1]
-    p = torch.zeros(n, 2, 6)
-    p[..., 0] = 1e-8
-    sigma = torch.exp(net.noise[5:])
-    p = p + torch.stack([sigma[0] * 0, sigma[0] * 0, sigma[0] * 0, sigma[0] ** 2, sigma[0] * 0, sigma[1] ** 2])
-    zero = torch.zeros(n, 2)
-    leak, rolling = d["leak"][0].clone(), d["rolling"][0]
-    memory = torch.zeros(n, 4, MEMORY)
-    return {"v": zero, "leak": leak, "off": zero, "error": zero, "p": p, "memory": memory, "wander": zero, "rolling": rolling}
+    zero, none = torch.zeros(n, 2), torch.zeros(())
+    speed, leak = torch.exp(net.noise[5:]) ** 2
+    p = torch.stack([torch.tensor(1e-8), none, none, speed, none, leak]).expand(n, 2, 6)
+    state = {"v": zero, "leak": d["leak"][0].clone(), "off": zero, "error": zero, "p": p, "wander": zero}
+    return state | {"memory": torch.zeros(n, 4, MEMORY), "rolling": d["rolling"][0]}
 
 
 def turned(a: Tensor, c: Tensor, s: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.bench.blind.copies import JOINTS, LEGS, WHEELS, Copy
+from studies.bench.blind.copies import JOINTS, LEGS, WHEELS
 
 Array = NDArray[np.float64]
 
@@ -64,13 +64,14 @@ def _each(joints: Sequence[str], names: Sequence[str]) -> list[int]:
 
 
 Numbers = Mapping[str, float]
-Law = Callable[[Hidden, list[str], Numbers, Copy], None]
+#: Writes an effect's places and numbers into those of the simulator.
+Law = Callable[[Hidden, list[str], Numbers], None]
 
 
 def _at(field_name: str, parameter: str, names: Sequence[str] = JOINTS, *, add: bool = True) -> Law:
     """Write one parameter into the places' elements of a field."""
 
-    def write(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+    def write(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
         values = getattr(hidden, field_name)
         places = _each(where, names)
         values[places] = numbers[parameter] + (values[places] if add else 0.0)
@@ -79,105 +80,63 @@ def _at(field_name: str, parameter: str, names: Sequence[str] = JOINTS, *, add: 
 
 
 def _times(field_name: str, parameter: str, names: Sequence[str]) -> Law:
-    def write(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+    def write(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
         getattr(hidden, field_name)[_each(where, names)] *= numbers[parameter]
 
     return write
 
 
 def _vector(field_name: str, *parameters: str) -> Law:
-    def write(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+    def write(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
         setattr(hidden, field_name, np.array([numbers.get(name, 0.0) for name in parameters]))
 
     return write
 
 
 def _scalar(field_name: str, parameter: str) -> Law:
-    return lambda hidden, where, numbers, copy: setattr(hidden, field_name, float(numbers[parameter]))
+    return lambda hidden, where, numbers: setattr(hidden, field_name, float(numbers[parameter]))
 
 
-def _stribeck(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+def _stribeck(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
     places = _each(where, JOINTS)
     hidden.stick_extra[places] = numbers["extra_static_torque"]
     hidden.stick_speed[places] = numbers["stribeck_speed"]
 
 
-def _write_ripple(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+def _write_ripple(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
     for place in _each(where, JOINTS):
         hidden.ripple[:, place] = numbers["amplitude"], numbers["order"], numbers.get("phase", 0.0)
 
 
-def _level(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+def _level(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
     hidden.wheel_mu[:] = numbers["mu"]
 
 
-def _write_patch(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+def _write_patch(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
     far = 1e6
     hidden.patch = np.array(
         [numbers["mu"], numbers["x_min"], numbers["x_max"], numbers.get("y_min", -far), numbers.get("y_max", far)]
     )
 
 
-def _write_camera(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+def _write_camera(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
     hidden.camera_yaw, hidden.camera_scale = numbers.get("yaw", 0.0), numbers.get("scale", 1.0)
 
 
 def _both_rows(field_name: str, first: str, second: str) -> Law:
-    def write(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+    def write(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
         getattr(hidden, field_name)[:, _each(where, LEGS)] = np.array([[numbers[first]], [numbers[second]]])
 
     return write
 
 
-def _cross(hidden: Hidden, where: list[str], numbers: Numbers, copy: Copy) -> None:
+def _cross(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
     for axle in range(2):
         if WHEELS[2 * axle] in where:
             hidden.cross_ratio[axle] = numbers["ratio"]
 
 
-#: Effects of the vocabulary.
-NAMED: Mapping[str, Law] = {
-    "coulomb_friction": _at("coulomb", "torque"),
-    "viscous_friction": _at("viscous", "coefficient"),
-    "stribeck_friction": _stribeck,
-    "load_dependent_friction": _at("load_ratio", "ratio"),
-    "backlash": _at("play", "angle"),
-    "torque_ripple": _write_ripple,
-    "weak_motor": _times("motor_scale", "scale", JOINTS),
-    "supply_sag": _scalar("supply_resistance", "resistance"),
-    "command_delay": _at("delay", "delay"),
-    "joint_zero_offset": _at("zero", "angle", LEGS),
-    "friction_level": _level,
-    "friction_asymmetry": _at("wheel_mu", "mu", WHEELS, add=False),
-    "friction_anisotropy": _scalar("mu_ratio", "ratio"),
-    "friction_patch": _write_patch,
-    "slip_weakening": _vector("weak_slip", "mu_k", "slip_speed"),
-    "tyre_creep": _at("creep_speed", "creep_speed", WHEELS, add=False),
-    "rolling_resistance": _at("rolling", "coefficient", WHEELS),
-    "wheel_radius_error": _times("radius_scale", "scale", WHEELS),
-    "payload": _vector("payload", "mass", "x", "y", "z"),
-    "com_offset": _vector("com", "x", "y", "z"),
-    "floor_slope": _vector("slope", "pitch", "roll"),
-    "external_force": _vector("force", "fx", "fy"),
-    "tether": _vector("tether", "stiffness", "x", "y"),
-    "gyro_bias": _vector("gyro_bias", "x", "y", "z"),
-    "imu_misalignment": _vector("imu", "roll", "pitch", "yaw"),
-    "camera_misalignment": _write_camera,
-    "camera_delay": _scalar("camera_delay", "delay"),
-}
-#: Laws that no library names, and the coordinate each acts on.
-STRANGE: Mapping[str, Law] = {
-    "leg_spring": _both_rows("leg_spring", "stiffness", "rest"),
-    "body_drag": _scalar("drag", "coefficient"),
-    "cross_friction": _cross,
-    "periodic_pull": _vector("pull", "amplitude", "frequency", "phase"),
-    "out_of_round": _at("out_of_round", "share", WHEELS),
-    "elastic_hysteresis": _both_rows("elastic", "torque", "stiffness"),
-    "veer": _scalar("veer", "coefficient"),
-}
-
-
-def hide(effects: Sequence[Mapping[str, Any]], copy: Copy) -> Hidden:
+def hide(effects: Sequence[Mapping[str, Any]]) -> Hidden:
     """Translate effects, ``{name, where, parameters}``, into the numbers of their laws.
 
     Raises:
@@ -185,8 +144,8 @@ def hide(effects: Sequence[Mapping[str, Any]], copy: Copy) -> Hidden:
     """
     hidden = Hidden()
     for effect in sorted(effects, key=lambda one: one["name"] != "friction_level"):  # a level is below what single wheels have
-        law = NAMED.get(effect["name"]) or STRANGE[effect["name"]]
-        law(hidden, list(effect["where"]), effect["parameters"], copy)
+        law, _ = NAMED.get(effect["name"]) or STRANGE[effect["name"]]
+        law(hidden, list(effect["where"]), effect["parameters"])
     return hidden
 
 
@@ -219,6 +178,8 @@ OF_CAMERA = ("camera_misalignment", "camera_delay")
 
 Draw = np.random.Generator
 Effect = dict[str, Any]
+#: Draws an effect of a name at a severity.
+Drawn = Callable[[str, float, Draw], Effect]
 
 
 @dataclass(frozen=True)
@@ -312,7 +273,7 @@ def _some(rng: Draw, names: tuple[str, ...]) -> list[str]:
     return list(names if kind == 2 else names[2 * int(rng.integers(2)) :][:2])
 
 
-def _gears(leg: Callable[[float], Mapping[str, float]], wheel: Callable[[float], Mapping[str, float]]) -> Callable[..., Effect]:
+def _gears(leg: Callable[[float], Mapping[str, float]], wheel: Callable[[float], Mapping[str, float]]) -> Drawn:
     """An effect of gears: in legs or in wheels, whose sizes differ."""
 
     def make(name: str, severity: float, rng: Draw) -> Effect:
@@ -326,11 +287,11 @@ def _effect(name: str, where: Sequence[str], parameters: Mapping[str, float]) ->
     return {"name": name, "where": list(where), "parameters": {key: float(f"{value:.5g}") for key, value in parameters.items()}}
 
 
-def _fixed(place: str, numbers: Callable[[float, Draw], Mapping[str, float]]) -> Callable[..., Effect]:
+def _fixed(place: str, numbers: Callable[[float, Draw], Mapping[str, float]]) -> Drawn:
     return lambda name, severity, rng: _effect(name, [place], numbers(severity, rng))
 
 
-def _wheels(numbers: Callable[[float, Draw], Mapping[str, float]]) -> Callable[..., Effect]:
+def _wheels(numbers: Callable[[float, Draw], Mapping[str, float]]) -> Drawn:
     return lambda name, severity, rng: _effect(name, _some(rng, WHEELS), numbers(severity, rng))
 
 
@@ -412,43 +373,59 @@ def _camera(severity: float, rng: Draw) -> Mapping[str, float]:
     return {"scale": 1 + _sign(rng) * 0.015 * severity}
 
 
-#: How much of each effect is severity 1: three tolerances or somewhat more where a tolerance hides it (by definition what 2.5
-#: tolerances explain is no effect; of a vector the larger part has as much), else what the noise hides.
-_NAMED: Mapping[str, Callable[..., Effect]] = {
-    "coulomb_friction": _gears(lambda s: {"torque": 0.08 * s}, lambda s: {"torque": 0.025 * s}),
-    "viscous_friction": _gears(lambda s: {"coefficient": 0.04 * s}, lambda s: {"coefficient": 0.008 * s}),
-    "stribeck_friction": _gears(
-        lambda s: {"extra_static_torque": 0.08 * s, "stribeck_speed": 0.1},
-        lambda s: {"extra_static_torque": 0.025 * s, "stribeck_speed": 0.5},
+#: Effects of the vocabulary: what each does in the simulator, and how it is drawn. Severity 1 is three tolerances or somewhat
+#: more where a tolerance hides it (by definition what 2.5 tolerances explain is no effect; of a vector the larger part has as
+#: much), else what the noise hides.
+NAMED: Mapping[str, tuple[Law, Drawn]] = {
+    "coulomb_friction": (_at("coulomb", "torque"), _gears(lambda s: {"torque": 0.08 * s}, lambda s: {"torque": 0.025 * s})),
+    "viscous_friction": (
+        _at("viscous", "coefficient"),
+        _gears(lambda s: {"coefficient": 0.04 * s}, lambda s: {"coefficient": 0.008 * s}),
     ),
-    "load_dependent_friction": _gears(lambda s: {"ratio": 0.08 * s}, lambda s: {"ratio": 0.09 * s}),
-    "backlash": _gears(lambda s: {"angle": 0.008 * s}, lambda s: {"angle": 0.012 * s}),
-    "torque_ripple": _ripple,
-    "weak_motor": _gears(lambda s: {"scale": 1 - 0.15 * s}, lambda s: {"scale": 1 - 0.15 * s}),
-    "supply_sag": _fixed("body", lambda s, _: {"resistance": 0.08 * s}),
-    "command_delay": _delay,
-    "joint_zero_offset": _zero,
-    "friction_level": _fixed("ground", lambda s, _: {"mu": 0.6 / (1 + 0.45 * s)}),
-    "friction_asymmetry": _asymmetry,
-    "friction_anisotropy": _fixed("ground", lambda s, _: {"ratio": 1 / (1 + 0.25 * s)}),
-    "friction_patch": _fixed("ground", _patch),
-    "slip_weakening": _fixed("ground", lambda s, _: {"mu_k": 0.6 / (1 + 0.3 * s), "slip_speed": 0.05}),
-    "tyre_creep": _wheels(lambda s, _: {"creep_speed": 0.008 * s}),
-    "rolling_resistance": _wheels(lambda s, _: {"coefficient": 0.03 * s}),
-    "wheel_radius_error": _radius,
-    "payload": _fixed("body", _payload),
-    "com_offset": _fixed("body", _centre),
-    "floor_slope": _fixed("ground", _slope),
-    "external_force": _fixed("body", _wind),
-    "tether": _fixed("body", _tether),
-    "gyro_bias": _fixed("sensor", _gyro),
-    "imu_misalignment": _fixed("sensor", _imu),
-    "camera_misalignment": _fixed("sensor", _camera),
-    "camera_delay": _fixed("sensor", lambda s, _: {"delay": 0.03 * s}),
+    "stribeck_friction": (
+        _stribeck,
+        _gears(
+            lambda s: {"extra_static_torque": 0.08 * s, "stribeck_speed": 0.1},
+            lambda s: {"extra_static_torque": 0.025 * s, "stribeck_speed": 0.5},
+        ),
+    ),
+    "load_dependent_friction": (
+        _at("load_ratio", "ratio"),
+        _gears(lambda s: {"ratio": 0.08 * s}, lambda s: {"ratio": 0.09 * s}),
+    ),
+    "backlash": (_at("play", "angle"), _gears(lambda s: {"angle": 0.008 * s}, lambda s: {"angle": 0.012 * s})),
+    "torque_ripple": (_write_ripple, _ripple),
+    "weak_motor": (
+        _times("motor_scale", "scale", JOINTS),
+        _gears(lambda s: {"scale": 1 - 0.15 * s}, lambda s: {"scale": 1 - 0.15 * s}),
+    ),
+    "supply_sag": (_scalar("supply_resistance", "resistance"), _fixed("body", lambda s, _: {"resistance": 0.08 * s})),
+    "command_delay": (_at("delay", "delay"), _delay),
+    "joint_zero_offset": (_at("zero", "angle", LEGS), _zero),
+    "friction_level": (_level, _fixed("ground", lambda s, _: {"mu": 0.6 / (1 + 0.45 * s)})),
+    "friction_asymmetry": (_at("wheel_mu", "mu", WHEELS, add=False), _asymmetry),
+    "friction_anisotropy": (_scalar("mu_ratio", "ratio"), _fixed("ground", lambda s, _: {"ratio": 1 / (1 + 0.25 * s)})),
+    "friction_patch": (_write_patch, _fixed("ground", _patch)),
+    "slip_weakening": (
+        _vector("weak_slip", "mu_k", "slip_speed"),
+        _fixed("ground", lambda s, _: {"mu_k": 0.6 / (1 + 0.3 * s), "slip_speed": 0.05}),
+    ),
+    "tyre_creep": (_at("creep_speed", "creep_speed", WHEELS, add=False), _wheels(lambda s, _: {"creep_speed": 0.008 * s})),
+    "rolling_resistance": (_at("rolling", "coefficient", WHEELS), _wheels(lambda s, _: {"coefficient": 0.03 * s})),
+    "wheel_radius_error": (_times("radius_scale", "scale", WHEELS), _radius),
+    "payload": (_vector("payload", "mass", "x", "y", "z"), _fixed("body", _payload)),
+    "com_offset": (_vector("com", "x", "y", "z"), _fixed("body", _centre)),
+    "floor_slope": (_vector("slope", "pitch", "roll"), _fixed("ground", _slope)),
+    "external_force": (_vector("force", "fx", "fy"), _fixed("body", _wind)),
+    "tether": (_vector("tether", "stiffness", "x", "y"), _fixed("body", _tether)),
+    "gyro_bias": (_vector("gyro_bias", "x", "y", "z"), _fixed("sensor", _gyro)),
+    "imu_misalignment": (_vector("imu", "roll", "pitch", "yaw"), _fixed("sensor", _imu)),
+    "camera_misalignment": (_write_camera, _fixed("sensor", _camera)),
+    "camera_delay": (_scalar("camera_delay", "delay"), _fixed("sensor", lambda s, _: {"delay": 0.03 * s})),
 }
 
 
-def _one_leg(numbers: Callable[[float], Mapping[str, float]]) -> Callable[..., Effect]:
+def _one_leg(numbers: Callable[[float], Mapping[str, float]]) -> Drawn:
     return lambda name, severity, rng: _effect(name, [LEGS[int(rng.integers(4))]], numbers(severity))
 
 
@@ -460,22 +437,29 @@ def _pull(severity: float, rng: Draw) -> Mapping[str, float]:
     return {"amplitude": 0.8 * severity, "frequency": rng.uniform(0.4, 1.2), "phase": rng.uniform(-np.pi, np.pi)}
 
 
-_STRANGE: Mapping[str, Callable[..., Effect]] = {
-    "leg_spring": _one_leg(lambda s: {"stiffness": 0.2 * s, "rest": 1.2}),
-    "body_drag": _fixed("body", lambda s, _: {"coefficient": 25.0 * s}),
-    "cross_friction": _axle,
-    "periodic_pull": _fixed("body", _pull),
-    "out_of_round": lambda name, severity, rng: _effect(name, [WHEELS[int(rng.integers(4))]], {"share": 0.015 * severity}),
-    "elastic_hysteresis": _one_leg(lambda s: {"torque": 0.1 * s, "stiffness": 1.0 * s}),
-    "veer": _fixed("body", lambda s, _: {"coefficient": 4.0 * s}),
+#: Laws that no library names, likewise.
+STRANGE: Mapping[str, tuple[Law, Drawn]] = {
+    "leg_spring": (_both_rows("leg_spring", "stiffness", "rest"), _one_leg(lambda s: {"stiffness": 0.2 * s, "rest": 1.2})),
+    "body_drag": (_scalar("drag", "coefficient"), _fixed("body", lambda s, _: {"coefficient": 25.0 * s})),
+    "cross_friction": (_cross, _axle),
+    "periodic_pull": (_vector("pull", "amplitude", "frequency", "phase"), _fixed("body", _pull)),
+    "out_of_round": (
+        _at("out_of_round", "share", WHEELS),
+        lambda name, severity, rng: _effect(name, [WHEELS[int(rng.integers(4))]], {"share": 0.015 * severity}),
+    ),
+    "elastic_hysteresis": (
+        _both_rows("elastic", "torque", "stiffness"),
+        _one_leg(lambda s: {"torque": 0.1 * s, "stiffness": 1.0 * s}),
+    ),
+    "veer": (_scalar("veer", "coefficient"), _fixed("body", lambda s, _: {"coefficient": 4.0 * s})),
 }
 
 
 def named(name: str, severity: float, rng: Draw) -> Effect:
     """Draw an effect of the vocabulary at a severity: its place, its signs, its parameters."""
-    return _NAMED[name](name, severity, rng)
+    return NAMED[name][1](name, severity, rng)
 
 
 def strange(name: str, severity: float, rng: Draw) -> Effect:
     """Draw a law that no library names."""
-    return _STRANGE[name](name, severity, rng)
+    return STRANGE[name][1](name, severity, rng)

@@ -103,7 +103,7 @@ def simulate_runs(
     profile = BlindProfile(
         float(choose.choice(ACCELERATIONS)), float(choose.choice(SPEEDS)), float(choose.choice(LEG_ACCELERATIONS))
     )
-    driven = BlindRobot(robot, copy, hide(effects, copy), profile, camera)
+    driven = BlindRobot(robot, copy, hide(effects), profile, camera)
     tables = [driven.drive(scripts[kind], np.random.default_rng([seed, 3, kind])) for kind in runs]
     notes = ", ".join(f"run_{n + 1:02d} {commands.NAMES[kind]}" for n, kind in enumerate(runs))
     return tables, driven.meta(f"runs in order: {notes}"), copy

@@ -30,7 +30,7 @@ def log(records, effects=(), seed=0, **copy_numbers) -> pd.DataFrame:
     copy, rng = nominal(ROBOT).moved(**copy_numbers), np.random.default_rng(seed)
     times = drive.ticks((len(records) - 1) / 1000 - 0.1, 50.0, rng)
     setpoints = np.zeros((len(times), 8))
-    return drive.log(records, times, setpoints, copy, hide(effects, copy), ROBOT, rng)
+    return drive.log(records, times, setpoints, copy, hide(effects), ROBOT, rng)
 
 
 def effect(name, **parameters):

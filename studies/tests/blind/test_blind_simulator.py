@@ -32,7 +32,7 @@ def simulate(setpoints, duration, effects=(), copy: Copy | None = None, start=DO
     times = np.arange(0.0, duration, 0.02)
     if setpoints.ndim == 1:
         setpoints = np.tile(np.concatenate([start, setpoints]), (len(times), 1))
-    hidden = hide(effects, copy)
+    hidden = hide(effects)
     return drive.simulate(
         drive.build(copy, hidden), copy, hidden, profile, times, setpoints, np.asarray(start, dtype=float), duration
     )
