@@ -287,24 +287,21 @@ def measure_perception(size: Size) -> list[Measurement]:
     """Frames per second, ticks missed, and the age of poses, with a film and with rendered frames."""
     for package, extra in (("cv2", "vision"), ("dynamixel_sdk", "robot"), ("serial", "robot")):
         require_package(package, extra)
-    seconds, rounds = size(30, 2), min(size.rounds, 3)
+    seconds, rounds, rows = size(30, 2), min(size.rounds, 3), []
     with tempfile.TemporaryDirectory(prefix="wlr-bench-") as folder:
         film = _film(Path(folder), load_camera_file("emulated"), load_robot(), size(_FRAMES, 12))
-        filmed = [drive_in_real_time(seconds, [_POLICY, "--camera", str(film)]) for _ in range(rounds)]
-        rendered = [drive_in_real_time(seconds, [_POLICY, "--camera", "emulated"]) for _ in range(rounds)]
-    return [*_rows("film", seconds, filmed, 1.0), *_rows("rendered as it drives", seconds, rendered, None)]
-
-
-def _rows(kind: str, seconds: int, drives: list[dict[str, Any]], bar: float | None) -> list[Measurement]:
-    what = f"{seconds} s at 50 Hz beside the camera, {kind}"
-    cameras = [drive["camera"] for drive in drives]
-    rates = tuple(camera["rate"] for camera in cameras)
-    missed = float(sum(drive["missed"] for drive in drives))
-    return [
-        Measurement("perception", f"{what}: frames per second of {_RATE:g}", "1/s", rates),
-        Measurement("perception", f"{what}: ticks missed in {len(drives)} rounds", "ticks", (missed,), bar=bar),
-        Measurement("perception", f"{what}: pictures to poses, p99", "us", tuple(1e3 * c["work"]["p99"] for c in cameras)),
-    ]
+        for kind, camera, bar in (("film", str(film), 1.0), ("rendered as it drives", "emulated", None)):
+            drives = [drive_in_real_time(seconds, [_POLICY, "--camera", camera]) for _ in range(rounds)]
+            seen = [drive["camera"] for drive in drives]
+            rates, late = tuple(one["rate"] for one in seen), tuple(1e3 * one["work"]["p99"] for one in seen)
+            missed = float(sum(drive["missed"] for drive in drives))
+            what = f"{seconds} s at 50 Hz beside the camera, {kind}"
+            rows += [
+                Measurement("perception", f"{what}: frames per second of {_RATE:g}", "1/s", rates),
+                Measurement("perception", f"{what}: ticks missed in {rounds} rounds", "ticks", (missed,), bar=bar),
+                Measurement("perception", f"{what}: pictures to poses, p99", "us", late),
+            ]
+    return rows
 
 
 def _film(folder: Path, file: CameraFile, robot: Robot, frames: int) -> Path:

@@ -31,7 +31,7 @@ from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
 from wlr_gym.hardware.plant import RobotPlant
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
-from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantState, RobotOptions, standing_state
+from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, RobotOptions, standing_state
 from wlr_gym.policy import environment_for, make_policy
 from wlr_gym.robot import WHEELS
 from wlr_gym.robot.parameters import Parameters
@@ -40,11 +40,8 @@ Array = NDArray[np.float64]
 
 #: Where the policies that are measured were trained.
 ENVIRONMENT = "WLR-Velocity-v0"
-#: s of emulated time per tick.
-_TICK = 0.002
 #: s at the beginning of an episode that do not count.
 _SKIPPED = 1.0
-#: Seed of the first episode.
 _FIRST_SEED = 9000
 
 
@@ -56,7 +53,7 @@ class ChainDrive:
         time: (T,) s. command: (T, C). sensors: (T, SENSOR_LAYOUT.width). truth: (T, TRUTH_LAYOUT.width).
         start: (3,) true x, y (m) and yaw (rad) at the run's start.
         estimate: (T, W) of the observer. reasons: (T,) why there is no camera pose; empty = nothing is wrong.
-        reason: why the drive ended. camera: statistics of the loop.
+        reason: why the drive ended.
     """
 
     time: Array
@@ -67,7 +64,6 @@ class ChainDrive:
     estimate: Array
     reasons: tuple[str, ...]
     reason: str
-    camera: Mapping[str, Any]
 
     def sensed(self, name: str) -> Array:
         """Return a channel of the sensors, (T,) or (T, size)."""
@@ -120,7 +116,13 @@ def measure_camera(size: Size) -> list[Measurement]:
     require_package("cv2", "vision")
     seeds, seconds = range(_FIRST_SEED, _FIRST_SEED + size(6, 1)), float(size(8, 2))
     at = 0.625 * seconds
-    camera, covered = _quick(chain_camera()), (f"camera_covered after={at:g}",)
+    # fewer pixels, nearer to the floor: rendering is what takes the time
+    lens = {"width": 640, "height": 360, "focal": (380.0, 380.0), "centre": (319.5, 179.5)}
+    scene = {"height": 2.0, "samples": 3}
+    camera, covered = chain_camera(), (f"camera_covered after={at:g}",)
+    camera = camera.model_copy(
+        update={"calibration": camera.calibration.model_copy(update=lens), "emulated": camera.emulated.model_copy(update=scene)}
+    )
     rows, floors = [], ("slippery", "ice", "split")
     for done, floor in enumerate(floors):
         size.tell(done / len(floors))
@@ -141,13 +143,6 @@ def measure_camera(size: Size) -> list[Measurement]:
         ):
             rows.append(Measurement("camera", f"{what} {name}", "-", (float(ours.mean() / other.mean()),), bar=bar))
     return rows
-
-
-def _quick(file: CameraFile) -> CameraFile:
-    """Return a camera with fewer pixels, nearer to the floor: rendering is what takes the time."""
-    lens = {"width": 640, "height": 360, "focal": (380.0, 380.0), "centre": (319.5, 179.5)}
-    scene = file.emulated.model_copy(update={"height": 2.0, "samples": 3})
-    return file.model_copy(update={"calibration": file.calibration.model_copy(update=lens), "emulated": scene})
 
 
 def chain_camera() -> CameraFile:
@@ -196,7 +191,9 @@ def drive_chain(setting: ChainSetting, seed: int) -> ChainDrive:
     drawn.seed(0, seed)
     drawn.begin_episodes(drawn.everyone)
     parameters = Parameters(drawn.parameters.values.copy())
-    state = _standing(drawn, parameters)
+    state, yaw = standing_state(drawn.task.robot, parameters), yaw_of(*drawn.state.quaternion[0])
+    state.position[0, :2] = drawn.state.position[0, :2]  # on the same patches of floor, at rest
+    state.quaternion[0] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
     drawn.close()
     keywords = {"backend": "dynamixel", "hardware": RobotOptions(emulated=True, camera=None), "episode_length": setting.seconds}
     core = make_core(ENVIRONMENT, 1, environment_for(setting.policy, {**keywords, **setting.extra}))
@@ -204,7 +201,7 @@ def drive_chain(setting: ChainSetting, seed: int) -> ChainDrive:
     plant = core.plant
     assert isinstance(plant, RobotPlant)
     hardware = plant.loop.hardware
-    options = MachineOptions(timing=NO_TIME, tick=_TICK, seed=seed)
+    options = MachineOptions(timing=NO_TIME, tick=0.002, seed=seed)
     machine = Machine(core.task.robot, hardware, options, parameters=parameters, state=state)
     camera = None
     if setting.camera is not None:
@@ -213,15 +210,6 @@ def drive_chain(setting: ChainSetting, seed: int) -> ChainDrive:
     core.plant = RobotPlant(core.task.robot, 1, plant.options, RobotOptions(), emulated_link(machine, camera))
     with closing(core):
         return _watched(core, machine, setting, seed)
-
-
-def _standing(core: Core, parameters: Parameters) -> PlantState:
-    """Return the robot standing where a simulated episode begins, on the same patches of floor, at rest."""
-    state = standing_state(core.task.robot, parameters)
-    yaw = yaw_of(*core.state.quaternion[0])
-    state.position[0, :2] = core.state.position[0, :2]
-    state.quaternion[0] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
-    return state
 
 
 def _watched(core: Core, machine: Machine, setting: ChainSetting, seed: int) -> ChainDrive:
@@ -253,10 +241,7 @@ def _watched(core: Core, machine: Machine, setting: ChainSetting, seed: int) -> 
     except StoppedError:
         pass
     time, command, sensors, truth, estimate = (np.array(column) for column in zip(*rows, strict=True))
-    return ChainDrive(
-        time[:, 0], command, sensors, truth, began, estimate, tuple(reasons), loop.reason,
-        loop.statistics().get("camera", {}),
-    )  # fmt: skip
+    return ChainDrive(time[:, 0], command, sensors, truth, began, estimate, tuple(reasons), loop.reason)
 
 
 # ---- picture of what camera, optical flow and observer saw -----------------------------------------------------------
@@ -264,9 +249,6 @@ def _watched(core: Core, machine: Machine, setting: ChainSetting, seed: int) -> 
 
 #: s of the drive that is drawn, from when on the lens is covered, and for how long.
 _SECONDS, _COVERED, _FOR = 12.0, 5.0, 3.0
-#: The truth is wide and pale: what lies on it hides no more than its middle.
-_TRUTH: dict[str, Any] = {"color": "0.6", "lw": 4.0, "label": "truth"}
-_SEEN, _ESTIMATE, _FLOW = ORANGE, BLUE, GREEN
 
 
 def draw_chain(drive: ChainDrive, path: Path, title: str) -> None:
@@ -275,84 +257,59 @@ def draw_chain(drive: ChainDrive, path: Path, title: str) -> None:
     Args:
         drive: what was seen. path: of the picture. title: of it.
     """
-    figure = new_figure(8.0, 6.8)
+    figure, time, age = new_figure(8.0, 6.8), drive.time, drive.sensed("camera_age")
     axes = figure.subplots(5, 1, sharex=True, height_ratios=(2, 2, 3, 3, 1.5))
-    _draw_pose_error(axes[0], drive, 0, "error of x\n(mm)")
-    _draw_pose_error(axes[1], drive, 2, "error of the\nheading (mrad)")
-    _draw_speed(axes[2], drive)
-    _draw_slip(axes[3], drive)
-    axes[4].plot(drive.time, 1e3 * drive.sensed("camera_age"), color=_SEEN, lw=1.0)
-    axes[4].set_ylabel("age of the\npose (ms)")
-    axes[4].set_yscale("log")
+
+    def estimate(name: str) -> Any:
+        return ESTIMATE_LAYOUT.view(drive.estimate, name)
+
+    def draw_estimate(axis: Any, true: Array, values: Array, sigma: Array, label: str) -> None:
+        """Draw the estimate with 2 sigma on the truth, which is wide and pale: its middle alone is hidden."""
+        axis.plot(time, true, color="0.6", lw=4.0, label="truth")
+        axis.fill_between(time, values - 2 * sigma, values + 2 * sigma, color=BLUE, alpha=0.2, lw=0, label="2 sigma")
+        axis.plot(time, values, color=BLUE, lw=1.2, label="observer")
+        low, high = min(true.min(), values.min()), max(true.max(), values.max())
+        margin = 0.25 * max(high - low, 0.01)
+        axis.set(ylabel=label, ylim=(low - margin, high + margin))
+
+    is_new = drive.sensed("camera_is_new") > 0.5
+    exposed = (time - age)[is_new]
+    poses = ((0, estimate("position")[:, 0], "error of x\n(mm)"), (2, estimate("yaw"), "error of the\nheading (mrad)"))
+    for axis, (k, estimated, label) in zip(axes, poses, strict=False):
+        true = drive.true_pose()[:, k]
+        seen = drive.sensed("camera_pose")[is_new, k] - np.interp(exposed, time, true)
+        axis.plot(exposed, 1e3 * seen, ".", color=ORANGE, ms=3, label="camera, when exposed")
+        axis.plot(time, 1e3 * (estimated - true), color=BLUE, lw=1.2, label="observer")
+        axis.axhline(0.0, color="black", lw=0.6)
+        axis.set_ylabel(label)
+    speed, sigma = (estimate(f"linear_velocity_{name}")[:, 0] for name in ("in_body", "sigma"))
+    draw_estimate(axes[2], drive.true("linear_velocity_in_body")[:, 0], speed, sigma, "forward speed\n(m/s)")
+    axes[2].plot(time, drive.command[:, 0], "--", color=GREY, lw=1.0, label="command")
+    if (flows := drive.sensed("flow_is_new") > 0.5).any():
+        flow = (drive.sensed("flow")[:, 0] + drive.sensed("gyro")[:, 1]) * drive.true("position")[:, 2]
+        axes[2].plot(time[flows], flow[flows], ".", color=GREEN, ms=2, label="flow times height")
+    slip, sigma = (estimate(name)[:, 0] for name in ("slip_velocity", "slip_sigma"))
+    draw_estimate(axes[3], drive.true("slip_velocity")[:, 0], slip, sigma, f"slip of {WHEELS[0]}\n(m/s)")
+    axes[4].plot(time, 1e3 * age, color=ORANGE, lw=1.0)
+    axes[4].set(ylabel="age of the\npose (ms)", yscale="log", xlabel="time (s)")
     axes[4].yaxis.set_major_formatter("{x:g}")
-    axes[4].set_xlabel("time (s)")
     blind = np.array([bool(reason) for reason in drive.reasons])
     for axis in axes:
         shade = {"transform": axis.get_xaxis_transform(), "color": "0.92", "lw": 0, "zorder": 0}
-        axis.fill_between(drive.time, 0, 1, where=blind, label="no pose", **shade)
+        axis.fill_between(time, 0, 1, where=blind, label="no pose", **shade)
         tidy(axis)
-        axis.set_xlim(0, drive.time[-1])
+        axis.set_xlim(0, time[-1])
     axes[0].set_title(title, fontsize=10)
     figure.align_ylabels(axes)
     legend_below(figure, columns=3)
     save(figure, path)
 
 
-def _estimate(drive: ChainDrive, name: str) -> Any:
-    return ESTIMATE_LAYOUT.view(drive.estimate, name)
-
-
-def _draw_pose_error(axis: Any, drive: ChainDrive, k: int, label: str) -> None:
-    """One component of the pose, less the truth: the estimate, and every frame against when it was exposed."""
-    true = drive.true_pose()[:, k]
-    estimate = _estimate(drive, "yaw") if k == 2 else _estimate(drive, "position")[:, k]
-    is_new = drive.sensed("camera_is_new") > 0.5
-    exposed = (drive.time - drive.sensed("camera_age"))[is_new]
-    seen = drive.sensed("camera_pose")[is_new, k] - np.interp(exposed, drive.time, true)
-    axis.plot(exposed, 1e3 * seen, ".", color=_SEEN, ms=3, label="camera, when exposed")
-    axis.plot(drive.time, 1e3 * (estimate - true), color=_ESTIMATE, lw=1.2, label="observer")
-    axis.axhline(0.0, color="black", lw=0.6)
-    axis.set_ylabel(label)
-
-
-def _draw_band(axis: Any, time: Any, values: Any, sigma: Any) -> None:
-    axis.fill_between(time, values - 2 * sigma, values + 2 * sigma, color=_ESTIMATE, alpha=0.2, lw=0, label="2 sigma")
-    axis.plot(time, values, color=_ESTIMATE, lw=1.2, label="observer")
-
-
-def _draw_speed(axis: Any, drive: ChainDrive) -> None:
-    speed, sigma = (_estimate(drive, f"linear_velocity_{name}")[:, 0] for name in ("in_body", "sigma"))
-    axis.plot(drive.time, drive.true("linear_velocity_in_body")[:, 0], **_TRUTH)
-    _draw_band(axis, drive.time, speed, sigma)
-    axis.plot(drive.time, drive.command[:, 0], "--", color=GREY, lw=1.0, label="command")
-    if "flow" in SENSOR_LAYOUT.channels and (is_new := drive.sensed("flow_is_new") > 0.5).any():
-        turned = drive.sensed("flow")[:, 0] + drive.sensed("gyro")[:, 1]
-        height = drive.true("position")[:, 2]
-        axis.plot(drive.time[is_new], (turned * height)[is_new], ".", color=_FLOW, ms=2, label="flow times height")
-    axis.set_ylabel("forward speed\n(m/s)")
-    axis.set_ylim(*_limits(drive.true("linear_velocity_in_body")[:, 0], speed))
-
-
-def _draw_slip(axis: Any, drive: ChainDrive, wheel: int = 0) -> None:
-    slip, sigma = (_estimate(drive, name)[:, 2 * wheel] for name in ("slip_velocity", "slip_sigma"))
-    true = drive.true("slip_velocity")[:, 2 * wheel]
-    axis.plot(drive.time, true, **_TRUTH)
-    _draw_band(axis, drive.time, slip, sigma)
-    axis.set_ylabel(f"slip of {WHEELS[wheel]}\n(m/s)")
-    axis.set_ylim(*_limits(true, slip))
-
-
-def _limits(*series: Any) -> tuple[float, float]:
-    low, high = (function([function(values) for values in series]) for function in (np.min, np.max))
-    margin = 0.25 * max(high - low, 0.01)
-    return float(low - margin), float(high + margin)
-
-
 def main(arguments: list[str]) -> int:
     """Drive and draw; 0 when done."""
     fault = f"camera_covered after={_COVERED:g} duration={_FOR:g}"
     setting = ChainSetting("velocity_slip_aware", "split", chain_camera(), _SECONDS, (fault,))
-    drive = drive_chain(setting, 9000)
+    drive = drive_chain(setting, _FIRST_SEED)
     title = "Emulated robot on a split floor; rendered frames, 40 ms latency, 10 % lost; lens covered from 5 to 8 s"
     draw_chain(drive, Path(arguments[0]), title)
     return 0

@@ -11,7 +11,7 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -178,22 +178,16 @@ def run_lab_films(folder: Path, count: int, seed: int = SEED, say: Callable[[str
 
 
 def measure_film(film: LabFilm) -> LabResult:
-    """Drive, film, encode, analyse."""
+    """Drive, film, encode, analyse, and hold it against the truth."""
     drive = lab_drive(load_robot(), film.speed, film.spin, film.friction, seconds=SECONDS + 0.4)
-    body, floor = targets(film)
     with tempfile.TemporaryDirectory() as folder:
         shots = encoded(list(frames(drive, film.lab, SECONDS, RATE, OFFSET)), film, Path(folder))
-        return analysed(film, drive, shots, body, floor)
-
-
-def analysed(film: LabFilm, drive: FilmedDrive, shots: Iterable[VideoFrame], body: Target, floor: Target) -> LabResult:
-    """Analyse one film, and hold it against the truth."""
-    start = time.process_time()
-    try:
-        found = analyse(shots, drive.run, lens(), body, floor, drive.robot)
-    except InputError as error:
-        return LabResult(asdict(film), str(error), time.process_time() - start, [], [], 0.0, [], 0.0, [])
-    spent = time.process_time() - start
+        start = time.process_time()
+        try:
+            found = analyse(shots, drive.run, lens(), *targets(film), drive.robot)
+        except InputError as error:
+            return LabResult(asdict(film), str(error), time.process_time() - start, [], [], 0.0, [], 0.0, [])
+        spent = time.process_time() - start
     slip = found.slip
     truth = true_slip(drive, slip.time)
     error, sigma = (slip.slip - truth)[-1], np.hypot(slip.slip_std[-1], slip.slip_layout_std[-1])

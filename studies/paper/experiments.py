@@ -82,25 +82,13 @@ class PaperTest:
 
 
 #: Leg angles.
-_LOW = math.radians(30)
-_HIGH = math.radians(150)
+_LOW, _HIGH = math.radians(30), math.radians(150)
 TESTS: Mapping[str, PaperTest] = {
     "test_1": PaperTest("test_1", "first test: rear legs turn", (_LOW, _LOW), (_LOW, _HIGH), (7, 8, 9, 10, 11), 0.115, 0.011),
     "test_2": PaperTest(
         "test_2", "second test: all legs turn", (_LOW, _HIGH), (_HIGH, _LOW), (13, 14, 15, 16, 17), 0.05, 0.052
     ),
 }
-
-
-def paper_test(name: str) -> PaperTest:
-    """Return one of :data:`TESTS`.
-
-    Raises:
-        InputError: no such test.
-    """
-    if name not in TESTS:
-        raise unknown_name("test of the paper", name, TESTS)
-    return TESTS[name]
 
 
 def write_tests(folder: Path) -> list[Path]:
@@ -257,36 +245,34 @@ def _look_at_truth(plant: Plant, readings: Sensors, slip_path: Array) -> Row:
     truth = plant.truth()
     yaw, pitch, roll = euler_angles(truth.quaternion)
     v, w = truth.linear_velocity_in_body, truth.angular_velocity_in_body
-    level = np.einsum("nij,nj->ni", rotation(np.zeros_like(yaw), pitch, roll), v)
     return {
         "joint_position": truth.joint_position + np.pad(plant.parameters["joint.zero_offset"], ((0, 0), (0, 4))),
         "joint_velocity": truth.joint_velocity.copy(),
         "torque": truth.motor_torque.copy(),
         "position": truth.position.copy(),
         "attitude": np.stack([yaw, pitch, roll], axis=1),
-        "velocity": level,
+        "velocity": np.einsum("nij,nj->ni", rotation(np.zeros_like(yaw), pitch, roll), v),
         "yaw_rate": (np.sin(roll) * w[:, 1] + np.cos(roll) * w[:, 2]) / np.cos(pitch),
         "slip": truth.slip_velocity.reshape(-1, 4, 2).copy(),
-        "slip_path": slip_path.reshape(-1, 4, 2).copy(),
+        "slip_path": slip_path.reshape(-1, 4, 2),
         "force": truth.contact_force.reshape(-1, 4, 3).copy(),
     }
 
 
 def _look_at_sensors(plant: Plant, readings: Sensors, slip_path: Array) -> Row:
-    count = plant.count
-    unknown = np.full((count, 4, 3), np.nan)
     x, y, yaw = readings.camera_pose.T
+    unknown = np.full((plant.count, 4, 3), np.nan)
     return {
         "joint_position": readings.joint_position.copy(),
         "joint_velocity": readings.joint_velocity.copy(),
         "torque": readings.joint_effort.copy(),
-        "position": np.stack([x, y, np.full(count, np.nan)], axis=1),
-        "attitude": np.stack([yaw, np.full(count, np.nan), np.full(count, np.nan)], axis=1),
-        "velocity": unknown[:, 0].copy(),
+        "position": np.stack([x, y, unknown[:, 0, 0]], axis=1),
+        "attitude": np.stack([yaw, *unknown[:, 0, :2].T], axis=1),
+        "velocity": unknown[:, 0],
         "yaw_rate": readings.gyro[:, 2].copy(),
-        "slip": unknown[:, :, :2].copy(),
-        "slip_path": unknown[:, :, :2].copy(),
-        "force": unknown.copy(),
+        "slip": unknown[:, :, :2],
+        "slip_path": unknown[:, :, :2],
+        "force": unknown,
     }
 
 
@@ -472,7 +458,7 @@ def ideal_motion(test: PaperTest, constants: PaperConstants | None = None) -> Id
     time = np.arange(-0.2, duration() + 0.5, _TICK)
     front, front_rate = _leg(time, test.start[0], test.end[0])
     rear, rear_rate = _leg(time, test.start[1], test.end[1])
-    turned, spin = _front_wheels(time)
+    turned, spin = _trapezoid(time, WHEEL_SPEED, WHEEL_SPEED / WHEEL_ACCELERATION, stop_time())
     p = reduced.posture(c, front, rear)
     u9 = np.zeros((len(time), 9))
     u9[:, 3], u9[:, 4], u9[:, 5:7] = front_rate, rear_rate, spin[:, None]
@@ -488,28 +474,22 @@ def ideal_motion(test: PaperTest, constants: PaperConstants | None = None) -> Id
     return IdealMotion(test, c, time, front, rear, wheels - wheels[start], p, x - x[start], u, u_dot)
 
 
+def _trapezoid(time: Array, speed: float, ramp: float, stop: float) -> tuple[Array, Array]:
+    """Way and rate of a profile from 0 s on: up to a speed within ``ramp`` s, from ``stop`` s on down again."""
+    acceleration = speed / ramp
+    up, down = np.clip(time, 0.0, ramp), np.clip(time - stop, 0.0, ramp)
+    steady = np.clip(time - ramp, 0.0, stop - ramp)
+    way = acceleration * up**2 / 2 + speed * (steady + down) - acceleration * down**2 / 2
+    return way, acceleration * (up - down)
+
+
 def _leg(time: Array, start: float, end: float) -> tuple[Array, Array]:
     """Angle and rate of a leg: constant speed between two ramps, as long as a rectangular profile plus one ramp."""
     if start == end:
         return np.full_like(time, start), np.zeros_like(time)
-    length = abs(end - start) / LEG_SPEED
-    acceleration = LEG_SPEED / LEG_RAMP
-    up = np.clip(time, 0.0, LEG_RAMP)
-    down = np.clip(time - length, 0.0, LEG_RAMP)
-    steady = np.clip(time - LEG_RAMP, 0.0, length - LEG_RAMP)
-    angle = acceleration * up**2 / 2 + LEG_SPEED * steady + LEG_SPEED * down - acceleration * down**2 / 2
-    rate = acceleration * (up - down)
+    angle, rate = _trapezoid(time, LEG_SPEED, LEG_RAMP, abs(end - start) / LEG_SPEED)
     way = np.sign(end - start)
     return start + way * angle, way * rate
-
-
-def _front_wheels(time: Array) -> tuple[Array, Array]:
-    ramp = WHEEL_SPEED / WHEEL_ACCELERATION
-    up = np.clip(time, 0.0, ramp)
-    down = np.clip(time - stop_time(), 0.0, ramp)
-    steady = np.clip(time - ramp, 0.0, stop_time() - ramp)
-    turned = WHEEL_ACCELERATION * up**2 / 2 + WHEEL_SPEED * (steady + down) - WHEEL_ACCELERATION * down**2 / 2
-    return turned, WHEEL_ACCELERATION * (up - down)
 
 
 def _integral(rate: Array) -> Array:

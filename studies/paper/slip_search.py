@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.paper.experiments import TESTS, PaperTest, Record, drive, no_slip_travel, select
+from studies.paper.experiments import TESTS, PaperTest, drive, no_slip_travel, select
 from wlr_gym.base.random import generator
 from wlr_gym.physics.effects import EFFECTS, apply_patch, load_patch
 from wlr_gym.robot import LEGS, Robot
@@ -215,34 +215,26 @@ def outcomes(robot: Robot, parameters: Parameters, threads: int = 2, exact: bool
 def measure(robot: Robot, parameters: Parameters, test: PaperTest, threads: int = 2, exact: bool = True) -> dict[str, Array]:
     """Drive one test on N robots; return the fields of :class:`Outcomes`, each (N,).
 
-    One robot more goes with every batch, with something of every candidate: all batches then need the same compiled kernel.
+    One robot more goes with every batch, with every dial of every candidate a tenth on its way: all batches then need the same
+    compiled kernel.
     """
     step, precision = _EXACT if exact else _FAST
-    batch = Parameters(np.concatenate([parameters.values, _everything(robot).values]))
+    dials = [dial for candidate in CANDIDATES for dial in candidate.dials]
+    everything = make_parameters(robot, dials, scaled(dials, np.full((1, len(dials)), 0.1)))
+    batch = Parameters(np.concatenate([parameters.values, everything.values]))
     record = drive("gibbs_appell", test, robot, batch, (), step, every=50, threads=threads, precision=precision)
     record = select(record, np.arange(len(parameters)))
-    x, y = _seen_by_camera(record, parameters)
-    turns = record.joint_position[-1, :, 6:].mean(axis=1) / (2 * np.pi)
-    return {
-        "error_encoder": no_slip_error(x, no_slip_travel(robot, record, True)[-1]),
-        "error_printed": no_slip_error(x, no_slip_travel(robot, record, False)[-1]),
-        "lateral": y,
-        "yaw": record.attitude[-1, :, 0],
-        "rear_turns": turns,
-        "front_effort": record.torque[record.time > 0.0][:, :, 4:6].mean(axis=(0, 2)),
-    }
-
-
-def _everything(robot: Robot) -> Parameters:
-    """One robot with every dial of every candidate a tenth on its way."""
-    dials = [dial for candidate in CANDIDATES for dial in candidate.dials]
-    return make_parameters(robot, dials, scaled(dials, np.full((1, len(dials)), 0.1)))
-
-
-def _seen_by_camera(record: Record, parameters: Parameters) -> tuple[Array, Array]:
     x, y = record.end.T
     yaw, scale = parameters["camera.mount_yaw"], parameters["camera.scale"]
-    return scale * (np.cos(yaw) * x + np.sin(yaw) * y), scale * (np.cos(yaw) * y - np.sin(yaw) * x)
+    seen = scale * (np.cos(yaw) * x + np.sin(yaw) * y)
+    return {
+        "error_encoder": no_slip_error(seen, no_slip_travel(robot, record, True)[-1]),
+        "error_printed": no_slip_error(seen, no_slip_travel(robot, record, False)[-1]),
+        "lateral": scale * (np.cos(yaw) * y - np.sin(yaw) * x),
+        "yaw": record.attitude[-1, :, 0],
+        "rear_turns": record.joint_position[-1, :, 6:].mean(axis=1) / (2 * np.pi),
+        "front_effort": record.torque[record.time > 0.0][:, :, 4:6].mean(axis=(0, 2)),
+    }
 
 
 # ---- the search ------------------------------------------------------------------------------------------------------
@@ -285,10 +277,6 @@ class SearchFinding:
     def closest(self, reading: PaperReading) -> float:
         """Return the smallest miss, in tolerances."""
         return float(self.outcomes.miss(reading).min())
-
-    def parameters(self, robot: Robot, rows: NDArray[np.intp]) -> Parameters:
-        """Return the robots of some draws."""
-        return make_parameters(robot, self.dials, self.values[rows])
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types: per reading how close, how many matches, and the range of every dial among them."""
@@ -355,7 +343,11 @@ def search(
         tell(next(driven) / batches)
         matched += [trial for trial in trials if trial.matches]
         findings += [trial.finding() for trial in trials]
-    _spread(robot, matched, 16 * draws, threads)
+    for width in (0.15, 0.05) if matched else ():  # how far do the matches reach?
+        for trial in matched:
+            trial.close_in(8 * draws, width)
+        _drive_all(robot, matched, threads)
+        _drive_again(robot, matched, threads)
     spread = {trial.names: trial.finding() for trial in matched}
     return [spread.get(found.names, found) for found in findings]
 
@@ -420,15 +412,6 @@ def _drive_all(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
         trial.take(every.take(np.arange(end - len(trial.waiting), end)))
 
 
-def _spread(robot: Robot, trials: Sequence[_Trial], draws: int, threads: int) -> None:
-    """Draw near the best of trials that match, wide and narrow."""
-    for width in (0.15, 0.05) if trials else ():
-        for trial in trials:
-            trial.close_in(draws // 2, width)
-        _drive_all(robot, trials, threads)
-        _drive_again(robot, trials, threads)
-
-
 def _drive_again(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
     """Put the exact outcomes in the place of the fast ones where these come near a match."""
     known = [_joined(trial.parts) for trial in trials]
@@ -482,7 +465,7 @@ def observables(
     chosen = [finding.matches(reading)[:most] for finding in findings]
     if not chosen:
         return []
-    batch = [finding.parameters(robot, rows).values for finding, rows in zip(findings, chosen, strict=True)]
+    batch = [make_parameters(robot, one.dials, one.values[rows]).values for one, rows in zip(findings, chosen, strict=True)]
     control = measure(robot, Parameters(np.concatenate(batch)), CONTROL, threads)
     shown, end = [], 0
     for finding, rows in zip(findings, chosen, strict=True):

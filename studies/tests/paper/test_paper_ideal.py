@@ -14,7 +14,6 @@ from studies.paper.experiments import (
     WHEEL_SPEED,
     duration,
     ideal_motion,
-    paper_test,
     stop_time,
 )
 from studies.paper.quantities import PaperConstants
@@ -37,7 +36,7 @@ def test_commands_are_whole_register_counts():
 
 def test_goals_are_what_the_paper_commands():
     for name, test in TESTS.items():
-        setpoints = paper_test(name).motion().setpoints
+        setpoints = TESTS[name].motion().setpoints
         assert np.isnan(setpoints[:, 6:]).all()
         rest = int(1.0 / 0.02)
         np.testing.assert_allclose(np.degrees(setpoints[rest - 1, :4]), np.degrees(np.repeat(test.start, 2)))
