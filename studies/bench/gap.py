@@ -133,7 +133,13 @@ def run_blind_test(
         InputError: the output folder cannot be written to; it, or ``answers``, holds results or truths of another test.
     """
     cases = plan.cases()
-    earlier = {} if answers is None else _answers_to(plan, cases, answers)
+    earlier = {}
+    if answers is not None:
+        found = read_answers(answers)
+        for one in (one for one in cases if one.name in found):
+            _check_origin(plan, one, found[one.name], answers, "leave out --answers")
+            if found[one.name]["verdict"] != FAILED:  # the reason may be the other machine's
+                earlier[one.name] = found[one.name]
     for name in ("", "results", "data", "sealed", "work"):
         make_output_folder(plan.out / name)
     say(f"truths sealed in {plan.out / 'sealed'}: sha256 {seal(plan, cases)}")
@@ -171,20 +177,19 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
         raise InputError(f"{path}: cannot be read as answers of a blind test: {error}") from error
     if not isinstance(answers, dict):
         raise InputError(f"{path}: expected a mapping of sets to answers")
+
+    def has(value: Any, *keys: str) -> bool:
+        return isinstance(value, dict) and set(keys) <= value.keys()
+
     for name, answer in answers.items():
-        _check_answer(f"{path}: {name}", answer)
+        if not has(answer) or not isinstance(answer.get("verdict"), str):
+            raise InputError(f"{path}: {name}: expected a mapping with a verdict")
+        effects = answer.get("effects", [])
+        if not isinstance(effects, list) or not all(has(one, "name", "parameters") for one in effects):
+            raise InputError(f"{path}: {name}: effects: expected a list of mappings with name and parameters")
+        if not has(answer.get("blind_test"), "truth_sha256", "runs"):
+            raise InputError(f"{path}: {name}: blind_test: expected a mapping with truth_sha256 and runs")
     return answers
-
-
-def _check_answer(place: str, answer: Any) -> None:
-    if not isinstance(answer, dict) or not isinstance(answer.get("verdict"), str):
-        raise InputError(f"{place}: expected a mapping with a verdict")
-    effects = answer.get("effects", [])
-    if not isinstance(effects, list) or not all(isinstance(e, dict) and {"name", "parameters"} <= e.keys() for e in effects):
-        raise InputError(f"{place}: effects: expected a list of mappings with name and parameters")
-    made = answer.get("blind_test")
-    if not isinstance(made, dict) or not {"truth_sha256", "runs"} <= made.keys():
-        raise InputError(f"{place}: blind_test: expected a mapping with truth_sha256 and runs")
 
 
 def score_answers(path: Path) -> dict[str, Any]:
@@ -202,19 +207,6 @@ def score_answers(path: Path) -> dict[str, Any]:
     return score(answers, {one.name: one.as_dict() for one in cases})
 
 
-def _answers_to(plan: Plan, cases: Sequence[BlindCase], path: Path) -> dict[str, dict[str, Any]]:
-    """Read the answers to sets of a plan; those that failed are to be analysed again.
-
-    Raises:
-        InputError: no answers, or one is about another truth or other runs than the set of its name now.
-    """
-    answers = read_answers(path)
-    asked = [one for one in cases if one.name in answers]
-    for one in asked:
-        _check_origin(plan, one, answers[one.name], path, "leave out --answers")
-    return {one.name: answers[one.name] for one in asked if answers[one.name]["verdict"] != FAILED}
-
-
 def seal(plan: Plan, cases: Sequence[BlindCase]) -> str:
     """Write the truths to a file of their own, away from the data, and return its SHA-256.
 
@@ -223,25 +215,19 @@ def seal(plan: Plan, cases: Sequence[BlindCase]) -> str:
     """
     truths, folder = {one.name: _plain(one.as_dict()) for one in cases}, plan.out / "sealed"
     for file in sorted(folder.glob("truths_*.yaml")):
-        _check_seal(file, truths)
+        try:
+            sealed = yaml.safe_load(file.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, UnicodeDecodeError):
+            sealed = None
+        if not isinstance(sealed, dict):
+            raise InputError(f"{file}: holds no truths; use another --out")
+        if other := sorted(name for name in sealed.keys() & truths.keys() if sealed[name] != truths[name]):
+            what = f"holds other truths than these seeds give now ({len(other)} sets, first {other[0]})"
+            raise InputError(f"{file}: {what}; use another --out")
     text = yaml.safe_dump(truths, sort_keys=True)
     file = folder / f"truths_{plan.first_seed}_{plan.sets}.yaml"
     write_text(file, text)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _check_seal(file: Path, truths: Mapping[str, Any]) -> None:
-    try:
-        sealed = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError):
-        sealed = None
-    if not isinstance(sealed, dict):
-        raise InputError(f"{file}: holds no truths; use another --out")
-    other = sorted(name for name in sealed.keys() & truths.keys() if sealed[name] != truths[name])
-    if other:
-        raise InputError(
-            f"{file}: holds other truths than these seeds give now ({len(other)} sets, first {other[0]}); use another --out"
-        )
 
 
 def _origin(plan: Plan, one: BlindCase) -> dict[str, Any]:
@@ -357,12 +343,12 @@ def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = ()) -> str:
     import numpy as np
 
     from studies.bench.blind.copies import read_robot
-    from studies.bench.blind.dataset import SPOIL, fingerprint, simulate_runs, write
+    from studies.bench.blind.dataset import fingerprint, simulate_runs, spoilt, write
 
     robot = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
     tables, meta, _ = simulate_runs(robot, one.effects, one.seed, runs or one.runs, one.kind == "none", True, one.camera)
     if one.spoilt:
-        tables = SPOIL[one.spoilt](tables, np.random.default_rng([one.seed, 5]))
+        tables = spoilt(one.spoilt, tables, np.random.default_rng([one.seed, 5]))
     shutil.rmtree(folder, ignore_errors=True)
     write(folder, tables, meta)
     return fingerprint(tables)

@@ -410,10 +410,8 @@ CREEP = 1e-6
 JOINT_CREEP = 1e-5
 _ITERATIONS = 60
 _TOLERANCE = 1e-7
-#: Velocities of the model; wheels; index of the first joint among the velocities.
-_SIZE = 9
-_CONTACTS = 4
-_FIRST_JOINT = 3
+#: Wheels; index of the first joint among the velocities.
+_CONTACTS, _FIRST_JOINT = 4, 3
 
 
 @njit(cache=True)
@@ -427,11 +425,11 @@ def rub(a: Array, pull: Array, rows: Array, load: Array, mu: Array, dry: Array, 
     """
     count = len(a)
     velocity, impulse = start.copy(), np.zeros((count, _CONTACTS, 2))
-    matrix, new, weight = np.empty((_SIZE, _SIZE)), np.empty(_SIZE), np.empty((_CONTACTS, 2))
+    weight = np.empty((_CONTACTS, 2))
     for n in range(count):
         u = velocity[n]
         for _ in range(_ITERATIONS):
-            matrix[:] = a[n]
+            matrix = a[n].copy()
             for wheel in range(_CONTACTS):
                 squared = (mu[n, wheel, 0] * CREEP) ** 2 + 1e-30
                 for axis in range(2):
@@ -439,13 +437,11 @@ def rub(a: Array, pull: Array, rows: Array, load: Array, mu: Array, dry: Array, 
                 for axis in range(2):
                     weight[wheel, axis] = load[n, wheel] * mu[n, wheel, axis] ** 2 / np.sqrt(squared)
                     row = rows[n, wheel, axis]
-                    for i in range(_SIZE):
-                        for j in range(i + 1):
-                            matrix[i, j] += weight[wheel, axis] * row[i] * row[j]
+                    matrix += weight[wheel, axis] * np.outer(row, row)
             for joint in range(dry.shape[1]):
                 i = _FIRST_JOINT + joint
                 matrix[i, i] += dry[n, joint] / np.sqrt(u[i] ** 2 + JOINT_CREEP**2)
-            _solve(matrix, pull[n], new)
+            new = np.linalg.solve(matrix, pull[n])
             change = np.abs(new - u).max()
             u[:] = new
             if change < _TOLERANCE:
@@ -454,25 +450,3 @@ def rub(a: Array, pull: Array, rows: Array, load: Array, mu: Array, dry: Array, 
             for axis in range(2):
                 impulse[n, wheel, axis] = -weight[wheel, axis] * (rows[n, wheel, axis] * u).sum()
     return velocity, impulse
-
-
-@njit(cache=True)
-def _solve(matrix: Array, right: Array, solution: Array) -> None:
-    """Cholesky in the lower triangle of ``matrix``, in place; forward and back substitution."""
-    for j in range(_SIZE):
-        for k in range(j):
-            for i in range(j, _SIZE):
-                matrix[i, j] -= matrix[i, k] * matrix[j, k]
-        pivot = np.sqrt(matrix[j, j])
-        for i in range(j, _SIZE):
-            matrix[i, j] /= pivot
-    for i in range(_SIZE):
-        value = right[i]
-        for k in range(i):
-            value -= matrix[i, k] * solution[k]
-        solution[i] = value / matrix[i, i]
-    for i in range(_SIZE - 1, -1, -1):
-        value = solution[i]
-        for k in range(i + 1, _SIZE):
-            value -= matrix[k, i] * solution[k]
-        solution[i] = value / matrix[i, i]

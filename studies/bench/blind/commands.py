@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,7 @@ class Geometry:
 
 def scripts(rng: np.random.Generator, geometry: Geometry) -> list[BlindScript]:
     """Draw the eight runs in the order of ``NAMES``."""
+    rear_legs, all_legs = partial(turning, both=False), partial(turning, both=True)
     makers = (straight, posture, skid, curves, stop_and_go, rear_legs, all_legs, random_band)
     return [maker(rng, geometry) for maker in makers]
 
@@ -156,8 +158,8 @@ def posture(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
     return BlindScript(end, setpoints)
 
 
-def _turning(rng: np.random.Generator, both: bool) -> BlindScript:
-    """Legs turn from one end of their range to the other; front wheels driven, rear wheels free."""
+def turning(rng: np.random.Generator, geometry: Geometry, both: bool) -> BlindScript:
+    """Rear legs, or all against each other, turn from one end of their range to the other; rear wheels free."""
     low, high = DOWN - rng.uniform(0.95, 1.06), DOWN + rng.uniform(0.95, 1.06)
     speed, turning, ramp = rng.uniform(1.4, 2.2), rng.uniform(5.0, 6.5), rng.uniform(4.0, 5.0)
     end = rng.uniform(17.5, 19.0)
@@ -172,16 +174,6 @@ def _turning(rng: np.random.Generator, both: bool) -> BlindScript:
         return np.stack([front_angle, front_angle, rear_angle, rear_angle, drive, drive, free, free], axis=1)
 
     return BlindScript(end, setpoints)
-
-
-def rear_legs(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
-    """Rear legs turn, front legs stay."""
-    return _turning(rng, both=False)
-
-
-def all_legs(rng: np.random.Generator, geometry: Geometry) -> BlindScript:
-    """Front and rear legs turn against each other."""
-    return _turning(rng, both=True)
 
 
 def random_band(rng: np.random.Generator, geometry: Geometry) -> BlindScript:

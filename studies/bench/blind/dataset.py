@@ -131,59 +131,37 @@ def write(folder: Path, tables: Sequence[pd.DataFrame], meta: Mapping[str, Any])
 # ---- bad data: what a workflow must refuse or call bad, never explain by an effect -----------------------------------
 
 
-Tables = list[pd.DataFrame]
-
-
-def _wrong_unit(tables: Tables, rng: np.random.Generator) -> Tables:
-    """Leg angles in degrees."""
-    columns = [f"pos_{leg}" for leg in LEGS]
-    return [table.assign(**{name: np.rad2deg(table[name]) for name in columns}) for table in tables]
-
-
-def _mis_ordered(tables: Tables, rng: np.random.Generator) -> Tables:
-    """Rows of every run in another order."""
-    return [table.iloc[rng.permutation(len(table))].reset_index(drop=True) for table in tables]
-
-
-def _nan_ridden(tables: Tables, rng: np.random.Generator) -> Tables:
-    """A third of all encoder readings missing."""
-    columns = [f"pos_{joint}" for joint in JOINTS]
-    return [table.assign(**{name: table[name].where(rng.random(len(table)) > 1 / 3) for name in columns}) for table in tables]
-
-
-def _flipped_sign(tables: Tables, rng: np.random.Generator) -> Tables:
-    """The encoder of one wheel counts backwards, its rate and the rest do not."""
-    return [table.assign(pos_wheel_lr=-table["pos_wheel_lr"]) for table in tables]
-
-
-def _stuck_encoder(tables: Tables, rng: np.random.Generator) -> Tables:
-    """One leg's encoder stays at its first reading; so does its rate."""
-    return [table.assign(pos_leg_rf=table["pos_leg_rf"].iloc[0], vel_leg_rf=0.0) for table in tables]
-
-
-def _too_short(tables: Tables, rng: np.random.Generator) -> Tables:
-    """A fifth of a second of every run."""
-    return [table.iloc[:10] for table in tables]
-
-
-def _too_few(tables: Tables, rng: np.random.Generator) -> Tables:
-    """One run only."""
-    return tables[:1]
-
-
-def _motionless(tables: Tables, rng: np.random.Generator) -> Tables:
+def _motionless(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Six times the second before anything moves."""
-    still = [table.iloc[: int(np.count_nonzero(table["t"] < 0.95))] for table in tables]
-    return [pd.concat([table.assign(t=table["t"] + lap) for lap in range(6)], ignore_index=True) for table in still]
+    still = table.iloc[: int(np.count_nonzero(table["t"] < 0.95))]
+    return pd.concat([still.assign(t=still["t"] + lap) for lap in range(6)], ignore_index=True)
 
 
-SPOIL: Mapping[str, Callable[[Tables, np.random.Generator], Tables]] = {
-    "wrong_unit": _wrong_unit,
-    "mis_ordered": _mis_ordered,
-    "nan_ridden": _nan_ridden,
-    "flipped_sign": _flipped_sign,
-    "stuck_encoder": _stuck_encoder,
-    "too_short": _too_short,
-    "too_few": _too_few,
+#: What happens to every run. The fewest runs are in ``too_few``: one.
+SPOIL: Mapping[str, Callable[[pd.DataFrame, np.random.Generator], pd.DataFrame]] = {
+    # leg angles in degrees
+    "wrong_unit": lambda table, rng: table.assign(**{name: np.rad2deg(table[name]) for name in _angles(LEGS)}),
+    # rows in another order
+    "mis_ordered": lambda table, rng: table.iloc[rng.permutation(len(table))].reset_index(drop=True),
+    # a third of all encoder readings missing
+    "nan_ridden": lambda table, rng: table.assign(
+        **{name: table[name].where(rng.random(len(table)) > 1 / 3) for name in _angles(JOINTS)}
+    ),
+    # the encoder of one wheel counts backwards, its rate and the rest do not
+    "flipped_sign": lambda table, rng: table.assign(pos_wheel_lr=-table["pos_wheel_lr"]),
+    # one leg's encoder stays at its first reading; so does its rate
+    "stuck_encoder": lambda table, rng: table.assign(pos_leg_rf=table["pos_leg_rf"].iloc[0], vel_leg_rf=0.0),
+    # a fifth of a second
+    "too_short": lambda table, rng: table.iloc[:10],
+    "too_few": lambda table, rng: table,
     "motionless": _motionless,
 }
+
+
+def _angles(joints: Sequence[str]) -> list[str]:
+    return [f"pos_{joint}" for joint in joints]
+
+
+def spoilt(how: str, tables: Sequence[pd.DataFrame], rng: np.random.Generator) -> list[pd.DataFrame]:
+    """Return the runs of a data set with what :data:`SPOIL` does to them."""
+    return [SPOIL[how](table, rng) for table in (tables[:1] if how == "too_few" else tables)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -110,16 +110,12 @@ def _names_within(group: Any) -> set[str]:
     return set().union(*map(_names_within, group)) if isinstance(group, Sequence) else set()
 
 
+@cache
 def neutral(name: str, parameter: str) -> float:
     """Return the value at which an effect vanishes: a floor like the nominal one, a factor of 1, else 0."""
     if parameter in ("mu", "mu_k"):
-        return _floor_friction()
+        return nominal(read_robot(data_directory("configs") / "robot" / "nominal.yaml")).mu
     return 1.0 if parameter == "scale" or name == "friction_anisotropy" else 0.0
-
-
-@cache
-def _floor_friction() -> float:
-    return nominal(read_robot(data_directory("configs") / "robot" / "nominal.yaml")).mu
 
 
 def size_error(truth: Mapping[str, Any], found: Mapping[str, Any]) -> float:
@@ -189,7 +185,7 @@ def score(results: Mapping[str, Result], truths: Mapping[str, Truth]) -> dict[st
     nulls = [*of["none"], *of["parameters"]]
     return {
         "sets": len(scored),
-        "commits": dict(Counter(_commit(result) for _, result in scored).most_common()),
+        "commits": dict(Counter((r.get("blind_test") or {}).get("commit") or "unknown" for _, r in scored).most_common()),
         "false_alarms": {
             "none": _share(at_most, [_alarm(result) for _, result in of["none"] if _answered(result)]),
             "parameters": _share(at_most, [_alarm(result) for _, result in of["parameters"] if _answered(result)]),
@@ -229,10 +225,6 @@ def _answered(result: Result) -> bool:
     return not _refused(result) and result["verdict"] != FAILED
 
 
-def _commit(result: Result) -> str:
-    return (result.get("blind_test") or {}).get("commit") or "unknown"
-
-
 def _top(truth: Truth, result: Result) -> bool:
     return headline(result) == truth["effects"][0]["name"]
 
@@ -248,26 +240,29 @@ def _same_place(true: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
 
 
 def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
-    severities = sorted({truth["severity"] for truth, _ in pairs})
     by_severity = {}
-    for severity in severities:
+    for severity in sorted({truth["severity"] for truth, _ in pairs}):
         chosen = [pair for pair in pairs if pair[0]["severity"] == severity]
-        hits: dict[str, Callable[[Truth, Result], bool]]
-        hits = {"found": lambda _, result: _alarm(result), "top1": _top, "in_set": _in_set}
-        by_severity[str(severity)] = {key: _share(at_least, [hit(*pair) for pair in chosen]) for key, hit in hits.items()}
+        by_severity[str(severity)] = {
+            "found": _share(at_least, [_alarm(result) for _, result in chosen]),
+            "top1": _share(at_least, [_top(*pair) for pair in chosen]),
+            "in_set": _share(at_least, [_in_set(*pair) for pair in chosen]),
+        }
     matched = [match for truth, result in clear for match in _matched(truth, result)]
     shapes = [error for true, found in matched if (error := shape_error(true, found)) is not None]
     orders = [right for true, found in matched if (right := order_found(true, found)) is not None]
     holds = [hold for true, found in matched for hold in intervals_hold(true, found)]
     gaps = [result.get("gap") or {} for _, result in clear if _alarm(result)]
+    upper_ends = [(gap.get("reduction_ci95") or (None, None))[1] for gap in gaps]
     reductions = [share for gap in gaps if (share := gap.get("reduction_signed", gap.get("reduction"))) is not None]
+    sizes = [len(equivalence_set(r)) for _, r in clear if _alarm(r)]
     extra = [set(found_names(r)) != {t["effects"][0]["name"]} for t, r in clear if t["effects"][0]["name"] in found_names(r)]
     return {
         "by_severity": by_severity,
         "top1": _share(at_least, [_top(truth, result) for truth, result in clear]),
         "top1_at_one": _share(at_least, [_top(truth, result) for truth, result in pairs if truth["severity"] == 1.0]),
         "in_set": _share(at_least, [_in_set(truth, result) for truth, result in clear]),
-        "mean_set_size": _mean([len(equivalence_set(r)) for _, r in clear if _alarm(r)]),
+        "mean_set_size": float(np.mean(sizes)) if sizes else None,
         "place": _share(at_least, [_same_place(true, found) for true, found in matched]),
         "extra_name": _share(at_most, extra),
         "size_error": _quantiles([size_error(true, found) for true, found in matched]),
@@ -276,7 +271,7 @@ def _single(pairs: Sequence[tuple[Truth, Result]], clear: Sequence[tuple[Truth, 
         "interval_coverage": {**_share(at_least, holds), "bound95_above": at_most(sum(holds), len(holds)).bound},
         "gap_reduction": _quantiles(reductions),
         "gap_reduction_of_all": _quantiles(reductions + [0.0] * (len(clear) - len(reductions))),
-        "gap_grew_surely": _share(at_most, [high < 0 for gap in gaps if (high := _upper_end(gap)) is not None]),
+        "gap_grew_surely": _share(at_most, [high < 0 for high in upper_ends if high is not None]),  # few runs have no interval
         "gap_grew": _share(at_most, [_grew(gap) for gap in gaps]),
         "confidence": _calibration(clear),
     }
@@ -316,11 +311,6 @@ def _grew(gap: Mapping[str, Any]) -> bool:
     return after is not None and before is not None and after > 1.02 * before
 
 
-def _upper_end(gap: Mapping[str, Any]) -> float | None:
-    """Upper end of the reduction's interval; None where the held-out runs were too few for one."""
-    return (gap.get("reduction_ci95") or (None, None))[1]
-
-
 def _pairs(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
     def names(truth: Truth) -> set[str]:
         return {effect["name"] for effect in truth["effects"]}
@@ -351,16 +341,13 @@ def _calibration(pairs: Sequence[tuple[Truth, Result]]) -> dict[str, Any]:
     return {"mean_confidence": float(confidence.mean()), "right": float(right.mean()), "count": len(rows)}
 
 
-def _mean(values: Sequence[float]) -> float | None:
-    return float(np.mean(values)) if len(values) else None
-
-
 def _quantiles(values: Sequence[float]) -> dict[str, float | int | None]:
-    """Return quantiles and bounds of the median; "worst" is the largest value."""
+    """Return quantiles and one-sided 95 % bounds of the median from order statistics; "worst" is the largest value."""
     if not len(values):
         return dict.fromkeys(("median", "at_least95", "at_most95", "p90", "worst", "lowest"), None) | {"count": 0}
     array = np.sort(np.asarray(values, dtype=float))
-    low, high = _median_bounds(array)
+    count, rank = len(array), int(binom.ppf(0.95, len(array), 0.5))  # whatever the distribution; none below five values
+    low, high = (float(array[count - 1 - rank]), float(array[rank])) if rank < count else (None, None)
     return {
         "median": float(np.median(array)),
         "at_least95": low,
@@ -368,33 +355,19 @@ def _quantiles(values: Sequence[float]) -> dict[str, float | int | None]:
         "p90": float(np.quantile(array, 0.9)),
         "worst": float(array.max()),
         "lowest": float(array.min()),
-        "count": len(array),
+        "count": count,
     }
-
-
-def _median_bounds(ordered: np.ndarray) -> tuple[float | None, float | None]:
-    """One-sided 95 % bounds of a median from order statistics, whatever the distribution; none for fewer than five values."""
-    count = len(ordered)
-    rank = int(binom.ppf(0.95, count, 0.5))
-    return (float(ordered[count - 1 - rank]), float(ordered[rank])) if rank < count else (None, None)
 
 
 def confusion(scored: Sequence[tuple[Truth, Result]]) -> dict[str, dict[str, int]]:
     """Return counts: what was hidden -> what the headline says. Effects count from severity 1 on, pairs are left out."""
     table: dict[str, dict[str, int]] = {}
+    words = {"none": "nothing", "parameters": "parameters only", "bad": "bad data"}
     for truth, result in scored:
-        if truth["kind"] == "pair" or (truth["kind"] == "effect" and truth["severity"] < 1.0):
+        kind, said = truth["kind"], headline(result)
+        if kind == "pair" or (kind == "effect" and truth["severity"] < 1.0):
             continue
-        row = _row(truth)
-        said = headline(result)
-        counts = table.setdefault(row, {})
+        hidden = words[kind] if kind in words else truth["effects"][0]["name"]
+        counts = table.setdefault(f"({hidden})" if kind == "stranger" else hidden, {})
         counts[said] = counts.get(said, 0) + 1
     return table
-
-
-def _row(truth: Truth) -> str:
-    """What was hidden, for the confusion matrix; strangers in brackets."""
-    if truth["kind"] in ("effect", "stranger"):
-        name = truth["effects"][0]["name"]
-        return name if truth["kind"] == "effect" else f"({name})"
-    return {"none": "nothing", "parameters": "parameters only", "bad": "bad data"}[truth["kind"]]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from studies.bench.blind.copies import read_robot
-from studies.bench.blind.dataset import SPOIL, simulate_runs, write
+from studies.bench.blind.dataset import SPOIL, simulate_runs, spoilt, write
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import data_directory
 from wlr_gym.gap import workflow
@@ -40,7 +40,7 @@ def test_good_data_pass(good, intake_only, tmp_path):
 @pytest.mark.parametrize("kind", [kind for kind in SPOIL if kind != "motionless"])
 def test_bad_data_do_not(kind, good, intake_only, tmp_path):
     tables, meta = good
-    write(tmp_path, SPOIL[kind]([table.copy() for table in tables], np.random.default_rng(1)), meta)
+    write(tmp_path, spoilt(kind, [table.copy() for table in tables], np.random.default_rng(1)), meta)
     try:
         found = workflow.analyse(tmp_path)
     except InputError:

@@ -115,7 +115,9 @@ def test_a_robot_is_stopped_while_signals_are_looked_at(tmp_path, monkeypatch, c
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("studies.paper.experiments.drive_plant", drive)
-    monkeypatch.setattr("studies.paper.__main__._search", lambda *_: (_ for _ in ()).throw(RuntimeError("both were driven")))
+    monkeypatch.setattr(
+        "studies.paper.report.what_would_decide", lambda *_: (_ for _ in ()).throw(RuntimeError("both were driven"))
+    )
     monkeypatch.setattr("studies.paper.claims.gather", lambda *_: None)
     monkeypatch.setattr("studies.paper.claims.check_all", lambda *_: [])
     arguments = ["--out", str(tmp_path / "out"), "--plant", "dynamixel", "--emulated", "--draws", "0"]
