@@ -373,16 +373,11 @@ class Printer:
 
     def _term(self, term: Expression) -> str:
         coefficient, product = term.as_coeff_Mul()
-        factors = [base for factor in sp.Mul.make_args(product) for base in self._powers(factor)]
-        factors.sort(key=self._rank)
+        powers = (factor.as_base_exp() for factor in sp.Mul.make_args(product))
+        factors = sorted((base for base, exponent in powers for _ in range(int(exponent))), key=self._rank)
         sign = "-" if coefficient < 0 else ""
         number = [] if abs(coefficient) == 1 else [f"{float(abs(coefficient))}"]
         return sign + " * ".join(number + [f"({self.text(f)})" if f.is_Add else str(f) for f in factors])
-
-    @staticmethod
-    def _powers(factor: Expression) -> list[Expression]:
-        base, exponent = factor.as_base_exp()
-        return [base] * int(exponent)
 
 
 def function_source(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -77,27 +77,11 @@ def run(options: BenchOptions) -> int:
         check_folder(options.save.parent, "--save")
         require_ending(options.save, (".json",), "--save")
         refuse_existing(options.save, options.force, "--save")
-    console = Console()
-    here = machine()
+    console, here = Console(), machine()
     report: dict[str, Any] = {"schema": SCHEMA, "machine": here, "rounds": options.rounds, "quick": options.quick}
     report |= {"measurements": [], "convergence": [], "vision": []}
     console.print(f"{here['processor']}, {here['cores']} cores, {here['system']}; {tally(here['versions'])}")
     names = options.what or tuple(name for name in MEASUREMENTS if name not in _ON_REQUEST)
-    for name, rows in _measured(names, Size(options.rounds, options.quick), console):
-        if name == "engine":
-            rows = _engine_pairs(rows, report, console, options.save)
-        report[name if name in _TABLES else "measurements"] += [row.as_dict() for row in rows]
-        _TABLES.get(name, _print_speed)(rows, console)
-    if options.json:
-        print_json(report)
-    if options.save is not None:
-        write_json(options.save, report)
-        print(f"written: {options.save}")
-    return OK
-
-
-def _measured(names: Sequence[str], size: Size, console: Console) -> Iterator[tuple[str, Any]]:
-    """Yield each measurement and what came of it, under a bar with the remaining time."""
     with progress(console) as tell:
         for done, name in enumerate(names):
 
@@ -106,7 +90,17 @@ def _measured(names: Sequence[str], size: Size, console: Console) -> Iterator[tu
 
             told(0.0)
             module, _, function = MEASUREMENTS[name].partition(":")
-            yield name, getattr(importlib.import_module(module), function)(replace(size, tell=told))
+            rows = getattr(importlib.import_module(module), function)(Size(options.rounds, options.quick, told))
+            if name == "engine":
+                rows = _engine_pairs(rows, report, console, options.save)
+            report[name if name in _TABLES else "measurements"] += [row.as_dict() for row in rows]
+            _TABLES.get(name, _print_speed)(rows, console)
+    if options.json:
+        print_json(report)
+    if options.save is not None:
+        write_json(options.save, report)
+        print(f"written: {options.save}")
+    return OK
 
 
 def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:

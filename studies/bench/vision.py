@@ -18,7 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from studies.bench.measure import Size
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
@@ -178,9 +180,6 @@ def _drive(
     torque_on: NDArray[np.bool_],
     x: float,
 ) -> FilmedDrive:
-    import pandas
-    from scipy.spatial.transform import Rotation
-
     plant = make_plant("gibbs_appell", robot, 1, PlantOptions(control_period=TICK, physics_step=0.001))
     state = standing_state(robot, parameters, legs[0])  # sin is the same for all legs, so the body is level
     state.joint_position[:, LEG_SLICE] = legs
@@ -188,22 +187,20 @@ def _drive(
     state.position[:, 0] = x
     sensors = plant.reset(np.array([7], np.uint64), parameters, state=state)
     for _ in range(int(_SETTLING / TICK)):
-        leg_setpoints, wheel_setpoints = setpoints(0.0)
-        sensors = plant.step(np.array([[*leg_setpoints, *wheel_setpoints]]), torque_on[None])
+        sensors = plant.step(np.concatenate(setpoints(0.0))[None], torque_on[None])
     count = int(duration / TICK)
     rows: list[list[float]] = []
     truths, slips = [], np.zeros((count + 1, 4, 2))
     for tick in range(count + 1):
         time = tick * TICK
-        leg_setpoints, wheel_setpoints = setpoints(time - time % (ROW * TICK) if tick % ROW else time)
-        goal = np.array([[*leg_setpoints, *wheel_setpoints]])
+        goal = np.concatenate(setpoints(time - time % (ROW * TICK) if tick % ROW else time))
         truth = plant.truth()
         truths.append(np.concatenate([truth.position[0], truth.quaternion[0], truth.joint_position[0, LEG_SLICE]]))
         if tick > 0:
             slips[tick] = slips[tick - 1] + truth.slip_displacement[0].reshape(4, 2)
         if tick % ROW == 0:
-            rows.append([time, *np.where(torque_on, goal[0], np.nan), *channels(sensors, 0)[: len(_LOGGED)]])
-        sensors = plant.step(goal, torque_on[None])
+            rows.append([time, *np.where(torque_on, goal, np.nan), *channels(sensors, 0)[: len(_LOGGED)]])
+        sensors = plant.step(goal[None], torque_on[None])
     plant.close()
     found = np.array(truths)
     table = pandas.DataFrame(rows, columns=["t", *COMMANDS, *_LOGGED])
@@ -243,8 +240,6 @@ def film(
 
 def pose_at(drive: FilmedDrive, time: float) -> ScenePose:
     """True pose of the body at a servo time: linear between ticks."""
-    from scipy.spatial.transform import Rotation, Slerp
-
     k = min(int(time / TICK), len(drive.time) - 2)
     part = (time - drive.time[k]) / TICK
     turn = Slerp([0, 1], Rotation.from_matrix(drive.rotation[k : k + 2]))(part).as_matrix()

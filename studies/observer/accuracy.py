@@ -6,37 +6,39 @@ from pathlib import Path
 
 import numpy as np
 
-from studies.observer.runs import PERIOD, Runs, channel, observe, play, simulate, slip_in_truth_order, without_flow
+from studies.observer.runs import (
+    DRIVEN,
+    PERIOD,
+    PLAYED,
+    Runs,
+    estimated,
+    observe,
+    play,
+    simulate,
+    slip_in_truth_order,
+    without_flow,
+)
 from wlr_gym.base.files import write_json
 from wlr_gym.base.plots import COLOURS, legend_below, new_figure, save, tidy
 from wlr_gym.base.provenance import git_commit
-from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.robot import load_robot
 
 SEED = 5
 START = 25  # ticks: robots of a simulation are dropped, which is not what is measured here
-FLOORS = ("nominal", "wide", "split", "ice", "patches")
-CASES = [("gibbs_appell", floor, drive, 64) for floor in FLOORS for drive in ("commands", "excitation")]
-CASES += [("gibbs_appell", "slope", "climb", 64), ("gibbs_appell", "slippery", "commands", 64)]
-CASES += [("gibbs_appell", "changing", "commands", 64)]
-CASES += [("mujoco", floor, drive, 32) for floor in FLOORS for drive in ("commands", "excitation")]
-CASES += [("mujoco", floor, "commands", 32) for floor in ("slippery", "changing")]
+CASES = [("gibbs_appell", floor, drive, 64) for floor, drive in DRIVEN]
+CASES += [("mujoco", floor, drive, 32) for floor, drive in DRIVEN if floor != "slope"]
 #: How far off the optical-flow sensor is, in the rows that have one.
 FLOW = {"flow__scale": 1.05, "flow__mount_yaw": 0.02, "flow__dropout": 0.02}
 FLOW_DRIVE = "commands, robot with optical flow"
-POLICIES = ("velocity_blind", "velocity_slip_aware")
-PLAYED = [(policy, floor, 64) for policy in POLICIES for floor in ("slippery", "ice", "split")]
 
 
 def measures(runs: Runs, camera: bool) -> dict[str, float]:
     """Errors of forward speed (rms, median, 99 %), lateral speed and slip; how well the slip's sigma holds."""
     found = observe(runs, camera)
-    velocity = (channel(ESTIMATE_LAYOUT, found, "linear_velocity_in_body") - runs.true("linear_velocity_in_body")[..., :2])[
-        START:
-    ]
-    error = (channel(ESTIMATE_LAYOUT, found, "slip_velocity") - runs.true("slip_velocity"))[START:]
-    sigma = channel(ESTIMATE_LAYOUT, found, "slip_sigma")[START:]
+    velocity = estimated(found, "linear_velocity_in_body") - runs.true("linear_velocity_in_body")[..., :2]
+    velocity, sigma = velocity[START:], estimated(found, "slip_sigma")[START:]
+    error = (estimated(found, "slip_velocity") - runs.true("slip_velocity"))[START:]
     ahead, normalised = np.abs(velocity[..., 0]), error / sigma
     return {
         "v_x_mm_s": 1e3 * rms(ahead),
@@ -73,9 +75,7 @@ def draw(path: Path) -> None:
     estimates = {}
     for label, camera in (("without camera", False), ("with camera", True)):
         found = observe(runs, camera)
-        estimates[label] = [
-            slip_in_truth_order(channel(ESTIMATE_LAYOUT, found, name))[..., 0] for name in ("slip_velocity", "slip_sigma")
-        ]
+        estimates[label] = [slip_in_truth_order(estimated(found, name))[..., 0] for name in ("slip_velocity", "slip_sigma")]
     errors = (estimates["without camera"][0] - true)[START:]
     shown = int(np.argmax(np.square(errors).mean(axis=(0, 2))))
     mu = runs.truth[:, shown, TRUTH_LAYOUT.slices["effective_friction"]][len(time) // 2, ::2]
@@ -103,7 +103,7 @@ def measure_accuracy(data: Path | None = None, figure: Path | None = None) -> No
         row(simulate("gibbs_appell", floor, "commands", 64, 10.0, SEED, robot, **FLOW), "gibbs_appell", floor, FLOW_DRIVE)
         for floor in ("split", "slippery")
     ]
-    rows += [row(play(policy, floor, count, 10.0, seed=SEED), "gibbs_appell", floor, policy) for policy, floor, count in PLAYED]
+    rows += [row(play(policy, floor, 64, 10.0, seed=SEED), "gibbs_appell", floor, policy) for policy, floor in PLAYED]
     if data is not None:
         write_json(data, {"commit": git_commit(), "seed": SEED, "rows": rows})
     if figure is not None:

@@ -96,6 +96,10 @@ FLOORS = {
     }
 }
 DRIVES = {"climb": climbing_setpoints, "commands": commanded_setpoints, "excitation": excited_setpoints}
+#: Floors and drives, and policies and floors, that the observer is trained and measured with.
+DRIVEN = [(floor, drive) for floor in ("nominal", "wide", "split", "ice", "patches") for drive in ("commands", "excitation")]
+DRIVEN += [("slope", "climb"), ("slippery", "commands"), ("changing", "commands")]
+PLAYED = [(p, f) for p in ("velocity_blind", "velocity_slip_aware") for f in ("slippery", "ice", "split")]
 
 
 def simulate(

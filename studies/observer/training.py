@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 import wlr_gym.perception.observer as package
-from studies.observer.runs import PERIOD, Runs, play, simulate
+from studies.observer.runs import DRIVEN, PERIOD, PLAYED, Runs, play, simulate
 from wlr_gym.perception.observer import SlipObserver
 from wlr_gym.perception.observer.trust import CLUES, CLUES_ALIKE, MEMORY, OUTPUTS
 from wlr_gym.robot import load_robot
@@ -28,10 +28,6 @@ SEEDS = (77, 78)
 COUNT, TICKS, CHUNK, BATCH = 128, 500, 50, 208
 ACCEL_NOISE = ROBOT.sensors.imu.accel_noise
 CAMERA_NOISE, FLOW_NOISE, FLOW_SCALE = ROBOT.sensors.camera.position_noise, 0.014, 0.03
-FLOORS = ("nominal", "wide", "split", "ice", "patches")
-DRIVEN = [(floor, drive) for floor in FLOORS for drive in ("commands", "excitation")]
-DRIVEN += [("slope", "climb"), ("slippery", "commands"), ("changing", "commands")]
-PLAYED = [(p, f) for p in ("velocity_blind", "velocity_slip_aware") for f in ("slippery", "ice", "split")]
 #: What is taken from the compiled observer's state of each step.
 TAKEN = ("rolling", "load", "traction", "force", "slope", "turned", "yaw_rate", "shaken", "legs", "inclined", "guess")
 #: Noises that are learnt: of the leak its wander, with the legs, with turning; of the velocity; at the start.

@@ -43,7 +43,7 @@ from studies.paper.verdicts import verdict_table
 from studies.tables import markdown_table
 from wlr_gym.base.files import write_json, write_text
 from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
-from wlr_gym.physics.plants import SIMULATORS
+from wlr_gym.physics.plants import REAL, SIMULATORS
 from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
@@ -52,6 +52,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     REDUCED: {"label": "reduced model", "color": ORANGE, "linewidth": 2.4, "alpha": 0.7},
     "gibbs_appell": {"label": "Gibbs-Appell", "color": BLUE, "linewidth": 1.2},
     "mujoco": {"label": "MuJoCo", "color": "black", "linewidth": 1.0, "linestyle": (0, (4, 3))},
+    **{model: {"label": model, "color": GREEN, "linewidth": 1.0} for model in REAL},
 }
 _IDEAL: dict[str, Any] = {"color": "0.6", "linewidth": 3.0, "alpha": 0.6}
 #: s; what is before, the robot settling on its legs, is not drawn.
@@ -70,10 +71,6 @@ _RPM = 60.0 / (2.0 * np.pi)
 #: A grid of axes.
 Panels = NDArray[Any]
 Series = Callable[[Record], Array]
-
-
-def _style(model: str) -> dict[str, Any]:
-    return _STYLES.get(model, {"label": model, "color": GREEN, "linewidth": 1.0})
 
 
 def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[Figure, Panels]:
@@ -99,7 +96,7 @@ def _over_time(figure: Figure, axes: Panels) -> Figure:
 def _draw(axes: Axes, records: Sequence[Record], series: Series, title: str, label: str) -> None:
     for record in records:
         shown = record.time > _FROM
-        axes.plot(record.time[shown], series(record)[shown], **_style(record.model))
+        axes.plot(record.time[shown], series(record)[shown], **_STYLES[record.model])
     axes.set_title(title, fontsize=9)
     axes.set_ylabel(label)
 
@@ -204,7 +201,7 @@ def path_figure(records: Sequence[Record], variants: Mapping[str, Array], test: 
     figure.set_size_inches(8.5, 4.2)
     panel = axes[0, 0]
     for record in records:
-        panel.plot(record.position[:, 0, 0], 100 * record.position[:, 0, 1], **_style(record.model))
+        panel.plot(record.position[:, 0, 0], 100 * record.position[:, 0, 1], **_STYLES[record.model])
     for (label, path), colour in zip(variants.items(), _UNEVEN, strict=True):
         panel.plot(path[:, 0], 100 * path[:, 1], linewidth=1.4, color=colour, label=f"Gibbs-Appell, {label}")
     for sign in (1, -1):
@@ -231,10 +228,10 @@ def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
 def question_figure(findings: Sequence[SearchFinding]) -> Figure:
     """How near departures from the nominal robot come to the paper's four numbers: one at a time, and the best combinations."""
     nearest = sorted(findings, key=lambda finding: min(map(finding.closest, READINGS)))
-    alone = [finding for finding in nearest if len(finding.names) == 1]
+    alone, meaning = [finding for finding in nearest if len(finding.names) == 1], {one.name: one.doc for one in CANDIDATES}
     together = [finding for finding in nearest if len(finding.names) > 1][:_COMBINATIONS]
     groups = [
-        ("one departure, and what it is", alone, [_departure(finding.label) for finding in alone]),
+        ("one departure, and what it is", alone, [f"{finding.label}: {meaning[finding.label]}" for finding in alone]),
         ("several at once: the closest", together, [finding.label for finding in together]),
     ]
     groups = [group for group in groups if group[1]]
@@ -251,11 +248,6 @@ def question_figure(findings: Sequence[SearchFinding]) -> Figure:
     return figure
 
 
-def _departure(name: str) -> str:
-    """``zeros: zeros of the leg encoders``."""
-    return next((f"{name}: {one.doc}" for one in CANDIDATES if one.name == name), name)
-
-
 def _draw_misses(panel: Axes, shown: Sequence[SearchFinding], labels: Sequence[str]) -> None:
     """Draw by how much each departure misses the paper's numbers, in tolerances, a row each."""
     panel.axvspan(0.0, 1.0, color=GREEN, alpha=0.2, linewidth=0.0, label="match: all four within tolerance")
@@ -267,23 +259,6 @@ def _draw_misses(panel: Axes, shown: Sequence[SearchFinding], labels: Sequence[s
     panel.set_ylim(len(shown) - 0.4, -0.6)
     panel.set_xlim(left=0.0)
     panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-
-
-def figures_of_test(
-    records: Sequence[Record], ideal: IdealMotion, measured: FromMeasurement | None, paths: Mapping[str, Array]
-) -> dict[str, Figure]:
-    """Return all figures of one test by file name."""
-    numbers = ideal.test.figures
-    ordered = sorted(records, key=lambda record: MODELS.index(record.model))
-    drawn = (
-        rotation_figure(ordered, ideal),
-        speed_figure(ordered, ideal),
-        torque_figure(ordered, ideal, measured),
-        body_figure(ordered, ideal),
-        path_figure(ordered, paths, ideal.test),
-    )
-    named = {f"figure_{number:02d}.png": figure for number, figure in zip(numbers, drawn, strict=True)}
-    return named | {f"{ideal.test.name}_slip.png": slip_figure(ordered, ideal)}
 
 
 # ---- agreement of the models -----------------------------------------------------------------------------------------
@@ -301,27 +276,26 @@ def agreement(records: Records) -> dict[str, dict[str, dict[str, float]]]:
     left and right taken together (how wheels that stick share a load is open), from the commands on.
     """
     reference = records.get("gibbs_appell")
+    others = [model for model in records if model in (REDUCED, *SIMULATORS) and model != "gibbs_appell"]
     if reference is None:
         return {}
-    return {
-        model: {name: _apart(reference[name], own[name]) for name in TESTS}
-        for model, own in records.items()
-        if model in (REDUCED, *SIMULATORS) and model != "gibbs_appell"
-    }
+    return {model: {name: _apart(reference[name], records[model][name]) for name in TESTS} for model in others}
 
 
 def _apart(a: Record, b: Record) -> dict[str, float]:
-    moving = a.time > 0.0
-    distance = float(np.linalg.norm(a.end[0] - b.end[0]))
-    torque = {}
-    for name, columns in (("leg_torque", (0, 1, 2, 3)), ("wheel_torque", (4, 5))):
-        pairs = [[record.torque[moving][:, 0, j] for j in columns] for record in (a, b)]
-        first, second = (np.array(pair).reshape(len(columns) // 2, 2, -1).mean(axis=1) for pair in pairs)
-        torque[name] = float(np.sqrt(np.mean((first - second) ** 2) / np.mean(first**2)))
+    def torques(record: Record, joints: slice) -> Array:
+        values = record.torque[a.time > 0.0][:, 0, joints]
+        return values.reshape(len(values), -1, 2).mean(axis=2)
+
+    def torque(joints: slice) -> float:
+        ours, theirs = torques(a, joints), torques(b, joints)
+        return float(np.sqrt(np.mean((ours - theirs) ** 2) / np.mean(ours**2)))
+
     return {
-        "position": distance / float(np.abs(a.end[0, 0])),
+        "position": float(np.linalg.norm(a.end[0] - b.end[0]) / np.abs(a.end[0, 0])),
         "yaw_degrees": float(np.degrees(np.abs(a.attitude[-1, 0, 0] - b.attitude[-1, 0, 0]))),
-        **torque,
+        "leg_torque": torque(slice(0, 4)),
+        "wheel_torque": torque(slice(4, 6)),
     }
 
 
@@ -347,15 +321,21 @@ def what_would_decide(robot: Robot, findings: Sequence[SearchFinding], threads: 
 def write_figures(folder: Path, records: Records, evidence: PaperEvidence, findings: Sequence[SearchFinding]) -> None:
     """Write all figures as PNG."""
     source = next((records[model] for model in SIMULATORS if model in records), evidence.plant)
-    for name in TESTS:
-        measured = inverse_from_record(evidence.robot, source[name])
-        variants = evidence.variants[name]
-        paths = {
-            label: variants.position[:, variant_row(label), :2] for label in ("more drag left", "left front wheel 2 % small")
-        }
-        own = [record[name] for record in records.values()]
-        for file, figure in figures_of_test(own, evidence.ideal[name], measured, paths).items():
-            save(figure, folder / file)
+    for name, test in TESTS.items():
+        ideal, variants = evidence.ideal[name], evidence.variants[name]
+        labels = "more drag left", "left front wheel 2 % small"
+        paths = {label: variants.position[:, variant_row(label), :2] for label in labels}
+        own = sorted((record[name] for record in records.values()), key=lambda record: MODELS.index(record.model))
+        drawn = (
+            rotation_figure(own, ideal),
+            speed_figure(own, ideal),
+            torque_figure(own, ideal, inverse_from_record(evidence.robot, source[name])),
+            body_figure(own, ideal),
+            path_figure(own, paths, test),
+        )
+        for number, figure in zip(test.figures, drawn, strict=True):
+            save(figure, folder / f"figure_{number:02d}.png")
+        save(slip_figure(own, ideal), folder / f"{name}_slip.png")
     if findings:
         save(question_figure(findings), folder / "open_question.png")
 
