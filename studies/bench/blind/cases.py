@@ -180,6 +180,8 @@ Draw = np.random.Generator
 Effect = dict[str, Any]
 #: Draws an effect of a name at a severity.
 Drawn = Callable[[str, float, Draw], Effect]
+#: Draws its numbers at a severity.
+Numbered = Callable[[float, Draw], Numbers]
 
 
 @dataclass(frozen=True)
@@ -287,12 +289,31 @@ def _effect(name: str, where: Sequence[str], parameters: Mapping[str, float]) ->
     return {"name": name, "where": list(where), "parameters": {key: float(f"{value:.5g}") for key, value in parameters.items()}}
 
 
-def _fixed(place: str, numbers: Callable[[float, Draw], Mapping[str, float]]) -> Drawn:
+def _fixed(place: str, numbers: Numbered) -> Drawn:
     return lambda name, severity, rng: _effect(name, [place], numbers(severity, rng))
 
 
-def _wheels(numbers: Callable[[float, Draw], Mapping[str, float]]) -> Drawn:
+def _wheels(numbers: Numbered) -> Drawn:
     return lambda name, severity, rng: _effect(name, _some(rng, WHEELS), numbers(severity, rng))
+
+
+def _one(names: Sequence[str], numbers: Numbered) -> Drawn:
+    return lambda name, severity, rng: _effect(name, [names[int(rng.integers(4))]], numbers(severity, rng))
+
+
+def _direction(size: float, *names: str, **others: float) -> Numbered:
+    """Two components of a vector of this size whose direction is drawn."""
+    return lambda severity, rng: dict(zip(names, _around(rng, size * severity), strict=True)) | others
+
+
+def _some_axes(size: float, most: int, *names: str) -> Numbered:
+    """One axis or more, each with a sign of its own."""
+
+    def numbers(severity: float, rng: Draw) -> Numbers:
+        axes = rng.choice(names, size=int(rng.integers(1, most + 1)), replace=False)
+        return {str(axis): _sign(rng) * size * severity for axis in sorted(axes)}
+
+    return numbers
 
 
 def _ripple(name: str, severity: float, rng: Draw) -> Effect:
@@ -307,27 +328,19 @@ def _delay(name: str, severity: float, rng: Draw) -> Effect:
     return _effect(name, where, {"delay": 0.015 * severity})
 
 
-def _zero(name: str, severity: float, rng: Draw) -> Effect:
-    return _effect(name, [LEGS[int(rng.integers(4))]], {"angle": _sign(rng) * 0.0262 * severity})
-
-
 def _asymmetry(name: str, severity: float, rng: Draw) -> Effect:
     """One wheel, an axle or a side; all four would be a level."""
     groups = [[wheel] for wheel in WHEELS] + [list(WHEELS[:2]), list(WHEELS[2:]), list(WHEELS[::2]), list(WHEELS[1::2])]
     return _effect(name, groups[int(rng.integers(len(groups)))], {"mu": 0.6 / (1 + 0.35 * severity)})
 
 
-def _radius(name: str, severity: float, rng: Draw) -> Effect:
-    return _effect(name, [WHEELS[int(rng.integers(4))]], {"scale": 1 + _sign(rng) * 0.015 * severity})
-
-
-def _patch(severity: float, rng: Draw) -> Mapping[str, float]:
+def _patch(severity: float, rng: Draw) -> Numbers:
     start, side = rng.uniform(0.1, 0.25), _sign(rng)
     edges = sorted((side * start, side * (start + rng.uniform(0.4, 0.8))))
     return {"mu": 0.6 / (1 + 0.5 * severity), "x_min": edges[0], "x_max": edges[1]}
 
 
-def _payload(severity: float, rng: Draw) -> Mapping[str, float]:
+def _payload(severity: float, rng: Draw) -> Numbers:
     x, y, z = rng.uniform([-0.12, -0.1, 0.02], [0.12, 0.1, 0.1])
     return {"mass": 0.15 * severity, "x": x, "y": y, "z": z}
 
@@ -337,37 +350,12 @@ def _around(rng: Draw, size: float) -> tuple[float, float]:
     return size * np.cos(angle), size * np.sin(angle)
 
 
-def _centre(severity: float, rng: Draw) -> Mapping[str, float]:
-    x, y = _around(rng, 0.0128 * severity)
-    return {"x": x, "y": y, "z": 0.0}
-
-
-def _slope(severity: float, rng: Draw) -> Mapping[str, float]:
-    pitch, roll = _around(rng, 0.0149 * severity)
-    return {"pitch": pitch, "roll": roll}
-
-
-def _wind(severity: float, rng: Draw) -> Mapping[str, float]:
-    x, y = _around(rng, 0.3 * severity)
-    return {"fx": x, "fy": y}
-
-
-def _tether(severity: float, rng: Draw) -> Mapping[str, float]:
+def _tether(severity: float, rng: Draw) -> Numbers:
     x, y = _around(rng, rng.uniform(0.2, 0.6))
     return {"stiffness": 0.6 * severity, "x": x, "y": y}
 
 
-def _gyro(severity: float, rng: Draw) -> Mapping[str, float]:
-    axes = rng.choice(["x", "y", "z"], size=int(rng.integers(1, 4)), replace=False)
-    return {str(axis): _sign(rng) * 0.003 * severity for axis in sorted(axes)}
-
-
-def _imu(severity: float, rng: Draw) -> Mapping[str, float]:
-    axes = rng.choice(["roll", "pitch", "yaw"], size=int(rng.integers(1, 3)), replace=False)
-    return {str(axis): _sign(rng) * 0.02 * severity for axis in sorted(axes)}
-
-
-def _camera(severity: float, rng: Draw) -> Mapping[str, float]:
+def _camera(severity: float, rng: Draw) -> Numbers:
     if rng.random() < 0.5:
         return {"yaw": _sign(rng) * 0.0262 * severity}
     return {"scale": 1 + _sign(rng) * 0.015 * severity}
@@ -401,7 +389,7 @@ NAMED: Mapping[str, tuple[Law, Drawn]] = {
     ),
     "supply_sag": (_scalar("supply_resistance", "resistance"), _fixed("body", lambda s, _: {"resistance": 0.08 * s})),
     "command_delay": (_at("delay", "delay"), _delay),
-    "joint_zero_offset": (_at("zero", "angle", LEGS), _zero),
+    "joint_zero_offset": (_at("zero", "angle", LEGS), _one(LEGS, lambda s, rng: {"angle": _sign(rng) * 0.0262 * s})),
     "friction_level": (_level, _fixed("ground", lambda s, _: {"mu": 0.6 / (1 + 0.45 * s)})),
     "friction_asymmetry": (_at("wheel_mu", "mu", WHEELS, add=False), _asymmetry),
     "friction_anisotropy": (_scalar("mu_ratio", "ratio"), _fixed("ground", lambda s, _: {"ratio": 1 / (1 + 0.25 * s)})),
@@ -412,44 +400,43 @@ NAMED: Mapping[str, tuple[Law, Drawn]] = {
     ),
     "tyre_creep": (_at("creep_speed", "creep_speed", WHEELS, add=False), _wheels(lambda s, _: {"creep_speed": 0.008 * s})),
     "rolling_resistance": (_at("rolling", "coefficient", WHEELS), _wheels(lambda s, _: {"coefficient": 0.03 * s})),
-    "wheel_radius_error": (_times("radius_scale", "scale", WHEELS), _radius),
+    "wheel_radius_error": (
+        _times("radius_scale", "scale", WHEELS),
+        _one(WHEELS, lambda s, rng: {"scale": 1 + _sign(rng) * 0.015 * s}),
+    ),
     "payload": (_vector("payload", "mass", "x", "y", "z"), _fixed("body", _payload)),
-    "com_offset": (_vector("com", "x", "y", "z"), _fixed("body", _centre)),
-    "floor_slope": (_vector("slope", "pitch", "roll"), _fixed("ground", _slope)),
-    "external_force": (_vector("force", "fx", "fy"), _fixed("body", _wind)),
+    "com_offset": (_vector("com", "x", "y", "z"), _fixed("body", _direction(0.0128, "x", "y", z=0.0))),
+    "floor_slope": (_vector("slope", "pitch", "roll"), _fixed("ground", _direction(0.0149, "pitch", "roll"))),
+    "external_force": (_vector("force", "fx", "fy"), _fixed("body", _direction(0.3, "fx", "fy"))),
     "tether": (_vector("tether", "stiffness", "x", "y"), _fixed("body", _tether)),
-    "gyro_bias": (_vector("gyro_bias", "x", "y", "z"), _fixed("sensor", _gyro)),
-    "imu_misalignment": (_vector("imu", "roll", "pitch", "yaw"), _fixed("sensor", _imu)),
+    "gyro_bias": (_vector("gyro_bias", "x", "y", "z"), _fixed("sensor", _some_axes(0.003, 3, "x", "y", "z"))),
+    "imu_misalignment": (_vector("imu", "roll", "pitch", "yaw"), _fixed("sensor", _some_axes(0.02, 2, "roll", "pitch", "yaw"))),
     "camera_misalignment": (_write_camera, _fixed("sensor", _camera)),
     "camera_delay": (_scalar("camera_delay", "delay"), _fixed("sensor", lambda s, _: {"delay": 0.03 * s})),
 }
-
-
-def _one_leg(numbers: Callable[[float], Mapping[str, float]]) -> Drawn:
-    return lambda name, severity, rng: _effect(name, [LEGS[int(rng.integers(4))]], numbers(severity))
 
 
 def _axle(name: str, severity: float, rng: Draw) -> Effect:
     return _effect(name, list(WHEELS[2 * int(rng.integers(2)) :][:2]), {"ratio": 0.1 * severity})
 
 
-def _pull(severity: float, rng: Draw) -> Mapping[str, float]:
+def _pull(severity: float, rng: Draw) -> Numbers:
     return {"amplitude": 0.8 * severity, "frequency": rng.uniform(0.4, 1.2), "phase": rng.uniform(-np.pi, np.pi)}
 
 
 #: Laws that no library names, likewise.
 STRANGE: Mapping[str, tuple[Law, Drawn]] = {
-    "leg_spring": (_both_rows("leg_spring", "stiffness", "rest"), _one_leg(lambda s: {"stiffness": 0.2 * s, "rest": 1.2})),
+    "leg_spring": (_both_rows("leg_spring", "stiffness", "rest"), _one(LEGS, lambda s, _: {"stiffness": 0.2 * s, "rest": 1.2})),
     "body_drag": (_scalar("drag", "coefficient"), _fixed("body", lambda s, _: {"coefficient": 25.0 * s})),
     "cross_friction": (_cross, _axle),
     "periodic_pull": (_vector("pull", "amplitude", "frequency", "phase"), _fixed("body", _pull)),
     "out_of_round": (
         _at("out_of_round", "share", WHEELS),
-        lambda name, severity, rng: _effect(name, [WHEELS[int(rng.integers(4))]], {"share": 0.015 * severity}),
+        _one(WHEELS, lambda s, _: {"share": 0.015 * s}),
     ),
     "elastic_hysteresis": (
         _both_rows("elastic", "torque", "stiffness"),
-        _one_leg(lambda s: {"torque": 0.1 * s, "stiffness": 1.0 * s}),
+        _one(LEGS, lambda s, _: {"torque": 0.1 * s, "stiffness": 1.0 * s}),
     ),
     "veer": (_scalar("veer", "coefficient"), _fixed("body", lambda s, _: {"coefficient": 4.0 * s})),
 }
