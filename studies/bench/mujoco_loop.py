@@ -31,7 +31,7 @@ from wlr_gym.physics.plants.base import (
 from wlr_gym.physics.plants.mujoco.mjcf import CONTACT_IMPEDANCE, build_model
 from wlr_gym.physics.plants.mujoco.plant import GEAR_IMPEDANCE
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel
-from wlr_gym.robot import FIRST_WHEEL, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot, standing_height
+from wlr_gym.robot import FIRST_WHEEL, JOINTS, LEGS, WHEEL_SLICE, WHEELS, Robot, standing_height
 from wlr_gym.robot.parameters import Parameters
 from wlr_gym.robot.slip import contact_slip_velocity
 
@@ -168,7 +168,8 @@ class MujocoLoopPlant:
     """One robot on ``mj_step(nstep)``; see :class:`wlr_gym.physics.plants.base.Plant` for the contract.
 
     Enough for tasks, not a reference: sums over a tick (energy, slip displacement) are the last substep's rate times the
-    control period, contact forces and friction torques are not filled in, all motors are always on, setpoints are not delayed.
+    control period, contact forces and friction torques are not filled in, all motors are always on, setpoints are not delayed,
+    parameters change at a reset only.
     """
 
     capabilities: Capabilities = Capabilities(BACKEND, has_truth=True, can_set_state=True, real_time=False)
@@ -194,12 +195,9 @@ class MujocoLoopPlant:
     def _build(self) -> None:
         self._model = build_servo_model(self.robot, self.parameters, self.options.physics_step)
         self._data = mujoco.MjData(self._model)
-        constant, resistance = servo.motor_constants(
-            self.parameters["servo.stall_torque"][0], self.parameters["servo.no_load_speed"][0], self.robot.servo.supply_voltage
-        )
-        self._back_emf = constant * constant / resistance
-        self._inverse_constant = 1.0 / constant
-        self._resistance = resistance
+        stall_torque, speed = (self.parameters[f"servo.{name}"][0] for name in ("stall_torque", "no_load_speed"))
+        constant, self._resistance = servo.motor_constants(stall_torque, speed, self.robot.servo.supply_voltage)
+        self._back_emf, self._inverse_constant = constant * constant / self._resistance, 1.0 / constant
 
     def reset(
         self,
@@ -212,37 +210,16 @@ class MujocoLoopPlant:
         if parameters is not None and not np.array_equal(parameters.values, self.parameters.values):
             self.parameters = parameters.copy()
             self._build()
-        mujoco.mj_resetData(self._model, self._data)
-        self._put(standing_state(self.robot, self.parameters) if state is None else state)
-        mujoco.mj_forward(self._model, self._data)
-        self._look()
-        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
-        return self._readings
-
-    def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
-        """Change parameters in mid-run; the state stays."""
-        state = self.mechanical_state()
-        self.parameters = parameters.copy()
-        self._build()
-        self._put(state)
-
-    def _put(self, state: PlantState) -> None:
-        data = self._data
+        data, state = self._data, state or standing_state(self.robot, self.parameters)
+        mujoco.mj_resetData(self._model, data)
         data.qpos[:3], data.qpos[3:7], data.qpos[7:] = state.position[0], state.quaternion[0], state.joint_position[0, _MUJOCO]
         mujoco.mju_rotVecQuat(data.qvel[:3], state.linear_velocity_in_body[0], state.quaternion[0])
         data.qvel[3:6], data.qvel[6:] = state.angular_velocity_in_body[0], state.joint_velocity[0, _MUJOCO]
         data.act[:] = state.reference_position[0, WHEEL_SLICE]
-
-    def mechanical_state(self) -> PlantState:
-        """Return a copy of the mechanical and servo state."""
-        truth = self._truth
-        reference, speed = truth.joint_position.copy(), np.zeros((1, 8))
-        reference[0, LEG_SLICE], reference[0, WHEEL_SLICE] = self._data.ctrl[LEG_SLICE], self._data.act
-        speed[0, WHEEL_SLICE] = self._data.ctrl[WHEEL_SLICE]
-        return PlantState(
-            truth.position.copy(), truth.quaternion.copy(), truth.linear_velocity_in_body.copy(),
-            truth.angular_velocity_in_body.copy(), truth.joint_position.copy(), truth.joint_velocity.copy(), reference, speed,
-        )  # fmt: skip
+        mujoco.mj_forward(self._model, data)
+        self._look()
+        self._sensors.reset(self._raw, self._readings.values, seeds, self.parameters, mask)
+        return self._readings
 
     def step(self, setpoints: Array, torque_on: NDArray[np.bool_] | None = None) -> Sensors:
         """Advance one control tick with the servos as actuators."""
@@ -256,27 +233,21 @@ class MujocoLoopPlant:
     def _look(self) -> None:
         """Fill truth and raw sensor signals from MuJoCo's state."""
         data, truth, row = self._data, self._truth, self._truth.values[0]
-        pose, rates = data.qpos, data.qvel
-        rotation = np.empty(9)
-        mujoco.mju_quat2Mat(rotation, pose[3:7])
-        matrix = rotation.reshape(3, 3)
+        pose, rates, matrix = data.qpos, data.qvel, np.empty((3, 3))
+        mujoco.mju_quat2Mat(matrix.reshape(9), pose[3:7])
         angles, speeds = pose[7:][_CONTRACT], rates[6:][_CONTRACT]
         torque = data.qfrc_actuator[6:][_CONTRACT] - self._back_emf * speeds
-        row[_PART["position"]] = pose[:3]
-        row[_PART["quaternion"]] = pose[3:7]
+        row[_PART["position"]], row[_PART["quaternion"]] = pose[:3], pose[3:7]
         row[_PART["linear_velocity_in_body"]] = rates[:3] @ matrix
         row[_PART["angular_velocity_in_body"]] = rates[3:6]
-        row[_PART["joint_position"]] = angles
-        row[_PART["joint_velocity"]] = speeds
-        row[_PART["motor_torque"]] = torque
+        row[_PART["joint_position"]], row[_PART["joint_velocity"]], row[_PART["motor_torque"]] = angles, speeds, torque
         slip = contact_slip_velocity(
             self.parameters, truth.quaternion, truth.linear_velocity_in_body, truth.angular_velocity_in_body,
             truth.joint_position, truth.joint_velocity,
         ).reshape(8)  # fmt: skip
         period, current = self.options.control_period, torque * self._inverse_constant
         shaft_power = float(torque @ speeds)
-        row[_PART["slip_velocity"]] = slip
-        row[_PART["slip_displacement"]] = period * slip
+        row[_PART["slip_velocity"]], row[_PART["slip_displacement"]] = slip, period * slip
         row[_PART["mechanical_energy"]] = period * shaft_power
         row[_PART["electrical_energy"]] = period * (shaft_power + float(self._resistance @ (current * current)))
         row[_PART["body_clearance"]] = pose[2] - np.abs(matrix[2]) @ self._corners
