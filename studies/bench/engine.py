@@ -578,8 +578,9 @@ def _draw(axes: Axes, rows: list[dict[str, Any]], label: str, colour: str, marke
         if chosen:
             axes.plot(*zip(*map(_point, chosen), strict=True), color=colour, markersize=5, linewidth=1.2, **style)
         for one in chosen if not (is_second and usual) else ():
-            number = f", {one['iterations']}{'p' if one['side'] == 'engine' else 'i'}"
-            text = f"{1e3 * one['step']:g}{'' if usual else number}"
+            text = f"{1e3 * one['step']:g}"
+            if not usual:
+                text += f", {one['iterations']}{'p' if one['side'] == 'engine' else 'i'}"
             axes.annotate(text, _point(one), (6, -3), textcoords="offset points", fontsize=7.5, color=colour, va="center")
 
 

@@ -463,10 +463,10 @@ def markdown(report: Mapping[str, Any]) -> str:
         (kind, _share(shares["alarms"], "at most"), _share(shares["top1"], "at least"))
         for kind, shares in report["by_recording"].items()
     ]
-    confusion = [
-        (hidden, tally(dict(sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0])))))
-        for hidden, said in sorted(report["confusion"].items())
-    ]
+    confusion = []
+    for hidden, said in sorted(report["confusion"].items()):
+        ordered = sorted(said.items(), key=lambda item: (item[0] != hidden, -item[1], item[0]))
+        confusion.append((hidden, tally(dict(ordered))))
     parts = [
         [f"Sets analysed by commit: {tally(report['commits'])}."],
         markdown_table(("", "measured (95 % bound)", "target", "met"), judgements),

@@ -25,6 +25,7 @@ from wlr_gym.cli import FAILED, OK, run_program
 from wlr_gym.cli.options import ForceOption, JsonOption, RobotOption, settings_of
 from wlr_gym.cli.terminal import confirm, print_json, print_table
 from wlr_gym.data.format import RunMeta
+from wlr_gym.data.record import write_commands
 from wlr_gym.hardware.deployment import refuse_deadman
 from wlr_gym.hardware.loop import StoppedError
 from wlr_gym.hardware.operator import stop_on_request
@@ -105,7 +106,8 @@ def run(options: PaperOptions) -> int:
         if options.plots:
             tell("", "figures", _SHARES["decided"])
             report.write_figures(options.out, records, evidence, findings)
-    experiments.write_tests(options.out / "commands")
+    for test in experiments.TESTS.values():  # for wlr record --commands
+        write_commands(options.out / "commands", test.motion())
     report.write_report(options.out, robot, records, checked, findings, decisive)
     record_provenance(options.out, settings_of(options) | {"robot": robot.name}, options.seed)
     if options.json:

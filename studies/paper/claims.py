@@ -16,6 +16,7 @@ import numpy as np
 
 from studies.paper import printed, reduced
 from studies.paper.experiments import (
+    DURATION,
     LEG_SPEED,
     TESTS,
     WHEEL_ACCELERATION,
@@ -24,7 +25,6 @@ from studies.paper.experiments import (
     PaperTest,
     Record,
     drive,
-    duration,
     error_of_ignoring_slip,
     ideal_motion,
     no_slip_travel,
@@ -297,7 +297,7 @@ def _rear_stops(e: PaperEvidence) -> Finding:
     record = e.plant["test_2"]
     at = _after(record, 6.5)
     speed = float(record.joint_velocity[at, 0, 6]) * _RPM
-    said = f"{speed:.1f} rpm at 6.5 s; they stop with the front wheels at {duration():.1f} s"
+    said = f"{speed:.1f} rpm at 6.5 s; they stop with the front wheels at {DURATION:.1f} s"
     return said, _graded(abs(speed) < 1.0)
 
 

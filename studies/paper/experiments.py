@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +38,9 @@ WHEEL_SPEED = load_table("XL430-W250-T").per_count("profile_velocity") * 80
 WHEEL_ACCELERATION = load_table("XL430-W250-T").per_count("profile_acceleration")
 LEG_SPEED = load_table("XM540-W150-R").per_count("profile_velocity") * 15
 PROFILE = Profile(wheel_acceleration=WHEEL_ACCELERATION, leg_velocity=LEG_SPEED, leg_acceleration=0.0)
+#: s: when the wheels must be told to stop to end after four turns (up and down ramps are alike), and when they stand.
+STOP_TIME = 2 * math.pi * TURNS / WHEEL_SPEED
+DURATION = STOP_TIME + WHEEL_SPEED / WHEEL_ACCELERATION
 #: s per tick; s of rest before the commands, in which the robot settles on its gears, and after the wheels stopped.
 PERIOD = 0.02
 SETTLE = 1.0
@@ -72,12 +74,12 @@ class PaperTest:
 
     def motion(self) -> Motion:
         """Return the setpoints as they are written, NaN = no torque; the servos' profiles make the ramps."""
-        times = PERIOD * np.arange(round((SETTLE + duration() + AFTER) / PERIOD)) - SETTLE
+        times = PERIOD * np.arange(round((SETTLE + DURATION + AFTER) / PERIOD)) - SETTLE
         commanded = (times > -0.5 * PERIOD)[:, None]
         setpoints = np.full((len(times), 8), np.nan)
         setpoints[:, LEG_SLICE] = np.where(commanded, np.repeat(self.end, 2), np.repeat(self.start, 2))
         driven = slice(4, 8) if self.rear_driven else slice(4, 6)
-        setpoints[:, driven] = np.where(commanded[:, 0] & (times < stop_time() - 0.5 * PERIOD), WHEEL_SPEED, 0.0)[:, None]
+        setpoints[:, driven] = np.where(commanded[:, 0] & (times < STOP_TIME - 0.5 * PERIOD), WHEEL_SPEED, 0.0)[:, None]
         return Motion(self.name, setpoints, PERIOD, PROFILE)
 
 
@@ -89,27 +91,6 @@ TESTS: Mapping[str, PaperTest] = {
         "test_2", "second test: all legs turn", (_LOW, _HIGH), (_HIGH, _LOW), (13, 14, 15, 16, 17), 0.05, 0.052
     ),
 }
-
-
-def write_tests(folder: Path) -> list[Path]:
-    """Write the setpoints of both tests as command files, for ``wlr record --commands``; its runs can be replayed and compared.
-
-    Raises:
-        InputError: the folder cannot be written to.
-    """
-    from wlr_gym.data.record import write_commands
-
-    return [write_commands(folder, test.motion()) for test in TESTS.values()]
-
-
-def stop_time() -> float:
-    """When the wheels must be told to stop so that they end after :data:`TURNS` turns: s (up and down ramps are alike)."""
-    return 2 * math.pi * TURNS / WHEEL_SPEED
-
-
-def duration() -> float:
-    """Until the wheels stand: s."""
-    return stop_time() + WHEEL_SPEED / WHEEL_ACCELERATION
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,10 +436,10 @@ class IdealMotion:
 def ideal_motion(test: PaperTest, constants: PaperConstants | None = None) -> IdealMotion:
     """Return one test without slip, of a robot with these constants; None = the paper's."""
     c = constants or PaperConstants()
-    time = np.arange(-0.2, duration() + 0.5, _TICK)
+    time = np.arange(-0.2, DURATION + 0.5, _TICK)
     front, front_rate = _leg(time, test.start[0], test.end[0])
     rear, rear_rate = _leg(time, test.start[1], test.end[1])
-    turned, spin = _trapezoid(time, WHEEL_SPEED, WHEEL_SPEED / WHEEL_ACCELERATION, stop_time())
+    turned, spin = _trapezoid(time, WHEEL_SPEED, WHEEL_SPEED / WHEEL_ACCELERATION, STOP_TIME)
     p = reduced.posture(c, front, rear)
     u9 = np.zeros((len(time), 9))
     u9[:, 3], u9[:, 4], u9[:, 5:7] = front_rate, rear_rate, spin[:, None]

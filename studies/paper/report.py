@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from studies.paper import printed, slip_search
 from studies.paper.claims import CheckedClaim, PaperEvidence, claims_table, variant_row
 from studies.paper.experiments import (
+    DURATION,
     MODELS,
     REDUCED,
     TESTS,
@@ -26,7 +27,6 @@ from studies.paper.experiments import (
     IdealMotion,
     PaperTest,
     Record,
-    duration,
     error_of_ignoring_slip,
     inverse_from_record,
 )
@@ -85,7 +85,7 @@ def _panels(title: str, rows: int, columns: int, height: float = 2.4) -> tuple[F
 def _over_time(figure: Figure, axes: Panels) -> Figure:
     """Finish a figure whose panels share the time."""
     for panel in axes.flat:
-        panel.set_xlim(_FROM, duration() + 0.5)
+        panel.set_xlim(_FROM, DURATION + 0.5)
         panel.xaxis.set_major_locator(MultipleLocator(_TICK))
     for panel in axes[-1]:
         panel.set_xlabel("time (s)")

@@ -341,8 +341,9 @@ def search(
             tell(next(driven) / batches)
         _drive_again(robot, trials, threads)
         tell(next(driven) / batches)
-        matched += [trial for trial in trials if trial.matches]
-        findings += [trial.finding() for trial in trials]
+        found = [trial.finding() for trial in trials]
+        matched += [trial for trial, one in zip(trials, found, strict=True) if any(len(one.matches(r)) for r in READINGS)]
+        findings += found
     for width in (0.15, 0.05) if matched else ():  # how far do the matches reach?
         for trial in matched:
             trial.close_in(8 * draws, width)
@@ -376,14 +377,14 @@ class _Trial:
     def __init__(self, combo: Sequence[SlipCandidate], stream: np.random.Generator, draws: int) -> None:
         self.names = tuple(candidate.name for candidate in combo)
         self.dials = (*(dial for candidate in combo for dial in candidate.dials), FLOOR_DIAL)
-        self.stream = stream
-        self.seen, self.parts = np.zeros((0, len(self.dials))), list[Outcomes]()
+        self.stream, self.seen = stream, np.zeros((0, len(self.dials)))
+        self.known = Outcomes(*np.zeros((6, 0, len(TESTS))))
         self.waiting: Array = stream.uniform(size=(draws, len(self.dials)))
 
     def close_in(self, draws: int, width: float) -> None:
         """Draw near the best of every reading so far, ``width`` away in the unit cube; a few anywhere."""
-        known, size = _joined(self.parts), (draws, len(self.dials))
-        best = np.concatenate([np.argsort(known.miss(reading), kind="stable")[:_ELITE] for reading in READINGS])
+        size = (draws, len(self.dials))
+        best = np.concatenate([np.argsort(self.known.miss(reading), kind="stable")[:_ELITE] for reading in READINGS])
         near = np.abs(self.seen[self.stream.choice(best, draws)] + width * self.stream.normal(size=size))
         near = 1.0 - np.abs(1.0 - near)  # reflected at both ends
         anew = self.stream.uniform(size=draws) < _FRESH
@@ -391,16 +392,14 @@ class _Trial:
 
     def take(self, outcomes: Outcomes) -> None:
         """Take the outcomes of the waiting draws."""
-        self.seen, self.parts = np.concatenate([self.seen, self.waiting]), [*self.parts, outcomes]
-
-    @property
-    def matches(self) -> bool:
-        """Whether a draw matches, in any reading."""
-        return any(len(self.finding().matches(reading)) for reading in READINGS)
+        self.seen = np.concatenate([self.seen, self.waiting])
+        self.known = Outcomes(
+            **{name: np.concatenate([old, getattr(outcomes, name)]) for name, old in vars(self.known).items()}
+        )
 
     def finding(self) -> SearchFinding:
         """Return all there is so far."""
-        return SearchFinding(self.names, self.dials, scaled(self.dials, self.seen), _joined(self.parts))
+        return SearchFinding(self.names, self.dials, scaled(self.dials, self.seen), self.known)
 
 
 def _drive_all(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
@@ -414,24 +413,16 @@ def _drive_all(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
 
 def _drive_again(robot: Robot, trials: Sequence[_Trial], threads: int) -> None:
     """Put the exact outcomes in the place of the fast ones where these come near a match."""
-    known = [_joined(trial.parts) for trial in trials]
-    near = [np.flatnonzero(np.min([found.miss(reading) for reading in READINGS], axis=0) < _NEAR) for found in known]
-    if not any(map(len, near)):
+    near = [np.flatnonzero(np.min([one.known.miss(reading) for reading in READINGS], axis=0) < _NEAR) for one in trials]
+    again = [(trial, rows) for trial, rows in zip(trials, near, strict=True) if len(rows)]
+    if not again:
         return
-    rows = [
-        make_parameters(robot, trial.dials, scaled(trial.dials, trial.seen[rows])).values
-        for trial, rows in zip(trials, near, strict=True)
-        if len(rows)
-    ]
-    exact, start = outcomes(robot, Parameters(np.concatenate(rows)), threads), 0
-    for trial, found, rows in zip(trials, known, near, strict=True):
-        for name, values in vars(found).items():
+    robots = [make_parameters(robot, one.dials, scaled(one.dials, one.seen[rows])).values for one, rows in again]
+    exact, start = outcomes(robot, Parameters(np.concatenate(robots)), threads), 0
+    for trial, rows in again:
+        for name, values in vars(trial.known).items():
             values[rows] = getattr(exact, name)[start : start + len(rows)]
-        trial.parts, start = [found], start + len(rows)
-
-
-def _joined(parts: Sequence[Outcomes]) -> Outcomes:
-    return Outcomes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+        start += len(rows)
 
 
 # ---- what would decide -----------------------------------------------------------------------------------------------

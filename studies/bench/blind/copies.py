@@ -82,10 +82,6 @@ class Copy:
         """N."""
         return (self.mass + float(self.leg_mass.sum()) + 4 * self.wheel_mass) * self.gravity
 
-    def moved(self, **changes: Any) -> Copy:
-        """Return a copy with other numbers."""
-        return replace(self, **changes)
-
 
 def read_robot(path: Path) -> dict[str, Any]:
     """Read a robot file."""
@@ -159,7 +155,8 @@ def draw(robot: dict[str, Any], rng: np.random.Generator) -> Copy:
         return float(number) * (np.pi / 180 if unit == "deg" else 1.0)
 
     viscous = np.repeat([0.01, 0.002], 4) * np.abs(cut(8))
-    return base.moved(
+    return replace(
+        base,
         mass=relative(base.mass, "body.mass"),
         inertia=_possible(lambda: relative(base.inertia, "body.inertia", 3)),
         com=base.com + absolute("body.com_offset") * cut(3),
@@ -190,7 +187,8 @@ def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
     def drawn(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
-    return copy.moved(
+    return replace(
+        copy,
         floor_creep=drawn(*YIELDING_FLOOR),
         gear_creep=drawn(*YIELDING_GEAR),
         normal_stiffness=copy.normal_stiffness * drawn(*SOFTNESS),
@@ -211,7 +209,7 @@ def _waves(height: float, rng: np.random.Generator) -> Array:
 def with_body_of(copy: Copy, other: Copy) -> Copy:
     """Return ``other`` with what the sensors and clocks of ``copy`` have: biases, the camera's age, the commands' delay."""
     kept = ("camera_age", "command_delay", "gyro_bias", "accel_bias")
-    return other.moved(**{name: getattr(copy, name) for name in kept})
+    return replace(other, **{name: getattr(copy, name) for name in kept})
 
 
 def _possible(attempt: Any) -> Array:

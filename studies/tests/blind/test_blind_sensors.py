@@ -1,5 +1,7 @@
 """The blind tests' sensors against what their specification says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -27,7 +29,7 @@ def moving(seconds: float = 20.0, yaw_rate: float = 0.2) -> np.ndarray:
 
 
 def log(records, effects=(), seed=0, **copy_numbers) -> pd.DataFrame:
-    copy, rng = nominal(ROBOT).moved(**copy_numbers), np.random.default_rng(seed)
+    copy, rng = replace(nominal(ROBOT), **copy_numbers), np.random.default_rng(seed)
     times = drive.ticks((len(records) - 1) / 1000 - 0.1, 50.0, rng)
     setpoints = np.zeros((len(times), 8))
     return drive.log(records, times, setpoints, copy, hide(effects), ROBOT, rng)

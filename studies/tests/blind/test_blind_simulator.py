@@ -1,6 +1,7 @@
 """The blind tests' own simulator against closed forms: it must be right before it may judge anybody."""
 
 import ast
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,7 +110,7 @@ def test_creep_speed_under_a_steady_pull():
 def test_a_flattened_tyre_rolls_on_less_than_its_radius():
     """On the radius at rest, less the share of what a load presses it deeper."""
     share, load = 0.5, effect("payload", ["body"], mass=1.5, x=0.0, y=0.0, z=0.0)
-    copy = nominal(ROBOT).moved(flattening=share)
+    copy = replace(nominal(ROBOT), flattening=share)
     for loads, deeper in (((), 0.0), ((load,), 1.5 * GRAVITY / 4 / 7400)):
         records = simulate(np.full(4, 4.0), 2.0, loads, copy)
         rolled = np.ptp(records[1000:, 0]) / np.ptp(records[1000:, 11:15], axis=0).mean()
@@ -122,7 +123,7 @@ def test_an_uneven_floor_carries_where_it_is():
     waves = np.zeros((8, 4))
     waves[0] = height, number, 0.0, 0.0
     waves[1] = 2 * height, 0.0, 0.0, np.pi / 2
-    records = simulate(np.zeros(4), 0.5, copy=nominal(ROBOT).moved(floor_waves=waves))
+    records = simulate(np.zeros(4), 0.5, copy=replace(nominal(ROBOT), floor_waves=waves))
     flat = simulate(np.zeros(4), 0.5)
     assert records[-1, 2] - flat[-1, 2] == pytest.approx(2 * height, rel=1e-3)
     pitch = -2 * records[-1, 5]  # nose up where the floor rises along x
@@ -162,7 +163,7 @@ def lifted() -> Copy:
     copy = nominal(ROBOT)
     radius = copy.radius.copy()
     radius[0] = 0.02
-    return copy.moved(radius=radius, com=np.array([-0.06, -0.06, 0.0]))
+    return replace(copy, radius=radius, com=np.array([-0.06, -0.06, 0.0]))
 
 
 def test_free_wheel_answers_a_step_as_a_dc_motor():

@@ -8,13 +8,13 @@ import pytest
 
 from studies.paper import printed
 from studies.paper.experiments import (
+    DURATION,
     LEG_SPEED,
+    STOP_TIME,
     TESTS,
     WHEEL_ACCELERATION,
     WHEEL_SPEED,
-    duration,
     ideal_motion,
-    stop_time,
 )
 from studies.paper.quantities import PaperConstants
 
@@ -30,7 +30,7 @@ def test_commands_are_whole_register_counts():
     assert pytest.approx(80 * 0.229) == WHEEL_SPEED * RPM
     assert pytest.approx(214.577) == WHEEL_ACCELERATION * 3600 / (2 * math.pi)
     assert pytest.approx(15 * 0.229) == LEG_SPEED * RPM
-    assert duration() == pytest.approx(18.223, abs=1e-3)
+    assert pytest.approx(18.223, abs=1e-3) == DURATION
     assert math.radians(120) / LEG_SPEED == pytest.approx(5.8224, abs=1e-4)
 
 
@@ -42,7 +42,7 @@ def test_goals_are_what_the_paper_commands():
         np.testing.assert_allclose(np.degrees(setpoints[rest - 1, :4]), np.degrees(np.repeat(test.start, 2)))
         np.testing.assert_allclose(np.degrees(setpoints[rest, :4]), np.degrees(np.repeat(test.end, 2)))
         driving = setpoints[:, 4] > 0.0
-        assert driving.sum() * 0.02 == pytest.approx(stop_time(), abs=0.01)
+        assert driving.sum() * 0.02 == pytest.approx(STOP_TIME, abs=0.01)
         assert set(setpoints[driving, 4]) == {WHEEL_SPEED}
 
 
