@@ -249,10 +249,10 @@ def _kept(plan: Plan, cases: Sequence[BlindCase]) -> dict[str, dict[str, Any]]:
     """
     found = {}
     for one in cases:
-        if plan.result_file(one).is_file():
-            found[one.name] = read_result(plan.result_file(one))
-            advice = "use another --out, or delete the file to analyse the set again"
-            _check_origin(plan, one, found[one.name], plan.result_file(one), advice)
+        file = plan.result_file(one)
+        if file.is_file():
+            found[one.name] = read_result(file)
+            _check_origin(plan, one, found[one.name], file, "use another --out, or delete the file to analyse the set again")
     return found
 
 

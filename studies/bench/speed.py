@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -214,7 +215,9 @@ class Deviation:
     percentile_90: float
     worst: float
 
-    as_dict = asdict
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain JSON types."""
+        return asdict(self)
 
 
 def measure_convergence(size: Size) -> list[Deviation]:

@@ -478,9 +478,10 @@ def _centre_error(camera: Camera, look: Look, seed: int) -> float:
     radii = np.array(ring_radii(code))
     circles = np.array([[0.0, 0.0, *(radius * radii)]])
     facet = Facet(np.zeros(3), np.eye(3)[:2], (0.05, 0.05), 225.0, circles=circles).moved(centre, rotation)
-    corner, seen = np.round(project(camera, centre[None])[0]) - 60, (2 * 60, 2 * 60)  # only the pixels around it are drawn
+    half = 60  # px: only so many around the centre are drawn
+    corner = np.round(project(camera, centre[None])[0]) - half
     shifted = (camera.centre[0] - corner[0], camera.centre[1] - corner[1])
-    crop = camera.model_copy(update={"width": seen[0], "height": seen[1], "centre": shifted})
+    crop = camera.model_copy(update={"width": 2 * half, "height": 2 * half, "centre": shifted})
     image = Renderer(crop, ScenePose(np.zeros(3), np.eye(3)), []).frame([[facet]], look, seed)
     middle = project(camera, centre[None])[0] - corner + rng.uniform(-1, 1, 2)
     edge = project(camera, centre + radius * rotation[:, :2].T) - project(camera, centre[None])

@@ -89,7 +89,7 @@ class Equation:
     """One equation of the paper.
 
     Attributes:
-        number, title, section: in the paper. verdicts: of the words above.
+        number, title: in the paper. verdicts: of the words above.
         remark: what is right or wrong with it, in a sentence.
         correction: the right form, as text.
         printed, repaired, corrected: functions; ``repaired`` is None where nothing, or only a last bracket, is misprinted.
@@ -97,7 +97,6 @@ class Equation:
 
     number: int
     title: str
-    section: str
     verdicts: tuple[str, ...]
     remark: str
     correction: str
@@ -106,7 +105,8 @@ class Equation:
     repaired: Callable[..., Any] | None = None
 
 
-def _rows() -> list[tuple[int, str, str, tuple[str, ...], str, str]]:
+def _rows() -> list[tuple[int, str, tuple[str, ...], str, str]]:
+    wheels = ("right front wheel", "left front wheel", "right rear wheel", "left rear wheel")
     slip = (
         "called the wheel's velocity, it is (contact point) - (slip): 0 on every true motion; leg and pitch rates are missing"
     )
@@ -122,74 +122,67 @@ def _rows() -> list[tuple[int, str, str, tuple[str, ...], str, str]]:
     no_inertia = f"{denominator}; lost sgn(y'); lateral inertia dropped; = left side of (18) again, not a force"
     lateral = "the rows of y and th give it: F_f + F_r = inertia of y, X_f F_f + X_r F_r = inertia of th - moment of the F_x,i"
     return [
-        (1, "velocity of a wheel centre", "3.1", (CORRECT,), "relative velocity taken in the yaw frame", "as printed"),
+        (1, "velocity of a wheel centre", (CORRECT,), "relative velocity taken in the yaw frame", "as printed"),
         (
-            2, "velocity of the body", "3.1", (CONDITIONAL,),
+            2, "velocity of the body", (CONDITIONAL,),
             "true for components of the yaw frame only, which is not said",
             "x' = X' cos th + Y' sin th, y' = Y' cos th - X' sin th",
         ),
-        (3, "right front wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
-        (4, "left front wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
-        (5, "right rear wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
-        (6, "left rear wheel", "3.1", (CONDITIONAL, INCOMPLETE), slip, true_slip),
+        *((n, wheel, (CONDITIONAL, INCOMPLETE), slip, true_slip) for n, wheel in enumerate(wheels, 3)),
         (
-            7, "Gibbs function of the wheels", "3.2", (CONDITIONAL, INCOMPLETE),
+            7, "Gibbs function of the wheels", (CONDITIONAL, INCOMPLETE),
             "right for absolute wheel angles; wheel mass and diametral inertia are missing",
             "I_o/2 (th_i'' + leg'' + psi'')^2 + J_w/2 th_i''^2 + I_t/2 th''^2 + m_w/2 a_i^2",
         ),
         (
-            8, "Gibbs function of the legs", "3.2", (WRONG,),
+            8, "Gibbs function of the legs", (WRONG,),
             "leg spin and angle are relative, velocity terms missing, a_i is the residual of (3)-(6), not a leg's acceleration",
             "absolute alpha'' + psi'', cos^2(alpha + psi), I_along sin^2, coupling terms, acceleration of the mid-leg point",
         ),
         (
-            9, "Gibbs function of the body", "3.2", (MISPRINT, INCOMPLETE),
+            9, "Gibbs function of the body", (MISPRINT, INCOMPLETE),
             "Psi'^2 for Psi''^2; inertia about x and velocity terms of a pitched body are missing",
             "I_yaw = I_Gx sin^2 psi + I_Gz cos^2 psi; + I_yaw' psi' th' th'' - I_yaw'/2 th'^2 psi''",
         ),
-        (10, "Gibbs function", "3.2", (INCOMPLETE, WRONG), "sum of (7)-(9), Psi''^2 right; has their faults", "sum of them"),
+        (10, "Gibbs function", (INCOMPLETE, WRONG), "sum of (7)-(9), Psi''^2 right; has their faults", "sum of them"),
         (
-            11, "acceleration of the body", "3.2", (WRONG,),
+            11, "acceleration of the body", (WRONG,),
             "drops -th' y': true without lateral velocity only", "(x'' - th' y') i + (y'' + th' x') j + z'' k",
         ),
         (
-            12, "potential", "3.2", (MISPRINT,),
+            12, "potential", (MISPRINT,),
             "legs' term without psi; and psi must be eliminated before differentiating",
             "V = g l (m_l + M_G/2)(sin(alpha + psi) + sin(beta + psi)) + constants",
         ),
         (
-            13, "Dahl friction", "3.2", (INCOMPLETE,), "state equation missing; sigma_0 is a stiffness, not a roughness",
+            13, "Dahl friction", (INCOMPLETE,), "state equation missing; sigma_0 is a stiffness, not a roughness",
             "F = -sigma_0 z, z' = v - sigma_0 |v| z/(mu F_n)",
         ),
         (
-            14, "Coulomb friction", "3.2", (CONDITIONAL,),
+            14, "Coulomb friction", (CONDITIONAL,),
             "steady sliding limit of (13), with v the slip velocity, not the wheel's; says nothing of sticking",
             "F = -mu F_n s/|s| for slip s; |F| <= mu F_n at rest",
         ),
         (
-            15, "dissipation", "3.2", (MISPRINT, CONDITIONAL),
+            15, "dissipation", (MISPRINT, CONDITIONAL),
             "bracket after mu_dx is not closed; adds x and y to a square: up to sqrt(2) mu F_n",
             "sum F_n sqrt((mu_x x_s')^2 + (mu_y y_s')^2), F_n not differentiated",
         ),
-        (16, "normal force in front", "3.2", (CORRECT,), "at rest, mass of the leg at mid-leg, massless wheels", "+ m_w g"),
-        (17, "normal force behind", "3.2", (CORRECT,), "likewise", "+ m_w g"),
-        (18, "Gibbs-Appell with slip", "3.2", (CORRECT,), "for slip coordinates the right side is 0", "as printed"),
+        (16, "normal force in front", (CORRECT,), "at rest, mass of the leg at mid-leg, massless wheels", "+ m_w g"),
+        (17, "normal force behind", (CORRECT,), "likewise", "+ m_w g"),
+        (18, "Gibbs-Appell with slip", (CORRECT,), "for slip coordinates the right side is 0", "as printed"),
         (
-            19, "torque of the front legs", "3.2", (MISPRINT, INCOMPLETE, WRONG),
+            19, "torque of the front legs", (MISPRINT, INCOMPLETE, WRONG),
             "z-part lost a factor 2 and has the leg inside its 1/2; gravity, normal forces and traction are missing",
             "tau_alpha = 2 (J_l + I_o + J_h) alpha'' + ... + 2 l cos f (N_f - m_l g/2) + (l sin f + a)(F_rf + F_lf)",
         ),
-        (20, "torque of the rear legs", "3.2", (MISPRINT, INCOMPLETE, WRONG), "as (19)", "as (19) with beta"),
-        (21, "torque of the right front wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
-        (22, "torque of the left front wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
-        (23, "torque of the right rear wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
-        (24, "torque of the left rear wheel", "3.2", (MISPRINT, WRONG), torque, true_torque),
-        (25, "force on the right front wheel", "3.2", (MISPRINT, WRONG), force, true_force),
-        (26, "force on the left front wheel", "3.2", (MISPRINT, WRONG), force, true_force),
-        (27, "force on the right rear wheel", "3.2", (MISPRINT, WRONG), f"sign of th'' l_y; {force}", true_force),
-        (28, "force on the left rear wheel", "3.2", (MISPRINT, WRONG), f"{denominator}; {force}", true_force),
-        (29, "lateral force in front", "3.2", (MISPRINT, INCOMPLETE, WRONG), no_inertia, lateral),
-        (30, "lateral force behind", "3.2", (MISPRINT, INCOMPLETE, WRONG), no_inertia, lateral),
+        (20, "torque of the rear legs", (MISPRINT, INCOMPLETE, WRONG), "as (19)", "as (19) with beta"),
+        *((n, f"torque of the {wheel}", (MISPRINT, WRONG), torque, true_torque) for n, wheel in enumerate(wheels, 21)),
+        *((n, f"force on the {wheel}", (MISPRINT, WRONG), force, true_force) for n, wheel in enumerate(wheels[:2], 25)),
+        (27, "force on the right rear wheel", (MISPRINT, WRONG), f"sign of th'' l_y; {force}", true_force),
+        (28, "force on the left rear wheel", (MISPRINT, WRONG), f"{denominator}; {force}", true_force),
+        (29, "lateral force in front", (MISPRINT, INCOMPLETE, WRONG), no_inertia, lateral),
+        (30, "lateral force behind", (MISPRINT, INCOMPLETE, WRONG), no_inertia, lateral),
     ]  # fmt: skip
 
 
