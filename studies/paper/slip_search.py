@@ -89,61 +89,42 @@ class SlipCandidate:
     dials: tuple[Dial, ...]
 
 
-def _each(effect: str, parameter: str, places: Sequence[str], low: float, high: float) -> tuple[Dial, ...]:
-    return tuple(Dial(effect, (place,), parameter, low, high) for place in places)
+def _candidate(name: str, doc: str, *ranges: tuple[str, str, Sequence[str], float, float]) -> SlipCandidate:
+    """A candidate of ranges: effect, parameter, places with a number each, low, high."""
+    dials = (Dial(effect, (place,), number, low, high) for effect, number, places, low, high in ranges for place in places)
+    return SlipCandidate(name, doc, tuple(dials))
 
 
 _FRONT = ("wheel_lf", "wheel_rf")
 _REAR = ("wheel_lr", "wheel_rr")
 _ALL = (*_FRONT, *_REAR)
+_BODY = ("body",)
 CANDIDATES: tuple[SlipCandidate, ...] = (
-    SlipCandidate(
-        "rear drag", "gears of the free rear wheels, each its own", _each("coulomb_friction", "torque", _REAR, 0.0, 0.2)
+    _candidate("rear drag", "gears of the free rear wheels, each its own", ("coulomb_friction", "torque", _REAR, 0.0, 0.2)),
+    _candidate("radius", "tyres of the front wheels, each its own", ("wheel_radius_error", "scale", _FRONT, 0.9, 1.1)),
+    _candidate("creep", "tyres that creep under load, each its own", ("tyre_creep", "creep_speed", _ALL, 0.0, 0.1)),
+    _candidate("grip", "wheels on unequal floor or tread", ("friction_asymmetry", "mu", _ALL, 0.1, 1.0)),
+    _candidate("rolling", "rolling resistance, each wheel its own", ("rolling_resistance", "coefficient", _ALL, 0.0, 0.15)),
+    _candidate("zeros", "zeros of the leg encoders", ("joint_zero_offset", "angle", LEGS, -0.1, 0.1)),
+    _candidate(
+        "load", "centre of mass, and the power source that the paper's 3 kg leave out",
+        ("com_offset", "x", _BODY, -0.05, 0.05), ("com_offset", "y", _BODY, -0.05, 0.05), ("payload", "mass", _BODY, 0.0, 1.0),
     ),
-    SlipCandidate("radius", "tyres of the front wheels, each its own", _each("wheel_radius_error", "scale", _FRONT, 0.9, 1.1)),
-    SlipCandidate("creep", "tyres that creep under load, each its own", _each("tyre_creep", "creep_speed", _ALL, 0.0, 0.1)),
-    SlipCandidate("grip", "wheels on unequal floor or tread", _each("friction_asymmetry", "mu", _ALL, 0.1, 1.0)),
-    SlipCandidate(
-        "rolling", "rolling resistance, each wheel its own", _each("rolling_resistance", "coefficient", _ALL, 0.0, 0.15)
+    _candidate(
+        "pull", "slope of the floor and pull of cables",
+        ("external_force", "fx", _BODY, -3.0, 3.0), ("external_force", "fy", _BODY, -3.0, 3.0),
+        ("floor_slope", "pitch", ("ground",), -0.03, 0.03), ("floor_slope", "roll", ("ground",), -0.03, 0.03),
     ),
-    SlipCandidate("zeros", "zeros of the leg encoders", _each("joint_zero_offset", "angle", LEGS, -0.1, 0.1)),
-    SlipCandidate(
-        "load",
-        "centre of mass, and the power source that the paper's 3 kg leave out",
-        (
-            Dial("com_offset", ("body",), "x", -0.05, 0.05),
-            Dial("com_offset", ("body",), "y", -0.05, 0.05),
-            Dial("payload", ("body",), "mass", 0.0, 1.0),
-        ),
+    _candidate(
+        "servo", "delay, play and torque of the front wheels' servos",
+        ("command_delay", "delay", _FRONT, 0.0, 0.06), ("backlash", "angle", _FRONT, 0.0, 0.1),
+        ("weak_motor", "scale", _FRONT, 0.3, 1.0),
     ),
-    SlipCandidate(
-        "pull",
-        "slope of the floor and pull of cables",
-        (
-            Dial("external_force", ("body",), "fx", -3.0, 3.0),
-            Dial("external_force", ("body",), "fy", -3.0, 3.0),
-            Dial("floor_slope", ("ground",), "pitch", -0.03, 0.03),
-            Dial("floor_slope", ("ground",), "roll", -0.03, 0.03),
-        ),
+    _candidate(
+        "camera", "camera's frame turned against the start heading, and scaled",
+        ("camera_misalignment", "yaw", ("sensor",), -0.1, 0.1), ("camera_misalignment", "scale", ("sensor",), 0.9, 1.1),
     ),
-    SlipCandidate(
-        "servo",
-        "delay, play and torque of the front wheels' servos",
-        (
-            *_each("command_delay", "delay", _FRONT, 0.0, 0.06),
-            *_each("backlash", "angle", _FRONT, 0.0, 0.1),
-            *_each("weak_motor", "scale", _FRONT, 0.3, 1.0),
-        ),
-    ),
-    SlipCandidate(
-        "camera",
-        "camera's frame turned against the start heading, and scaled",
-        (
-            Dial("camera_misalignment", ("sensor",), "yaw", -0.1, 0.1),
-            Dial("camera_misalignment", ("sensor",), "scale", 0.9, 1.1),
-        ),
-    ),
-)
+)  # fmt: skip
 #: The paper gives no coefficient of the floor; every draw has one of its own.
 FLOOR_DIAL = Dial("friction_level", ("ground",), "mu", 0.3, 0.9)
 
