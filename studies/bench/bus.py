@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from studies.bench.measure import Measurement, Size, interleave
+from studies.bench.measure import Measurement, Size, interleave, rate
 from wlr_gym.base.errors import require_package
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.hardware.camera.reading import CameraFile, load_camera_file
@@ -83,7 +83,7 @@ def _measure_cycle(size: Size) -> list[Measurement]:
         }
         latency = [[1e6 * delay() for _ in range(cycles)] for _ in range(size.rounds)]
     what = "bus cycle, 8 servos, 2 buses, SI values"
-    per_cycle = tuple(1e6 / rate for rate in rates["wall"]["ours"])
+    per_cycle = tuple(1e6 / one for one in rates["wall"]["ours"])
     return [
         Measurement("bus", what, "1/s", rates["wall"]["ours"], rates["wall"]["peer"], _PEER),
         Measurement("bus", f"{what}, processor time", "1/s", rates["processor"]["ours"], rates["processor"]["peer"], _PEER),
@@ -134,13 +134,11 @@ def drive_in_real_time(seconds: int, words: Sequence[str]) -> dict[str, Any]:
 
 
 def _rate(cycle: Cycle, count: int, clock: Callable[[], float]) -> Callable[[], float]:
-    def run() -> float:
-        start = clock()
+    def cycles() -> None:
         for _ in range(count):
             cycle()
-        return count / max(clock() - start, 1e-9)
 
-    return run
+    return lambda: rate(cycles, count, clock)
 
 
 # ---- the contenders --------------------------------------------------------------------------------------------------

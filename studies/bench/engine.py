@@ -18,7 +18,7 @@ import mujoco.rollout
 import numpy as np
 from numpy.typing import NDArray
 
-from studies.bench.measure import Measurement, Size, interleave, summary
+from studies.bench.measure import Measurement, Size, interleave, rate, summary
 from studies.bench.mujoco_loop import VIRTUAL_MASS_DIVISOR, Contact, ServoBatch, build_servo_model, servo_controls
 from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
 from wlr_gym.physics.model.dynamics import rotation_matrix
@@ -228,14 +228,6 @@ class Reference:
     convergence: Array
     closed_form: dict[str, float]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what is said about it."""
-        return {
-            "disagreement": {"median": float(np.median(self.disagreement)), "max": float(self.disagreement.max())},
-            "convergence": {"median": float(np.median(self.convergence)), "max": float(self.convergence.max())},
-            "closed_form": self.closed_form,
-        }
-
 
 @dataclass(frozen=True)
 class EngineReport:
@@ -246,7 +238,11 @@ class EngineReport:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
-        return {"reference": self.reference.as_dict(), "settings": [result.as_dict() for result in self.results]}
+        said: dict[str, Any] = {"closed_form": self.reference.closed_form}
+        for name in ("disagreement", "convergence"):
+            apart = getattr(self.reference, name)
+            said[name] = {"median": float(np.median(apart)), "max": float(apart.max())}
+        return {"reference": said, "settings": [result.as_dict() for result in self.results]}
 
 
 def settings(*, quick: bool = False) -> list[EngineSetting]:
@@ -362,11 +358,9 @@ def prepare(setting: EngineSetting, chosen: list[BenchMotion], copies: int) -> R
     return _rollout_run(setting, chosen) if setting.call == "rollout" else _batch_run(setting, chosen)
 
 
-def _timed(work: Callable[[], object], simulated: float, threads: int) -> float:
-    clock = time.process_time if threads == 1 else time.perf_counter
-    begin = clock()
-    work()
-    return simulated / (clock() - begin)
+def _clock(threads: int) -> Callable[[], float]:
+    """Processor time of one thread; of several the time that passes."""
+    return time.process_time if threads == 1 else time.perf_counter
 
 
 def _engine_run(setting: EngineSetting, chosen: list[BenchMotion], copies: int) -> Run:
@@ -382,7 +376,7 @@ def _engine_run(setting: EngineSetting, chosen: list[BenchMotion], copies: int) 
 
     def run() -> tuple[Array, float]:
         plant.reset(parameters=parameters, state=state)
-        speed = _timed(drive, len(many) * len(setpoints) * PERIOD, setting.threads)
+        speed = rate(drive, len(many) * len(setpoints) * PERIOD, _clock(setting.threads))
         return _pose(plant)[: len(chosen)], speed
 
     return run
@@ -409,7 +403,7 @@ def _batch_run(setting: EngineSetting, chosen: list[BenchMotion]) -> Run:
 
     def run() -> tuple[Array, float]:
         batch.reset(state)
-        speed = _timed(drive, len(chosen) * len(setpoints) * PERIOD, setting.threads)
+        speed = rate(drive, len(chosen) * len(setpoints) * PERIOD, _clock(setting.threads))
         return batch.position[:, :7].copy(), speed
 
     return run
@@ -437,7 +431,7 @@ def _rollout_run(setting: EngineSetting, chosen: list[BenchMotion]) -> Run:
             def drive() -> None:
                 pool.rollout(models, workers, initial, controls, state=states, sensordata=sensed)
 
-            speed = _timed(drive, len(chosen) * controls.shape[1] * setting.step, setting.threads)
+            speed = rate(drive, len(chosen) * controls.shape[1] * setting.step, _clock(setting.threads))
         return states[:, -1, 1:8].copy(), speed
 
     return run

@@ -417,8 +417,9 @@ def judged(what: str, numbers: Mapping[str, Any], side: Side, target: float | No
     is_share = "share" in numbers
     found = numbers["share" if is_share else "median"]
     bound = numbers["bound95" if is_share else {"at least": "at_least95", "at most": "at_most95"}[side]]
-    reaches = operator.ge if side == "at least" else operator.le
-    goal = "" if target is None else f"{'>=' if side == 'at least' else '<='} {target:{'.0%' if is_share else 'g'}}"
+    reaches, sign = (operator.ge, ">=") if side == "at least" else (operator.le, "<=")
+    form = ".0%" if is_share else "g"
+    goal = "" if target is None else f"{sign} {target:{form}}"
     if not numbers["count"]:
         return ScoreLine(what, "-", goal)
     if is_share:

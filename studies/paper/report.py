@@ -228,7 +228,8 @@ def slip_figure(records: Sequence[Record], ideal: IdealMotion) -> Figure:
 def question_figure(findings: Sequence[SearchFinding]) -> Figure:
     """How near departures from the nominal robot come to the paper's four numbers: one at a time, and the best combinations."""
     nearest = sorted(findings, key=lambda finding: min(map(finding.closest, READINGS)))
-    alone, meaning = [finding for finding in nearest if len(finding.names) == 1], {one.name: one.doc for one in CANDIDATES}
+    alone = [finding for finding in nearest if len(finding.names) == 1]
+    meaning = {candidate.name: candidate.doc for candidate in CANDIDATES}
     together = [finding for finding in nearest if len(finding.names) > 1][:_COMBINATIONS]
     groups = [
         ("one departure, and what it is", alone, [f"{finding.label}: {meaning[finding.label]}" for finding in alone]),

@@ -39,14 +39,10 @@ def refuses_and_fails(folder: Path, out: Path):
 def finished(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(Path(__file__).parent))
-        yield _finish(tmp_path_factory)
-
-
-def _finish(tmp_path_factory):
-    plan = gap.Plan(tmp_path_factory.mktemp("blind"), sets=2, processes=1, runs=(6,), keep_data=True)
-    said: list[str] = []
-    report = gap.run_blind_test(plan, "test_blind_bench:answers_nothing", said.append)
-    return plan, report, said
+        plan = gap.Plan(tmp_path_factory.mktemp("blind"), sets=2, processes=1, runs=(6,), keep_data=True)
+        said: list[str] = []
+        report = gap.run_blind_test(plan, "test_blind_bench:answers_nothing", said.append)
+        yield plan, report, said
 
 
 @pytest.mark.slow
