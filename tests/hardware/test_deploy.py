@@ -534,7 +534,7 @@ def test_an_emulated_robot_has_every_port_of_the_file(tmp_path):
         content["buses"][name] = {**legs, "port": f"/dev/real_{name}", "joints": joints}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
     options = DeployOptions("pid", hardware=str(tmp_path / "mine.yaml"), emulated=True)
-    with _emulator(options, Console(stderr=True)) as ports:
+    with _emulator(options, Console(stderr=True)) as (ports, _):
         wired = with_ports(load_hardware(options.hardware), ports)
         assert set(ports) == {"wheels", "front", "rear", "imu"}
         assert all("wlr-robot-" in bus.port for bus in (*wired.buses.values(), wired.imu))

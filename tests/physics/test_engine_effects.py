@@ -280,7 +280,7 @@ def floor(mu, mu_y=None, **more):
     return {f"ground.{name}": value for name, value in numbers.items()}
 
 
-def patch(place, mu, x=(-50.0, 50.0), y=(-50.0, 50.0), robots=slice(None)):
+def patch(place, mu, x=(-50.0, 50.0), y=(-50.0, 50.0), robots: int | slice = slice(None)):
     """Lay a patch of other friction into a place of the table."""
 
     def edit(parameters):
