@@ -37,6 +37,11 @@ def test_json_has_no_numbers_that_are_not_finite(capsys):
         print_json(object())
 
 
+def test_json_is_ascii(capsys):
+    print_json({"robot": "Räder"})
+    assert capsys.readouterr().out.isascii()
+
+
 def test_only_results_reach_the_standard_output(capsys):
     with only_results(True):
         print("a message")

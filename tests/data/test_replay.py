@@ -16,7 +16,7 @@ from wlr_gym import cli
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import Profile, Run, RunMeta, read_run
 from wlr_gym.data.format import CHANNELS
-from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay
+from wlr_gym.data.replay import ReplayResult, held_setpoints, profile_parameters, replay, save_plots
 from wlr_gym.data.run_states import camera_pose, euler_angles, local_fit, quaternion, rest_pose
 from wlr_gym.data.runs import note_robot, robot_of
 from wlr_gym.data.sensors import channel_noise
@@ -177,12 +177,13 @@ def test_replay_is_reproducible_and_does_not_touch_the_run():
     pandas.testing.assert_frame_equal(run.table, before)
 
 
-def test_only_required_columns_are_enough():
+def test_only_required_columns_are_enough(tmp_path):
     run = simulated_run([], [10])
     names = [name for name in run.table if name == "t" or name.startswith(("cmd", "pos"))]
     result = replay(Run(run.table.loc[:, names], META, run.path))
     assert {name[:3] for name in result.errors} == {"pos"}
     assert worst(result, "pos") < 0.5
+    assert [path.name for path in save_plots(result, tmp_path)] == [f"{run.path.stem}_joints.png"]
 
 
 # --- a run of another simulator of the same robot ---------------------------------------------------------------------

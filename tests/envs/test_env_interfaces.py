@@ -82,6 +82,12 @@ def test_every_option_is_described():
     assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == names
 
 
+def test_options_are_keywords():
+    options = EnvironmentOptions(plant="mujoco", episode_length=3.0)
+    assert dict(**options) == {"backend": "mujoco", "episode_length": 3.0}
+    assert EnvironmentOptions(**options) == EnvironmentOptions(backend="mujoco", episode_length=3.0)
+
+
 def test_the_second_word_for_the_backend(fake):
     assert make(plant="mujoco").core.settings.backend == "mujoco"
     assert make_vec(2, plant="mujoco", backend="mujoco").core.settings.backend == "mujoco"

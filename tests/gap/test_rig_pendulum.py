@@ -23,6 +23,7 @@ from wlr_gym.gap.rig.pendulum import (
     ENCODER_NOISE,
     GOAL_LEAD,
     JOINT,
+    NO_TORQUE_LIMIT,
     QUANTITIES,
     RIG_EFFECTS,
     PendulumProblem,
@@ -454,6 +455,21 @@ def test_opening_leaves_out_what_cannot_be_used(made, tmp_path):
     assert problem is None
     assert found[-1].kind == "few_runs"
     assert found[-1].fatal
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes", "number", "together"),
+    [
+        ("load_dependent_friction", ({"ratio": 0.08}, {"ratio": 0.07}), "load_friction", 0.15),
+        ("weak_motor", ({"scale": 0.9}, {"scale": 0.8}), "torque_scale", 0.72),
+        ("torque_limit", ({"torque": 0.5}, {"torque": 0.4}), "torque_limit", 0.4),
+    ],
+)
+def test_a_law_given_twice_acts_twice(name, sizes, number, together):
+    numbers = {"load_friction": 0.0, "torque_scale": 1.0, "torque_limit": NO_TORQUE_LIMIT}
+    for parameters in sizes:
+        RIG_EFFECTS[name].apply(numbers, PatchEffect(name, (), parameters))
+    assert numbers[number] == pytest.approx(together)
 
 
 def test_the_patch_that_an_analysis_of_the_rig_writes_can_be_given_back(made, tmp_path):

@@ -57,6 +57,7 @@ def edited(tmp_path, edit):
             lambda d: d["buses"]["legs"]["joints"].append("wheel_fr"),
             r"buses.legs.joints: .*'wheel_fr' \(did you mean 'wheel_rf'",
         ),
+        (lambda d: d["buses"].update(imu=d["buses"].pop("legs")), r"buses.imu: a sensor is called that"),
         (lambda d: d["safety"].update(warm=70), r"yaml: safety.warm = 70 degC: expected below hot = 68 degC$"),
         (lambda d: d["safety"].update(leg_error=0.6), r"yaml: safety.leg_error = 0.6 rad: expected below leg_lead = 0.45 rad"),
         (lambda d: d["safety"].update(leg_margin=3), r"yaml: safety.leg_margin = 3: expected 0.5 or less \(rad\)$"),

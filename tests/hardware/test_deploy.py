@@ -327,7 +327,7 @@ def test_command_line_dry_run(tmp_path):
         (["--seed", "-1"], "--seed -1"),
         (["--deadman", "0"], "--deadman 0"),
         (["--deadman", "nan"], "--deadman nan"),
-        (["--deadman", "300"], "--deadman 300: expected more than 0 and 10 at most s"),
+        (["--deadman", "300"], "--deadman 300: expected more than 0 and at most 10 s"),
         (["--command", "yaw_rate=nan"], "--command: yaw_rate = nan: expected -"),
         (["--command", "speed"], "--command speed: expected name=value, such as yaw_rate=0.1"),
         (["--command", "yaw_rate=fast"], "expected name=number"),

@@ -103,6 +103,15 @@ def test_numbers_of_a_foreign_urdf():
     assert "armature" not in numbers["servo"]["leg"]
 
 
+def test_links_may_be_called_anything():
+    """A file in which a macro's ``${prefix}`` was not filled in."""
+    text = foreign()
+    body = re.search(r'<link name="(\w+)"', text)
+    assert body is not None
+    named = text.replace(f'"{body[1]}"', f'"${{prefix}}{body[1]}"')
+    assert read(named).numbers["body"] == read(text).numbers["body"]
+
+
 def test_a_joint_that_turns_the_other_way_round():
     """Axis -y: the limits of the file, seen from the other side, and the sign."""
     one = {"axis": "0 -1 0", "more": LIMITS.replace('lower="-1" upper="1.2"', 'lower="-1.2" upper="1"')}

@@ -93,7 +93,8 @@ def check_number(
         if inside:
             return
     shown = f"{value:g}" if isinstance(value, float) else repr(value)
-    wanted = " ".join(filter(None, (_range(above, least, most, below, whole), unit)))
+    kind = "a whole number" if whole else "a finite number" if isinstance(value, float) and not math.isfinite(value) else ""
+    wanted = " ".join(filter(None, (_range(kind, above, least, most, below), unit)))
     raise InputError(f"{stated(place, shown)}: expected {wanted}{what and '; '}{what}")
 
 
@@ -102,14 +103,13 @@ def stated(place: str, shown: str) -> str:
     return f"{place} {shown}" if place.rpartition(" ")[2].startswith("--") else f"{place} = {shown}"
 
 
-def _range(above: float | None, least: float | None, most: float | None, below: float | None, whole: bool) -> str:
+def _range(kind: str, above: float | None, least: float | None, most: float | None, below: float | None) -> str:
     def bound(number: float) -> str:
         return str(number) if isinstance(number, int) else f"{number:g}"
 
-    kind = "a whole number" if whole else ""
     if least is not None and most is not None:
         return f"{kind or 'a number'} from {bound(least)} to {bound(most)}"
-    upper = f"{bound(most)} at most" if most is not None else f"less than {bound(below)}" if below is not None else ""
+    upper = f"at most {bound(most)}" if most is not None else f"less than {bound(below)}" if below is not None else ""
     lower = f"more than {bound(above)}" if above is not None else f"{bound(least)} or more" if least is not None else ""
     bounds = " and ".join(filter(None, (lower, upper)))
     return ", ".join(filter(None, (kind, bounds))) or "a finite number"

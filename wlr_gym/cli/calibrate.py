@@ -250,6 +250,8 @@ def _dialogue(command: Callable[Options, int]) -> Callable[Options, int]:
         except _StoppedError:
             print("stopped: nothing was written")
             return FAILED
+        except BrokenPipeError:  # nobody reads what is printed
+            raise
         except (NoAnswerError, RefusedError, ConnectionError) as error:
             raise InputError(f"{error}; see wlr doctor") from None
 

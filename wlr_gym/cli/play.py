@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +106,7 @@ def run(options: PlayOptions) -> int:
         policy = make_policy(options.agent, core.contract())
         driver = _driver(options, core)
         if options.video is not None:
-            _film(options, options.video, core, keywords)
+            _film(options, options.video, core, policy, driver, keywords)
         else:
             if not options.web:
                 require_display()  # after all names, which are checked first
@@ -168,26 +168,37 @@ def _check_commands(script: Script, ranges: Ranges, robot: Robot) -> None:
         )
 
 
-def _film(options: PlayOptions, video: Path, core: Core, keywords: dict[str, Any]) -> None:
+def _film(
+    options: PlayOptions, video: Path, core: Core, policy: Policy, driver: Driver | None, keywords: dict[str, Any]
+) -> None:
     """Film the policy, beside a second one where there is one, and say what was written."""
-    from wlr_gym.learning.evaluation.film import film_beside, film_length
+    from wlr_gym.learning.evaluation.film import film, film_beside, film_length
     from wlr_gym.learning.evaluation.subjects import read_subjects
+    from wlr_gym.render import write_video
 
-    seconds = SECONDS if options.seconds is None else options.seconds
+    def watch(pictures: Iterable[Any], count: int) -> Iterable[Any]:
+        return tracked(pictures, count, "drawing", Console())
+
+    seconds, view = SECONDS if options.seconds is None else options.seconds, _view(options)
     count, _, fps = film_length(core, seconds, options.fps)
-    film_beside(
-        video,
-        environment_of(options.env, options.agent),
-        read_subjects([options.agent, *filter(None, [options.beside])]),
-        options.seed,
-        seconds,
-        keywords,
-        view=_view(options),
-        schedule=options.command,
-        title=f"{options.agent} on {core.plant.capabilities.name}" if options.beside is None else "",
-        fps=options.fps,
-        watch=lambda pictures, count: tracked(pictures, count, "drawing", Console()),
-    )
+    if options.beside is None:
+        title = f"{options.agent} on {core.plant.capabilities.name}"
+        pictures = film(core, policy, options.seed, seconds, view=view, driver=driver, title=title, fps=options.fps)
+        write_video(video, watch(pictures, count), fps, count)
+    else:
+        subjects, env = read_subjects([options.agent, options.beside]), environment_of(options.env, options.agent)
+        film_beside(
+            video,
+            env,
+            subjects,
+            options.seed,
+            seconds,
+            keywords,
+            view=view,
+            schedule=options.command,
+            fps=options.fps,
+            watch=watch,
+        )
     print(f"written: {video} ({count} pictures, {count / fps:g} s)")
     if options.json:
         print_json({"video": video, "pictures": count, "seconds": count / fps})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import re
 import sys
 import textwrap
@@ -106,7 +107,7 @@ def _wrapped(cell: str, width: int) -> str:
     lines = []
     for line in cell.split("\n"):
         indent = line[: len(line) - len(line.lstrip())]
-        lines += textwrap.wrap(line, width, subsequent_indent=indent, break_on_hyphens=False) or [""]
+        lines += textwrap.wrap(line, width, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False) or [""]
     return "\n".join(lines)
 
 
@@ -140,7 +141,10 @@ def only_results(wanted: bool) -> Iterator[None]:
 
 def print_json(content: Any) -> None:
     """Print results as JSON; see :func:`wlr_gym.base.text.json_text`."""
-    print(json_text(content), file=_OUTPUT.get() or sys.stdout, flush=True)
+    text = json.dumps(
+        json.loads(json_text(content)), indent=2
+    )  # ASCII: a terminal or pipe may have another encoding than UTF-8
+    print(text, file=_OUTPUT.get() or sys.stdout, flush=True)
 
 
 # ---- questions -------------------------------------------------------------------------------------------------------

@@ -485,16 +485,17 @@ _CALM = 6.0  # noise units; flat channels are not blown up beyond this
 
 
 def save_plots(result: ReplayResult, folder: Path) -> list[Path]:
-    """Write ``<run>_joints.png`` and ``<run>_body.png`` and return their paths."""
+    """Write ``<run>_joints.png`` and ``<run>_body.png``, where there is something to show, and return their paths."""
     paths = []
-    for name, grid in (("joints", _JOINTS), ("body", _BODY)):
-        figure = _figure(result, grid, f"{result.run.name}: {name}, measured and replayed")
-        paths.append(save(figure, folder / f"{result.run.name}_{name}.png"))
+    for part, names in (("joints", _JOINTS), ("body", _BODY)):
+        grid = [row for row in names if any(name in result.errors for name in row)]
+        if grid:
+            figure = _figure(result, grid, f"{result.run.name}: {part}, measured and replayed")
+            paths.append(save(figure, folder / f"{result.run.name}_{part}.png"))
     return paths
 
 
 def _figure(result: ReplayResult, grid: list[list[str]], title: str) -> Figure:
-    grid = [row for row in grid if any(name in result.errors for name in row)]
     figure = new_figure(5.2 * len(grid[0]), 2.1 * len(grid) + 0.9)
     panels = figure.subplots(len(grid), len(grid[0]), squeeze=False, sharex=True)
     for axes, name in zip(panels.flat, (name for row in grid for name in row), strict=True):

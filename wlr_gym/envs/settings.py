@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -76,6 +76,8 @@ class EnvironmentOptions:
         if isinstance(self.free_wheels, str):
             raise InputError(f"free_wheels = {self.free_wheels!r}: expected a list of wheels, such as ['wheel_lf']")
         object.__setattr__(self, "free_wheels", tuple(self.free_wheels))  # an iterator can be read once
+        object.__setattr__(self, "backend", self.plant or self.backend)
+        object.__setattr__(self, "plant", None)
         for wheel in self.free_wheels:
             check_name("wheel", wheel, WHEELS, "free_wheels")
         if self.episode_length is not None and not 0 < self.episode_length < float("inf"):
@@ -86,6 +88,14 @@ class EnvironmentOptions:
             self._check_real()
         elif self.hardware is not None:
             raise InputError(f"hardware = {self.hardware!r}: only for backend 'dynamixel', not '{self.backend}'")
+
+    def keys(self) -> list[str]:
+        """Return the keywords that are given, so that ``gym.make(ID, **options)`` takes an instance."""
+        return [one.name for one in fields(self) if getattr(self, one.name) != one.default]
+
+    def __getitem__(self, keyword: str) -> Any:
+        """Return the value of a keyword."""
+        return getattr(self, keyword)
 
     def _check_real(self) -> None:
         """Refuse what only a simulator can do."""

@@ -144,7 +144,7 @@ class Measured(SettingsModel):
     watchdog_stop_time: MeasuredValues = _measured("s from the last packet until a wheel stands: its way over its speed")
     velocity_loop_time: MeasuredValues = _measured("s, time constant of a wheel's way to a new speed")
     integral_cycle: MeasuredValues = _measured("s, control cycle of the wheel's servo that this means")
-    load_per_pwm: MeasuredValues = _measured("Present Load over PWM of a free wheel: 0 = it is torque, 1 = it is PWM")
+    load_per_pwm: MeasuredValues = _measured("slope of Present Load over PWM of a free wheel: 0 = it is torque, 1 = it is PWM")
     running_load: MeasuredValues = _measured("load of a free wheel, or of a leg on its way, part of stall torque")
     stall_load: MeasuredValues = _measured("load of a held wheel or leg over PWM and supply")
     stall_current: MeasuredValues = _measured("A of a held wheel, at full voltage")
@@ -281,10 +281,16 @@ class Hardware(SettingsModel):
         return (*self.buses, "imu", *(["flow"] if self.flow is not None else []))
 
     @model_validator(mode="after")
-    def _every_joint_is_wired_once(self) -> Hardware:
+    def _names_are_known(self) -> Hardware:
+        for name in {"imu", "flow"} & set(self.buses):
+            raise ValueError(f"buses.{name}: a sensor is called that; expected another name for the bus")
         for name, values in self.measured:
             for place in values:
                 check_name("joint or bus", place, (*JOINTS, *self.buses), f"measured.{name}")
+        return self
+
+    @model_validator(mode="after")
+    def _every_joint_is_wired_once(self) -> Hardware:
         places = {f"buses.{name}.joints": bus.joints for name, bus in self.buses.items()} | {"joints": tuple(self.joints)}
         for where, joints in places.items():
             for joint in joints:
@@ -343,12 +349,14 @@ def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
     Raises:
         InputError: a name that is no bus.
     """
-    changed: dict[str, Any] = dict(hardware.buses)
+    changed: dict[str, Any] = {"buses": dict(hardware.buses)}
     for name, port in ports.items():
         check_name("port", name, hardware.port_names)
-        changed[name] = (changed.get(name) or getattr(hardware, name)).model_copy(update={"port": port})
-    sensors = {name: changed.pop(name) for name in ("imu", "flow") if name in changed}
-    return hardware.model_copy(update={"buses": changed, **sensors})
+        if name in hardware.buses:
+            changed["buses"][name] = hardware.buses[name].model_copy(update={"port": port})
+        else:
+            changed[name] = getattr(hardware, name).model_copy(update={"port": port})
+    return hardware.model_copy(update=changed)
 
 
 # ---- robot and wiring together ----

@@ -205,6 +205,11 @@ def test_one_is_one(tmp_path):
     assert book.size == "1 trial: 1 setting x 1 seed"
 
 
+def test_the_environment_is_the_first_argument(tmp_path):
+    with pytest.raises(InputError, match=r"environment = 'WLR-Path-v0': it is the first argument, 'WLR-Velocity-v0'"):
+        wlr_gym.sweep("WLR-Velocity-v0", tmp_path / "out", environment="WLR-Path-v0")
+
+
 def test_a_used_folder_is_refused(tmp_path):
     (tmp_path / "something").touch()
     with pytest.raises(InputError, match=r"not empty; give another folder$"):

@@ -175,8 +175,9 @@ def test_frames_from_a_folder_a_video_and_times(tmp_path):
     broken.write_bytes(b"not a video")
     with pytest.raises(InputError, match="cannot be read as a video"):
         list(Frames(str(broken)))
-    with pytest.raises(InputError, match="no such video or folder of images"):
-        list(Frames(str(tmp_path / "nothing.mp4")))
+    for source in (str(tmp_path / "nothing.mp4"), os.devnull):  # a device would be a film without end
+        with pytest.raises(InputError, match="no such video or folder of images"):
+            list(Frames(source))
 
 
 @pytest.mark.parametrize(("share", "missing"), [(1.0, 0), (0.5, 20)])

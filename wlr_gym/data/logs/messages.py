@@ -479,6 +479,7 @@ class McapStream:
         self._rows: queue.Queue[tuple[float, list[float]]] = queue.Queue(WAITING)
         self._over = threading.Event()
         self._flushed = monotonic()
+        require_package("rosbags", "logs")
         run = run_message(columns, 0, 0, meta)  # what first messages compile and look up is done now, not while it drives
         for message in (run, *row_messages(dict.fromkeys((*COMMANDS, *columns), 0.0), 0)):
             definition(message.kind)

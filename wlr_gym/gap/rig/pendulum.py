@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -92,11 +93,13 @@ class RigEffect(RigLaw):
     """An effect as the rig knows it.
 
     Attributes:
-        acts: number of the model -> parameter that it is, or by which a calibrated number grows.
+        acts: number of the model -> parameter that changes it.
+        how: from the number and the parameter to the changed number.
         least: below these values of its parameters it is another effect.
     """
 
     acts: Mapping[str, str]
+    how: Callable[[float, float], float] = operator.add
     least: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -117,7 +120,11 @@ class RigEffect(RigLaw):
             if key not in effect.parameters and not parameter.optional:
                 raise InputError(f"{effect.name}: has no '{key}' ({parameter.unit})")
             value = float(effect.parameters.get(key, float(parameter.neutral)))
-            numbers[target] = numbers[target] + value if target in CALIBRATED else value
+            numbers[target] = self.how(numbers[target], value)
+
+
+def _put(old: float, new: float) -> float:
+    return new
 
 
 def _library(name: str, guesses: tuple[Guess, ...], **more: Any) -> RigEffect:
@@ -154,7 +161,7 @@ RIG_EFFECTS: dict[str, RigEffect] = {
     "viscous_friction": _library("viscous_friction", _steps("coefficient", 0.005), acts={"viscous_friction": "coefficient"}),
     "load_dependent_friction": _library("load_dependent_friction", _steps("ratio", 0.1, 0.3), acts={"load_friction": "ratio"}),
     "backlash": _library("backlash", _steps("angle", 0.01, 0.03, 0.06), acts={"play": "angle"}),
-    "weak_motor": _library("weak_motor", _steps("scale", -0.1, neutral=1.0), acts={"torque_scale": "scale"}),
+    "weak_motor": _library("weak_motor", _steps("scale", -0.1, neutral=1.0), acts={"torque_scale": "scale"}, how=operator.mul),
     "command_delay": _library("command_delay", _steps("delay", 0.01, 0.03), acts={"delay": "delay"}),
     "torque_saturation": RigEffect(
         "torque falls behind the current: K I / (1 + coefficient |I|)",
@@ -180,17 +187,20 @@ RIG_EFFECTS: dict[str, RigEffect] = {
         {"torque": EffectParameter("N m", "the limit", 0.01, NO_TORQUE_LIMIT, NO_TORQUE_LIMIT, (0.45, NO_TORQUE_LIMIT), 0.6)},
         tuple(_limit(torque) for torque in (0.5, 0.6, 0.75)),
         acts={"torque_limit": "torque"},
+        how=_put,
     ),
     "stribeck_friction": _library(
         "stribeck_friction",
         tuple(_stribeck(speed) for speed in (0.05, 0.2, 0.8)),
         refines="coulomb_friction",  # more of it at rest than in motion
         acts={"stribeck_torque": "extra_static_torque", "stribeck_speed": "stribeck_speed"},
+        how=_put,
     ),
     "torque_ripple": _library(
         "torque_ripple",
         tuple(_ripple(float(order)) for order in (6, 8, 12, 16, 24, 32, 48, 64)),
         acts={"ripple_amplitude": "amplitude", "ripple_order": "order", "ripple_phase": "phase"},
+        how=_put,
         least={"order": 6.0},  # slower, it does not repeat within the swing and is an error of the load or of its zero
     ),
 }

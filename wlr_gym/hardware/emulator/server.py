@@ -227,7 +227,7 @@ class Server:
 
     def call(self, action: Callable[[], Any]) -> Any:
         """Run ``action`` between two ticks, in the serving thread, and return its result; any thread may ask."""
-        if threading.current_thread() is self._thread:
+        if threading.current_thread() is self._thread or not self._thread.is_alive():
             return action()
         future: Future[Any] = Future()
         with self._lock:

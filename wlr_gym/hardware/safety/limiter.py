@@ -119,17 +119,19 @@ class CommandLimiter:
         """Return all preflight checks. A watchdog that an earlier run left latched is cleared, where nothing else is wrong."""
         self.__servos.unsupervise()  # a servo that had no power meanwhile has lost its indirect addresses
         self.__servos.set_patience(max(CALM_PATIENCE, self.limits.patience))
-        found: list[Check] = []
-        for is_mended in (False, True):
-            found = preflight.check_servos(self.__servos, self.robot, self.hardware)
-            wrong = [check for check in found if not check.ok and check.is_fatal]
-            if not wrong:
-                self.__servos.set_patience(self.limits.patience)
-                found.append(preflight.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
-            if not wrong or is_mended or self.dry_run or any(check.what != "watchdog" for check in wrong):
-                break
+        found, wrong = self._examine()
+        if wrong and not self.dry_run and all(check.what == "watchdog" for check in wrong):
             preflight.mend(self.__servos, wrong)
+            found, wrong = self._examine()
+        if not wrong:
+            self.__servos.set_patience(self.limits.patience)
+            found.append(preflight.check_bus_speed(self.__servos, reads, self.limits.read_time, self._clock.now))
         return found
+
+    def _examine(self) -> tuple[list[Check], list[Check]]:
+        """Return the checks of the servos, and those of them that forbid driving."""
+        found = preflight.check_servos(self.__servos, self.robot, self.hardware)
+        return found, [check for check in found if not check.ok and check.is_fatal]
 
     # ---- life ----
 

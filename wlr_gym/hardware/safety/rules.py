@@ -163,7 +163,7 @@ def ratings_of(robot: Robot, period: float, **registers: Any) -> Ratings:
 class JointMemory:
     """What lasts from step to step of joints and IMU."""
 
-    still_at: Array = field(default_factory=_each(np.nan))  #: (8,) rad, since when only the encoder's last bits differ
+    still_at: Array = field(default_factory=_each(np.nan))  #: (8,) rad, reading since which only the encoder's last bits differ
     position: Array = field(default_factory=_each(np.nan))  #: (8,) rad, last read
     velocity: Array = field(default_factory=_each(np.nan))  #: (8,) rad/s; a leg that turns back may repeat one, not both
     ramp: Array = field(default_factory=_each(0.0))  #: (8,) rad/s, speed that the wheels' profile asks for by now; legs 0

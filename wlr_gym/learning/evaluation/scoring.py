@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from wlr_gym.base.errors import InputError, check_name, require_seed
 from wlr_gym.base.files import write_json
@@ -333,4 +333,6 @@ def read_acceptance(path: Path) -> Acceptance:
     try:
         return TypeAdapter(Acceptance).validate_json(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected a result of wlr evaluate --accept: {error}") from None
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        why = str(error) if first is None else f"{'.'.join(map(str, first['loc']))}: {first['msg']}".removeprefix(": ")
+        raise InputError(f"{path}: expected a result of wlr evaluate --accept: {why}") from None

@@ -87,7 +87,7 @@ class Book:
     def fill(self, run: Run, search: Callable[[], None] | None = None) -> SweepResult:
         """Train the grid with all seeds; or search with the first seed, then train the best with the others.
 
-        However it ends, table and page say what there is.
+        At the end, and after Ctrl-C, table and page say what there is.
 
         Args:
             run: runs jobs.
@@ -104,8 +104,10 @@ class Book:
                 best = [one.settings for one in summarise(self.results(), plan.metric)[: plan.search.repeat_best]]
                 self.train(trials_of(best, plan.seed_list), run)
         except KeyboardInterrupt:
-            with suppress(InputError):  # a full disk
+            try:
                 self.write()
+            except InputError as problem:  # a full disk
+                self.say(str(problem))
             raise KeyboardInterrupt(f"interrupted; trials have checkpoints; resume with: {resume}") from None
         try:
             self.write()

@@ -90,7 +90,7 @@ def spread_on_ray(jobs: Iterable[Job], at_once: int | None = None) -> Generator[
             try:
                 error = ray.get(ready)
             except RayError as problem:
-                error = f"Ray: {str(problem).strip().splitlines()[0]}"
+                error = f"Ray: {str(problem).strip().splitlines()[-1]}"  # the lines above are the trace
             yield Ended(running.pop(ready).name, error)
     finally:
         for reference in running:

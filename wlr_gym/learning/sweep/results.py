@@ -131,14 +131,15 @@ def frame_of(results: Sequence[TrialResult], out: Path) -> DataFrame:
 
     rows = []
     for one in results:
-        row: dict[str, Any] = {"name": one.trial.name, **one.trial.settings, "seed": one.trial.seed, "status": one.status}
+        row = {"name": one.trial.name, "seed": one.trial.seed, "status": one.status}
         row |= {f"final_{name}": one.final.get(name, np.nan) for name in METRICS}
         row |= {f"best_{name}": one.best.get(name, np.nan) for name in (*METRICS, "steps")}
         row |= {"steps": one.steps, "seconds": one.seconds, "error": one.error, "folder": str(one.folder.relative_to(out))}
         rows.append(row)
     frame = pandas.DataFrame(rows)
-    for name in {name for one in results for name in one.trial.settings}:
-        frame[name] = _column([one.trial.settings.get(name) for one in results])
+    settings = dict.fromkeys(name for one in results for name in one.trial.settings if name not in frame)
+    for place, name in enumerate(settings, 1):
+        frame.insert(place, name, _column([one.trial.settings.get(name) for one in results]))
     return frame
 
 
@@ -205,8 +206,14 @@ def write_page(plan: SweepPlan, results: Sequence[TrialResult], folder: Path) ->
                 f"wlr play --agent {shlex.quote(str(best.results[0].folder))}",
             ])),
         ]  # fmt: skip
-    shown = [*plan.space, "seed", "status", f"final_{plan.metric}", f"best_{plan.metric}", "best_steps", "steps", "seconds"]
-    rows = [[words(value) for value in row] for row in frame_of(results, folder)[shown].itertuples(index=False)]
+    metric = _METRIC[plan.metric]
+    shown = [*plan.space, "seed", "status", metric, f"best {metric}", "at step", "steps", "time"]
+    rows = []
+    for one in results:
+        settings = [words(one.trial.settings.get(name)) for name in plan.space]
+        scores = [number(found[plan.metric]) if found else "-" for found in (one.final, one.best)]
+        step = f"{one.best['steps']:,.0f}" if one.best else "-"
+        rows.append([*settings, str(one.trial.seed), one.status, *scores, step, f"{one.steps:,}", duration(one.seconds)])
     trials = table(shown, rows, range(len(plan.space) + 2, len(shown)))
     parts += [
         section("All trials", folded(counted(len(rows), "trial"), trials)),

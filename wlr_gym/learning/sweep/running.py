@@ -56,7 +56,10 @@ def sweep(
         MissingPackageError: Ray or Optuna is needed and not installed.
         KeyboardInterrupt: Ctrl-C or SIGTERM, after the trials saved checkpoints; :func:`resume_sweep` continues.
     """
-    fields = {"environment": env_id, "config": config, "init": None if init is None else str(init), **plan}
+    if "environment" in plan:
+        raise InputError(f"environment = {plan['environment']!r}: it is the first argument, {env_id!r}")
+    given = {name: value for name, value in plan.items() if value is not None}
+    fields = given | {"environment": env_id, "config": config, "init": None if init is None else str(init)}
     return start_sweep(parse_config(SweepPlan, fields, "sweep"), out, ray=ray, workers=workers, say=say)
 
 

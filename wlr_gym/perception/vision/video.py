@@ -91,9 +91,11 @@ class Frames:
 
     def _images(self, source: str) -> Iterator[tuple[float, Image]]:
         path = Path(source)
-        if not path.exists():
+        if path.is_dir():
+            return self._folder(path)
+        if not path.is_file():  # a device would be a film without end
             raise InputError(f"{source}: no such video or folder of images")
-        return self._folder(path) if path.is_dir() else self._file(path)
+        return self._file(path)
 
     def _file(self, path: Path) -> Iterator[tuple[float, Image]]:
         import cv2

@@ -371,7 +371,7 @@ class _Reader:
         """Note an inertia's products, beside the moments of both axes or ``scale``; ``{}`` in ``what`` is the axes."""
         for (i, j), axes in (((0, 1), "xy"), ((0, 2), "xz"), ((1, 2), "yz")):
             beside = scale or math.sqrt(abs(inertia[i, i] * inertia[j, j]))
-            self.leave_out(what.format(axes), float(inertia[i, j]), "kg m2", beside)
+            self.leave_out(what.replace("{}", axes), float(inertia[i, j]), "kg m2", beside)
 
     def _accept(self, share: float, note: str, refusal: str) -> None:
         if share > SMALL and not self.idealise:
