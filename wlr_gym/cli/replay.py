@@ -171,7 +171,8 @@ def _print(results: Sequence[ReplayResult], patch: Patch, console: Console, othe
         channel, kind = group if corner else name, "cam" if group.startswith("cam") else group
         for result in results:
             if (error := result.errors.get(name)) is not None:
-                rows.append((result.run.name, channel, corner, kind, *vars(error).values(), error.segment_rms / error.noise))
+                of = error.segment_rms, error.full_run_rms, error.unit, error.noise, error.segment_rms / error.noise
+                rows.append((result.run.name, channel, corner, kind, *of))
     columns: Any = ["run", "channel", "corner", "kind", "segment", "full", "unit", "noise", "ratio"]
     errors: Any = pandas.DataFrame(rows, columns=columns)
 

@@ -65,16 +65,17 @@ def run(options: TrainOptions) -> int:
     elif options.total_steps is not None:
         raise InputError(f"--total-steps goes with --resume; of a new training: --set total_steps={options.total_steps}")
     else:
-        environment = (
-            options.env or "WLR-Velocity-v0" if options.init is None else environment_of(options.env, find_policy(options.init))
-        )
+        environment = options.env or "WLR-Velocity-v0"
+        if options.init is not None:
+            environment = environment_of(options.env, find_policy(options.init))
         added: dict[str, Any] = {} if options.backend is None else {"backend": options.backend}
         if patch := options.patch():  # its content, so that the run folder says what was added
             added["effects"] = patch.content()["effects"]
         given = {"changes": options.set, "settings": {"environment": added} if added else None, "seed": options.seed}
         config = settings_of(environment, options.config, options.agent, options.init, robot=options.robot, **given)
         folder = options.out or default_folder(options, environment, config)
-        training = Training(environment, folder, config, False, seconds, options.progress, options.init, updates.append)
+        follow = {"max_seconds": seconds, "progress": options.progress, "on_update": updates.append}
+        training = Training(environment, folder, config, init=options.init, **follow)
         policy = run_training(options.agent, training)
     if updates and updates[0].steps < updates[0].total_steps:  # it looks finished otherwise
         last = updates[0]

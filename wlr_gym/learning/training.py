@@ -69,7 +69,8 @@ def train(
         KeyboardInterrupt: Ctrl-C or SIGTERM, after a checkpoint was saved.
     """
     chosen = settings_of(env_id, config, agent, init, settings=settings, seed=seed, robot=robot)
-    return run_training(agent, Training(env_id, Path(out), chosen, False, max_seconds, progress, init, on_update))
+    follow: dict[str, Any] = {"max_seconds": max_seconds, "progress": progress, "on_update": on_update}
+    return run_training(agent, Training(env_id, Path(out), chosen, init=init, **follow))
 
 
 def settings_of(
@@ -150,9 +151,8 @@ def resume_training(
     if total_steps is not None:
         _extend(saved["settings"], total_steps)
         write_yaml(path, saved)
-    request = Training(
-        saved["environment"], Path(folder), saved["settings"], True, max_seconds, progress, saved.get("init"), on_update
-    )
+    follow: dict[str, Any] = {"max_seconds": max_seconds, "progress": progress, "on_update": on_update}
+    request = Training(saved["environment"], Path(folder), saved["settings"], resume=True, init=saved.get("init"), **follow)
     return run_training(saved["agent"], request)
 
 

@@ -83,7 +83,8 @@ def train_trial(task: Mapping[str, Any], send: Send) -> None:
         else:  # without a checkpoint it is trained from the beginning
             shutil.rmtree(folder, ignore_errors=True)
             settings = plan.settings_of(trial)
-            run_training(plan.agent, Training(plan.environment, folder, settings, False, None, False, plan.init, on_update))
+            request = Training(plan.environment, folder, settings, progress=False, init=plan.init, on_update=on_update)
+            run_training(plan.agent, request)
         for row in scores_of(folder):  # what the end of the training added
             tell(row)
 

@@ -35,7 +35,7 @@ from wlr_gym.physics.model.dynamics import inertial_constants
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import gauss, kinematics
-from wlr_gym.physics.plants.gibbs_appell import step as source
+from wlr_gym.physics.plants.gibbs_appell import step as substep
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     ASSEMBLY,
     FORMULA_INPUTS,
@@ -131,7 +131,7 @@ def trace(features: frozenset[str], precision: str) -> dict[str, dict[str, Any]]
     blocks = {
         "setup": {name: value for name, value in setup.items() if name not in known},
         "sweep": gauss.kick_sweep(inner, features),
-        "finish": source.kick_finish(inner, step, features),
+        "finish": substep.kick_finish(inner, step, features),
     }
     prepare: dict[str, Any] = {}
     for name in blocks:
@@ -139,12 +139,12 @@ def trace(features: frozenset[str], precision: str) -> dict[str, dict[str, Any]]
         prepare |= hoisted
     blocks["setup"] = _without_unread(blocks["setup"], blocks["sweep"], blocks["finish"])
     if "forces" in features:
-        blocks["sense"] = source.sense(lanes, step, features)
+        blocks["sense"] = substep.sense(lanes, step, features)
     return {
         "prepare": prepare,
-        "drift": source.drift(lanes, owner.input("duration"), features),
+        "drift": substep.drift(lanes, owner.input("duration"), features),
         **blocks,
-        "observe": source.observe(lanes, step, features),
+        "observe": substep.observe(lanes, step, features),
     }
 
 
@@ -161,7 +161,7 @@ def _without_unread(outputs: dict[str, Any], *readers: dict[str, Any]) -> dict[s
 @cache
 def outputs() -> tuple[str, ...]:
     """Return the names of what is shown of a state, in storage order."""
-    return tuple(source.observe(Inputs(Graph()), 1.0, frozenset()))
+    return tuple(substep.observe(Inputs(Graph()), 1.0, frozenset()))
 
 
 _SCALARS = ("step", "time", "duration")
@@ -182,10 +182,10 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
         return f"F({value!r})" if precision == "float32" else (repr(value) if value >= 0 else f"({value!r})")
 
     lines = [f"F = np.{precision}", ""]
-    for block, outputs in blocks.items():
-        used = inputs_of(outputs.values())
+    for block, results in blocks.items():
+        used = inputs_of(results.values())
         scalars = [name for name in _SCALARS if name in used]
-        body = emit(outputs, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True, compact=True)
+        body = emit(results, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True, compact=True)
         lines += [
             *straight_line_source(f"{block}_of_robot", ["w", "k", *scalars], body),
             "",
@@ -376,7 +376,7 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    source, gauss, kinematics, equations, servo, drive, ground, ops, compilation, sys.modules[__name__]
+    substep, gauss, kinematics, equations, servo, drive, ground, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join(
     [source_of(*TRACED), *PARAMETER_LANES, *FORMULA_INPUTS, *FORMULA_OUTPUTS, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"]
