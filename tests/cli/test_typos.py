@@ -19,7 +19,7 @@ COMMANDS = {
     "a command of an emulated robot": ("deploy pid --command yaw=1 --emulated", "did you mean 'yaw_rate'?"),
     "a command out of range": (
         "deploy pid --command yaw_rate=50 --emulated",
-        "--command yaw_rate=50: expected -0.3 to 0.3 (rad/s)",
+        "--command: yaw_rate = 50: expected -0.3 to 0.3 rad/s",
     ),
     "an option": ("evaluate pid --epsiodes 3", "Unrecognized options: --epsiodes, 3 Perhaps you meant: --episodes INT"),
     "one dash": ("record -list", "Unrecognized options: -list"),

@@ -133,7 +133,7 @@ class Toy(Problem):
     def features(self, setting, runs) -> Any:
         return [{"shape of drag": self.shape("drag left")[r][:, 0], "time": self.times(r)} for r in runs]
 
-    def candidates(self, setting, residuals, runs):
+    def candidates(self, setting: Any, residuals: Any, runs: Any):
         lists = [self._drag(), self._single("twin"), self._single("weak", 0.2), self._play(), self._ripple(), self._copy()]
         lists += [self._single(name) for name in DECOYS]
         return [p for probes, _ in lists for p in probes], [c for _, candidates in lists for c in candidates]

@@ -66,7 +66,7 @@ class States:
         state = self.quaternion, self.v, self.w, self.angles, self.rates
         return dynamics.accelerations(parameters, *state, self.force)
 
-    def forward(self, row, model, joints=LEGS + WHEELS, sign=1.0, offset=0.0):
+    def forward(self, row, model, joints=LEGS + WHEELS, sign: float | np.ndarray = 1.0, offset: float | np.ndarray = 0.0):
         """MuJoCo's data of one state and its accelerations (14,), its joints ``sign * (angle - offset)``."""
         data, rotation, v, w, force = mujoco.MjData(model), self.rotation[row], self.v[row], self.w[row], self.force[row]
         angles, rates = ([getattr(model.joint(name), at)[0] for name in joints] for at in ("qposadr", "dofadr"))
