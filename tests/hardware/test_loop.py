@@ -663,7 +663,8 @@ def test_latency_is_from_the_readings_to_their_setpoints(rig):
 
 @pytest.mark.parametrize("deadman", [0.0, -1.0, np.nan, np.inf, 300.0])
 def test_a_deadman_that_never_acts_is_refused(deadman):
-    with pytest.raises(InputError, match=f"deadman = {deadman:g}: expected more than 0 and at most 10 s"):
+    number = "" if np.isfinite(deadman) else "a finite number, "
+    with pytest.raises(InputError, match=f"deadman = {deadman:g}: expected {number}more than 0 and at most 10 s"):
         RobotPlant(ROBOT, 1, PlantOptions(), RobotOptions(emulated=True, deadman=deadman))
 
 
