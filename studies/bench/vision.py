@@ -478,7 +478,7 @@ def _centre_error(camera: Camera, look: Look, seed: int) -> float:
     radii = np.array(ring_radii(code))
     circles = np.array([[0.0, 0.0, *(radius * radii)]])
     facet = Facet(np.zeros(3), np.eye(3)[:2], (0.05, 0.05), 225.0, circles=circles).moved(centre, rotation)
-    half = 60  # px: only so many around the centre are drawn
+    half = 60  # px around the centre that are drawn
     corner = np.round(project(camera, centre[None])[0]) - half
     shifted = (camera.centre[0] - corner[0], camera.centre[1] - corner[1])
     crop = camera.model_copy(update={"width": 2 * half, "height": 2 * half, "centre": shifted})

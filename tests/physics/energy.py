@@ -80,7 +80,7 @@ class Audit:
 
 
 def audit(plant: Any, ticks: int, every: int, draw: Callable[[], Array], viscous: float = 0.0) -> Audit:
-    """Drive by setpoints (N, 8) drawn ``every`` so many ticks of one physics step, and add up what every force does."""
+    """Drive by setpoints (N, 8) drawn anew after ``every`` ticks of one physics step, and add up what every force does."""
     step, count, parameters = plant.options.control_period, plant.count, plant.parameters
     has_play = parameters["servo.backlash"].any()
 

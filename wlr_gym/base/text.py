@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -58,14 +59,14 @@ def pairs(what: str, words: Iterable[str], example: str) -> dict[str, str]:
 
 
 def json_text(content: Any) -> str:
-    """Return JSON; a number that is not finite is null, a dataclass an object of its fields, an array a list.
+    """Return JSON in ASCII; a number that is not finite is null, a dataclass an object of its fields, an array a list.
 
     Raises:
         ValueError: something that JSON has not.
     """
-    from pydantic_core import to_json
+    from pydantic_core import to_jsonable_python
 
-    return to_json(content, indent=2, inf_nan_mode="null", fallback=_json_value).decode()
+    return json.dumps(to_jsonable_python(content, inf_nan_mode="null", fallback=_json_value), indent=2)
 
 
 def _json_value(value: Any) -> Any:
@@ -73,4 +74,4 @@ def _json_value(value: Any) -> Any:
         return dict(value)
     if hasattr(value, "tolist"):
         return value.tolist()
-    raise TypeError(f"{type(value).__name__}: JSON has no such value")
+    raise ValueError(f"{type(value).__name__}: JSON has no such value")

@@ -40,7 +40,7 @@ class ImportOptions(JsonOption):
     out: Path | None = None
     """Folder for the runs; made if it is not there."""
     split: Seconds | None = None
-    """Cut recordings into runs of about so many seconds, where the robot is quietest; default: only those over 600 s."""
+    """Length of a run, about: recordings are cut where the robot is quietest; default: only those over 600 s are cut."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the one that the map's meta names, else the nominal one."""
     format: Literal["parquet", "csv"] = "parquet"

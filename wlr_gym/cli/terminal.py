@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import re
 import sys
 import textwrap
@@ -141,10 +140,7 @@ def only_results(wanted: bool) -> Iterator[None]:
 
 def print_json(content: Any) -> None:
     """Print results as JSON; see :func:`wlr_gym.base.text.json_text`."""
-    text = json.dumps(
-        json.loads(json_text(content)), indent=2
-    )  # ASCII: a terminal or pipe may have another encoding than UTF-8
-    print(text, file=_OUTPUT.get() or sys.stdout, flush=True)
+    print(json_text(content), file=_OUTPUT.get() or sys.stdout, flush=True)
 
 
 # ---- questions -------------------------------------------------------------------------------------------------------

@@ -314,7 +314,7 @@ class Core:
         return contract(self.task, self.randomization.config.model_dump(mode="json", exclude_none=True))
 
     def shorten(self, max_episode_steps: int | None) -> None:
-        """Truncate episodes after so many control steps, if that is before the task's own limit; None and -1 leave that."""
+        """Truncate episodes after ``max_episode_steps``, if that is before the task's own limit; None and -1 keep the limit."""
         if max_episode_steps is None or max_episode_steps == -1:
             return
         if not is_whole(max_episode_steps) or max_episode_steps < 1:

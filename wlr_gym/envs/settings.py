@@ -76,6 +76,8 @@ class EnvironmentOptions:
         if isinstance(self.free_wheels, str):
             raise InputError(f"free_wheels = {self.free_wheels!r}: expected a list of wheels, such as ['wheel_lf']")
         object.__setattr__(self, "free_wheels", tuple(self.free_wheels))  # an iterator can be read once
+        if self.plant is not None and self.backend != type(self).backend:  # both are given
+            _require_one_backend(self.plant, self.backend)
         object.__setattr__(self, "backend", self.plant or self.backend)
         object.__setattr__(self, "plant", None)
         for wheel in self.free_wheels:
@@ -167,12 +169,14 @@ def read_settings(options: Mapping[str, Any]) -> EnvironmentOptions:
             raise UnknownOptionError(
                 f"environment: got an unexpected keyword argument '{option}'{hint}; valid: {', '.join(valid)}"
             )
-    given = dict(options)
-    if "plant" in given:
-        plant = given.pop("plant")
-        if given.setdefault("backend", plant) != plant:
-            raise InputError(f"plant = {plant!r} and backend = {given['backend']!r}: two words for one thing, give one")
-    return EnvironmentOptions(**given)
+    if options.get("plant") is not None and "backend" in options:
+        _require_one_backend(options["plant"], options["backend"])
+    return EnvironmentOptions(**options)
+
+
+def _require_one_backend(plant: str, backend: str) -> None:
+    if plant != backend:
+        raise InputError(f"plant = {plant!r} and backend = {backend!r}: two words for one thing, give one")
 
 
 def task_of(own: str | None, definition: Mapping[str, Any] | None) -> str | Mapping[str, Any]:

@@ -646,7 +646,7 @@ LEAST_DEGREES = 2
 
 
 def two_sided_95(degrees: int) -> float:
-    """Return Student's t: half of a 95 % interval in standard errors known to so many degrees of freedom."""
+    """Return Student's t: half the width of a 95 % interval, in standard errors with ``degrees`` degrees of freedom."""
     return float(stdtrit(degrees, 0.975))
 
 

@@ -469,7 +469,7 @@ _HOLE, _LEAST_HOLE, _LEAST_PIECE = 5.0, 0.5, 1.0
 def runs_of(log: Log, found: LogMap, resolved: Mapping[str, Resolved], split: float | None) -> Iterator[MadeRun]:
     """Yield the runs that a map makes of a recording, cut where the robot is quietest.
 
-    One, or several of about :data:`LONGEST`; with ``split``, runs of about so many seconds. Cut ones go across no hole.
+    One run, or several of about :data:`LONGEST` or ``split`` seconds. Runs of a cut recording go across no hole.
     """
     made = make_run(log, found, resolved)
     t = made.table["t"]

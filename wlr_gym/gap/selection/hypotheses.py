@@ -188,7 +188,7 @@ SAMPLES = 500
 EQUIVALENT = 0.93
 #: A rival that improves the fit by this share is equivalent unless the runs agree that it is worse ...
 RIVAL = 0.75
-#: ... by so many standard errors.
+#: ... by this many standard errors.
 AGREED = 2.0
 
 
@@ -249,7 +249,7 @@ TRIED = (2.0, 1.0, 0.5, 0.2)
 BEHIND = 0.5
 #: A hypothesis with less than this share of the best's improvement ...
 HOPELESS = 0.4
-#: ... after so many steps is not improved any further.
+#: ... after this many steps is not improved any further.
 PATIENCE = 2
 #: Hypotheses whose calibrated parameters the model without an effect more tries too.
 NUDGES = 2

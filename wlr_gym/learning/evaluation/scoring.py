@@ -14,6 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from wlr_gym.base.errors import InputError, check_name, require_seed
 from wlr_gym.base.files import write_json
+from wlr_gym.base.settings import expected
 from wlr_gym.envs.core import make_task
 from wlr_gym.envs.registry import task_name_of, task_source_of
 from wlr_gym.envs.settings import read_settings
@@ -333,6 +334,8 @@ def read_acceptance(path: Path) -> Acceptance:
     try:
         return TypeAdapter(Acceptance).validate_json(path.read_bytes())
     except (OSError, ValueError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else None
-        why = str(error) if first is None else f"{'.'.join(map(str, first['loc']))}: {first['msg']}".removeprefix(": ")
+        why = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            why = ": ".join(filter(None, (".".join(map(str, first["loc"])), expected(first))))
         raise InputError(f"{path}: expected a result of wlr evaluate --accept: {why}") from None
