@@ -227,13 +227,15 @@ class Server:
 
     def call(self, action: Callable[[], Any]) -> Any:
         """Run ``action`` between two ticks, in the serving thread, and return its result; any thread may ask."""
-        if threading.current_thread() is self._thread or not self._thread.is_alive():
-            return action()
         future: Future[Any] = Future()
         with self._lock:
             if self.failure is not None:
                 raise RuntimeError(f"the emulator has failed: {self.failure}") from self.failure
-            self._requests.append((action, future))
+            is_ours = threading.current_thread() is self._thread or not self._thread.is_alive()
+            if not is_ours:
+                self._requests.append((action, future))
+        if is_ours:
+            return action()
         os.write(self._waker, b"x")
         return future.result()
 
