@@ -10,8 +10,10 @@ from wlr_gym.data.sensors import channel_noise
 from wlr_gym.gap.analysis import (
     Adequacy,
     Analysis,
+    ByChannel,
     Calibrated,
     ChannelGap,
+    Constancy,
     Detectable,
     Equivalent,
     Evidence,
@@ -63,17 +65,27 @@ def trace(run, channel, size=1.0, seed=0):
     return Trace(run, channel, COLUMNS[channel].unit, t, measured, before, calibrated, truth, *errors)
 
 
+def statistic(value, expected, limit, p):
+    return Statistic(value, expected, limit, p, value / expected)
+
+
+def by_channel(whole, each, **others):
+    return ByChannel(**vars(statistic(*whole)), channels={name: statistic(*others.get(name, each)) for name in CHANNELS})
+
+
 ADEQUACY = Adequacy(
     19,
-    Statistic(1.19, 1.02, 1.03, 0.05),
-    Statistic(7.6, 7.0, 7.6, 0.1),
-    Statistic(2.8, 2.0, 2.4, 0.05),
-    Pulled("ground.mu", "run_05", Statistic(12.7, 6.4, 7.8, 0.05)),
-    {name: (Statistic(1.02, 1.01, 1.05, 0.4), Statistic(1.5, 1.0, 1.2, 0.05)) for name in CHANNELS}
-    | {
-        "acc_z": (Statistic(1.31, 1.0, 1.04, 0.05), Statistic(6.9, 6.8, 7.9, 0.25)),
-        "eff_leg_lf": (Statistic(1.32, 1.18, 1.25, 0.05), Statistic(41.7, 35.7, 40.3, 0.05)),
-    },
+    by_channel(
+        (1.19, 1.02, 1.03, 0.05),
+        (1.02, 1.01, 1.05, 0.4),
+        acc_z=(1.31, 1.0, 1.04, 0.05),
+        eff_leg_lf=(1.32, 1.18, 1.25, 0.05),
+    ),
+    by_channel((7.6, 7.0, 7.6, 0.1), (1.5, 1.0, 1.2, 0.05), acc_z=(6.9, 6.8, 7.9, 0.25), eff_leg_lf=(41.7, 35.7, 40.3, 0.05)),
+    Constancy(
+        **vars(statistic(2.8, 2.0, 2.4, 0.05)),
+        pulled_most=Pulled(**vars(statistic(12.7, 6.4, 7.8, 0.05)), number="ground.mu", run="run_05"),
+    ),
 )
 
 

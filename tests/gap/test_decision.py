@@ -30,7 +30,7 @@ def candidate(name, probability, outcome, number=1, where=("wheel_lf",)):
     values = {"coulomb_friction": "torque", "rolling_resistance": "coefficient", "viscous_friction": "coefficient"}
     return {
         "round": number, "name": name, "where": list(where), "values": {values[name]: 0.1}, "outcome": outcome,
-        "probability": probability,
+        "probability": probability, "gain": 0.0, "screened": 0.0, "reason": "",
     }  # fmt: skip
 
 

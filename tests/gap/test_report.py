@@ -304,8 +304,12 @@ def test_texts_are_escaped(tmp_path):
         seconds={evil: 3.0},
         adequacy=replace(
             examples.ADEQUACY,
-            pulled=replace(examples.ADEQUACY.pulled, number=evil, run=evil),
-            channels={evil: examples.ADEQUACY.channels["acc_z"]},
+            level=replace(examples.ADEQUACY.level, channels={evil: examples.ADEQUACY.level.channels["acc_z"]}),
+            whiteness=replace(examples.ADEQUACY.whiteness, channels={evil: examples.ADEQUACY.whiteness.channels["acc_z"]}),
+            constancy=replace(
+                examples.ADEQUACY.constancy,
+                pulled_most=replace(examples.ADEQUACY.constancy.pulled_most, number=evil, run=evil),
+            ),
         ),
     )  # fmt: skip
     text = report(analysis, {}, tmp_path)

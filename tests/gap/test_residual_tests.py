@@ -63,8 +63,8 @@ def test_chance_is_not_rejected():
         rejected = [getattr(one, name).rejected for one in found]
         assert sum(rejected) <= 2, name
     assert [one.level.ratio for one in found] == pytest.approx(np.ones(12), abs=0.06)
-    assert sum(one.pulled.errors.rejected for one in found) <= 2
-    channels = [statistic.rejected for one in found for both in one.channels.values() for statistic in both]
+    assert sum(one.constancy.pulled_most.rejected for one in found) <= 2
+    channels = [each.rejected for one in found for both in (one.level, one.whiteness) for each in both.channels.values()]
     assert np.mean(channels) < 0.12
     assert "nothing in the fitted runs that chance does not explain" in adequacy(found[0])
 
@@ -72,21 +72,21 @@ def test_chance_is_not_rejected():
 @pytest.mark.parametrize("channel", CHANNELS)
 def test_a_slow_drift_is_found_at_its_channel(channel):
     found = judged(drifting(channel, seed=3))
-    level, whiteness = found.channels[channel]
+    level, whiteness = found.level.channels[channel], found.whiteness.channels[channel]
     assert level.rejected
     assert whiteness.rejected
     assert whiteness.ratio > 10.0
     assert found.whiteness.rejected
     for other in set(CHANNELS) - {channel}:
-        assert not found.channels[other][1].rejected
-        assert found.channels[other][1].ratio < 1.3
+        assert not found.whiteness.channels[other].rejected
+        assert found.whiteness.channels[other].ratio < 1.3
     assert f"that is not expected is in {channel}" in adequacy(found)
 
 
 def test_a_drift_that_no_level_shows_is_seen_as_whiteness():
     """White noise that is a little smaller, and a drift that fills it up: the level is as expected, the rows are not."""
     found = judged(drifting("speed", 0.6, seed=5, white=0.9))
-    level, whiteness = found.channels["speed"]
+    level, whiteness = found.level.channels["speed"], found.whiteness.channels["speed"]
     assert not level.rejected
     assert whiteness.rejected
 
@@ -98,12 +98,13 @@ def test_numbers_that_differ_from_run_to_run_are_no_constants():
     found = judged(added(problem, lambda r: steps[r] * shape[r]))
     assert found.constancy.rejected
     assert found.constancy.ratio > 4.0
-    assert found.pulled.number == "mass"
-    assert steps[problem.runs.index(found.pulled.run)] != 0.0
-    assert found.pulled.errors.rejected
+    pulled = found.constancy.pulled_most
+    assert pulled.number == "mass"
+    assert steps[problem.runs.index(pulled.run)] != 0.0
+    assert pulled.rejected
     assert not found.level.rejected
     assert found.whiteness.ratio < 1.2
-    assert f"{found.pulled.run} pulls mass farthest" in adequacy(found)
+    assert f"{pulled.run} pulls mass farthest" in adequacy(found)
 
 
 class Moved(Toy):
@@ -136,7 +137,7 @@ class Gappy(Toy):
 
 def test_channels_that_were_not_measured_say_nothing():
     found = judged(Gappy(seed=2), [0, 2, 4])
-    assert set(found.channels) == {"speed", "place"}
+    assert set(found.level.channels) == {"speed", "place"}
     assert np.isfinite([found.level.value, found.level.limit, found.whiteness.value, found.constancy.value]).all()
     assert found.level.value == pytest.approx(found.level.expected, rel=0.1)
 

@@ -111,18 +111,19 @@ def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) ->
     print_table(console, ("of the map", "", "what the log shows"), rows, styles=styles)
     if found.unused:
         console.print(f"not used: {', '.join(found.unused)}", style="dim", markup=False)
-    _print_costs({column for key in found.content.get("channels", {}) for column in GROUPS.get(key, (key,))}, console)
+    _print_missing({column for key in found.content.get("channels", {}) for column in GROUPS.get(key, (key,))}, console)
     make_output_folder(target.parent)
     write_map(target, found)
     console.print(f"written: {target}", markup=False)
     return found
 
 
-def _print_costs(columns: set[str], console: Console) -> None:
-    from wlr_gym.data.logs.map import costs
+def _print_missing(columns: set[str], console: Console) -> None:
+    from wlr_gym.data.logs.map import GROUPS
 
-    for missing, cost in costs(columns):
-        console.print(f"missing: {missing}: {cost}", style="yellow", markup=False)
+    missing = [name for name in ("vel", "eff", "gyro", "acc", "cam", "volt") if columns.isdisjoint(GROUPS.get(name, (name,)))]
+    if missing:
+        console.print(f"missing: {', '.join(missing)}", style="yellow", markup=False)
 
 
 # ---- what was imported -----------------------------------------------------------------------------------------------
@@ -143,7 +144,7 @@ def _report(imported: Sequence[ImportedRun], console: Console) -> None:
             rows.append((columns, topic, unit, f"{facts[0].rate:.0f}", how, f"{1e3 * moved:.1f}", f"{100 * known:.0f} %"))
         headings = ("channels", "topic", "unit", "samples/s", "rows", "moved, ms rms", "rows with a value")
         print_table(console, headings, rows)
-        _print_costs({fact.column for fact in first.facts}, console)
+        _print_missing({fact.column for fact in first.facts}, console)
     for one in imported:
         console.print(f"written: {one.path}", markup=False)
         for finding in one.findings:

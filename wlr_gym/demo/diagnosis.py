@@ -216,15 +216,15 @@ def check(demo: Demo, tell: Tell) -> Section:
     )
     rows = []
     for one in heldout:
-        errors = [error(_number(value)) for value in (one.before, one.calibrated, one.after)]
-        rows.append((one.run, *errors, percent(_number(one.reduction))))
+        errors = [error(value) for value in (one.before, one.calibrated, one.after)]
+        rows.append((one.run, *errors, percent(one.reduction)))
     html += table(("held-out run", "as given", "calibrated", "with effects", "removed"), rows, range(1, 5))
     html += heading("The hidden fault") + _revealed(hidden, result.effects, answer)
     said = "No run was held out."
     if (gap := result.gap) is not None:
         steps = (error(_number(value)) for value in (gap.heldout_calibrated, gap.heldout_after, gap.noise_floor))
         said = "Error of the held-out runs: {} calibrated, {} with what was found; noise floor {}.".format(*steps)
-    worse = [one.run for one in heldout if _number(one.after) > _number(one.calibrated)]
+    worse = [one.run for one in heldout if one.after > one.calibrated]
     not_good = [*answer.outside, *([f"the effects make the error of {listed(worse)} larger"] if worse else [])]
     verdict = SHOWN if answer.right and fell(result.gap) else NOT_SHOWN
     return Section(CHECK_TITLE, f"{answer.sentence} {said}", html, verdict, not_good)

@@ -1,17 +1,36 @@
-"""What one analysis found: everything the result file, the pictures and the report are made of."""
+"""What one analysis found: everything the result file, the pictures and the report are made of.
+
+Several of these classes stand in the result file as they are; see :mod:`wlr_gym.gap.report.result`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from wlr_gym.gap.problem import Range
 
 Array = NDArray[np.float64]
+
+
+def finite(value: Any) -> Any:
+    """JSON has no NaN: a number that is none becomes null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+#: A number that may be NaN; the result file has null for that.
+MaybeNan = Annotated[
+    float,
+    BeforeValidator(lambda value: math.nan if value is None else value),
+    PlainSerializer(finite, return_type=float | None, when_used="json"),
+]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 #: Verdicts, as in the result file.
 BAD_DATA = "bad_data"
@@ -117,13 +136,13 @@ class Evidence:
     round: int
     name: str
     where: tuple[str, ...]
-    values: Mapping[str, float]
-    gain: float
-    screened: float
+    values: Mapping[str, MaybeNan]
+    gain: MaybeNan
+    screened: MaybeNan
     outcome: str
     reason: str
-    by_run: Mapping[str, float] = field(default_factory=dict)
-    probability: float = 0.0
+    by_run: Mapping[str, MaybeNan] = field(default_factory=dict)
+    probability: Share = 0.0
     formula: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
 
@@ -217,14 +236,17 @@ class GapFigures:
 
 @dataclass(frozen=True)
 class RunGap:
-    """The same for one run; ``reduction`` by the noise floor of all held-out runs."""
+    """The same for one run: of the model as given, calibrated, and with all effects.
+
+    ``reduction`` is by the noise floor of all held-out runs.
+    """
 
     run: str
     heldout: bool
-    before: float
-    calibrated: float
-    after: float
-    reduction: float
+    before: MaybeNan = math.nan
+    calibrated: MaybeNan = math.nan
+    after: MaybeNan = math.nan
+    reduction: MaybeNan = math.nan
 
 
 @dataclass(frozen=True)
@@ -260,7 +282,7 @@ class Detectable:
     """Smallest severity of an effect that these data would have shown; NaN: none that is plausible."""
 
     parameter: str
-    value: float
+    value: MaybeNan
     unit: str
 
 
@@ -273,17 +295,14 @@ class Statistic:
         expected: median of the runs made.
         limit: their 95 % quantile.
         p: share of them, the observed ones counted in, that are as large; NaN where they cannot be compared.
+        ratio: how many times larger than expected; NaN where nothing is expected.
     """
 
-    value: float
-    expected: float
-    limit: float
-    p: float
-
-    @property
-    def ratio(self) -> float:
-        """How many times larger than expected; NaN where nothing is expected."""
-        return self.value / self.expected if self.expected > 0.0 else math.nan
+    value: MaybeNan
+    expected: MaybeNan
+    limit: MaybeNan
+    p: MaybeNan
+    ratio: MaybeNan
 
     @property
     def rejected(self) -> bool:
@@ -292,12 +311,28 @@ class Statistic:
 
 
 @dataclass(frozen=True)
-class Pulled:
-    """The number that one run pulls farthest from the other runs, in standard errors."""
+class ByChannel(Statistic):
+    """A statistic over all channels, and of each."""
+
+    channels: Mapping[str, Statistic]
+
+
+@dataclass(frozen=True)
+class Pulled(Statistic):
+    """By how many standard errors one run pulls a number away from the other runs: the largest there is."""
 
     number: str
     run: str
-    errors: Statistic
+
+
+@dataclass(frozen=True)
+class Constancy(Statistic):
+    """Scatter of the runs' estimates of the numbers over what their rows predict.
+
+    Its value is NaN where the data are informative about no number.
+    """
+
+    pulled_most: Pulled
 
 
 @dataclass(frozen=True)
@@ -306,20 +341,15 @@ class Adequacy:
 
     Attributes:
         replicates: how many sets of runs the model made.
-        level: root mean square over all channels, noise units.
-        whiteness: integrated autocorrelation time of the residuals in rows, geometric mean over the channels.
-        constancy: scatter of the runs' estimates of the numbers over what their rows predict; its value is NaN where the data
-            are informative about no number.
-        pulled: the number that is pulled most.
-        channels: name -> level and whiteness of one channel.
+        level: root mean square, noise units.
+        whiteness: integrated autocorrelation time of the residuals in rows; of all channels the geometric mean.
+        constancy: whether the runs agree about the numbers.
     """
 
     replicates: int
-    level: Statistic
-    whiteness: Statistic
-    constancy: Statistic
-    pulled: Pulled
-    channels: Mapping[str, tuple[Statistic, Statistic]]
+    level: ByChannel
+    whiteness: ByChannel
+    constancy: Constancy
 
 
 @dataclass(frozen=True)
@@ -351,9 +381,9 @@ class Threshold:
     """
 
     round: int
-    least: float
-    by_chance: float
-    none: float = math.nan
+    least: MaybeNan = math.nan
+    by_chance: MaybeNan = math.nan
+    none: MaybeNan = math.nan
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -31,20 +31,10 @@ from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import META_FILE, Profile
 from wlr_gym.data.record import motion_of, record_simulation
 from wlr_gym.data.runs import Run, read_meta, read_run, robot_of, run_files
-from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED
+from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED, Adequacy
 from wlr_gym.gap.estimation import TWO_SIDED_95
 from wlr_gym.gap.problem import Array, Setting
-from wlr_gym.gap.report.result import (
-    DECIDED,
-    NOTHING,
-    RESULT_FILE,
-    AdequacyEntry,
-    Explanation,
-    Result,
-    StatisticEntry,
-    explanations,
-    read_result,
-)
+from wlr_gym.gap.report.result import DECIDED, NOTHING, RESULT_FILE, Explanation, Result, explanations, read_result
 from wlr_gym.gap.robot.candidates import shown_by
 from wlr_gym.gap.robot.problem import LEAST_RUNS, MISFIT, RobotProblem
 from wlr_gym.gap.validation.held_out import most_left
@@ -446,10 +436,14 @@ class _Foresight:
         self.steps: Array = np.array(steps)
         # weight (channels) of a squared residual, as of the fit that left what the result says; 0 where nothing was measured
         adequacy, weights = result.adequacy, np.full(len(problem.signals), 1.0 / problem.tempering)
-        if isinstance(adequacy, AdequacyEntry):
-            scatter = problem.tempering * max(adequacy.constancy.value or 1.0, 1.0)
-            levels, times = _by_channel(adequacy.level.channels), _by_channel(adequacy.whiteness.channels)
-            worth = {k: 1.0 / (max(level, 1.0) ** 2 * times[k] * scatter) for k, level in levels.items() if k in times}
+        if isinstance(adequacy, Adequacy):
+            scatter = problem.tempering * float(np.fmax(adequacy.constancy.value, 1.0))
+            times = adequacy.whiteness.channels
+            worth = {
+                name: 1.0 / (max(level.value, 1.0) ** 2 * times[name].value * scatter)
+                for name, level in adequacy.level.channels.items()
+                if name in times and math.isfinite(level.value + times[name].value)
+            }
             weights = np.array([worth.get(signal.name, 0.0) for signal in problem.signals])
         self._root = np.sqrt(weights)
 
@@ -485,10 +479,6 @@ class _Foresight:
         """Weighted predictions (settings, rows of all runs and channels)."""
         runs = self.problem.residuals(settings, range(len(self.problem.runs)))
         return np.concatenate([(np.nan_to_num(one) * self._root).reshape(len(settings), -1) for one in runs], axis=1)
-
-
-def _by_channel(entries: Mapping[str, StatisticEntry]) -> dict[str, float]:
-    return {name: one.value for name, one in entries.items() if one.value is not None}
 
 
 def _told(difference: Array, columns: Array) -> float:

@@ -25,7 +25,7 @@ def result(name, probability=1.0):
     parameters = {"torque": {"value": 0.1, "ci95": None, "unit": "N m"}}
     effect = {"name": name, "where": ["wheel_lf"], "parameters": parameters, "confidence": 1.0}
     other = "worse fit" if probability == 1.0 else "equivalent"
-    entry = {"round": 1, "where": ["wheel_lf"], "values": {}}
+    entry = {"round": 1, "where": ["wheel_lf"], "values": {}, "gain": 0.0, "screened": 0.0, "reason": ""}
     evidence = [{**entry, "name": name, "outcome": "selected", "probability": probability}]
     evidence.append({**entry, "name": "rolling_resistance", "outcome": other, "probability": 1.0 - probability})
     content = {"verdict": "effect_found", "effects": [effect], "evidence": evidence}

@@ -120,7 +120,8 @@ def lab_messages(table, offset=0.037, imu_axes=((0, 1), (1, 1), (2, 1)), names=N
 
 
 #: Units of the laboratory's bags, and of its tables, where names do not state them.
-_UNITS = {"pos": "deg", "vel": "deg/s", "cmd_leg": "deg", "cmd_wheel": "deg/s", "eff": "N m", "gyro": "deg/s"}
+_UNITS = {"pos": "deg", "vel": "deg/s", "cmd_leg": "deg", "cmd_wheel": "deg/s", "eff": "N m", "gyro": "deg/s",
+          "acc": "m/s2", "cam": "m", "volt": "V"}  # fmt: skip
 _OF_TABLES = {"pos": "rad", "vel": "rad/s", "cmd_leg": "rad", "cmd_wheel": "rad/s", "gyro": "rad/s", "acc": "g"}
 
 
@@ -132,13 +133,11 @@ def lab_map(log, given=None, **units) -> LogMap:
         if entry.get("unit") == OPEN:
             name = max((one for one in known if key.startswith(one)), key=len)
             entry["unit"] = known[name]
-        if entry.get("sign") == OPEN:
-            entry["sign"] = 1
     for joint, entry in content.get("joints", {}).items():
         answers = {"sign": 1, "zero": 0.0}
         content["joints"][joint] = {key: answers[key] if one == OPEN else one for key, one in entry.items()}
-    if content.get("frames", {}).get("imu") == OPEN:
-        content["frames"]["imu"] = ["x", "y", "z"]
+    for frame, axes in content.get("frames", {}).items():
+        content["frames"][frame] = ["x", "y", "z"] if axes == OPEN else axes
     for topic, clock in content.get("clocks", {}).items():
         content["clocks"][topic] = {"offset": -0.037} if clock == OPEN else clock
     if content.get("meta", {}).get("profile") == OPEN:

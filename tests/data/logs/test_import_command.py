@@ -50,7 +50,7 @@ def test_with_a_folder_the_map_is_written_there_and_runs_wait_for_its_answers(mc
     monkeypatch.chdir(tmp_path)
     assert main(["import", str(mcap), "--suggest", "--out", "runs"]) == BAD_INPUT
     said = capsys.readouterr().err
-    assert "runs/map.yaml: no run is made, 24 entries of the map are open: joints.leg_lf.sign, " in said
+    assert "runs/map.yaml: no run is made, 28 entries of the map are open: joints.leg_lf.sign, " in said
     assert said.rstrip().endswith(f"replace each 'open', then: wlr import {mcap} --out runs")
     assert [path.name for path in Path("runs").iterdir()] == ["map.yaml"]
     assert "# rad, deg, turn, count? topic" in Path("runs/map.yaml").read_text()
@@ -129,15 +129,12 @@ def test_what_no_map_helps_is_said_at_once(mcap, tmp_path, capsys, suffix):
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_missing_is_said_with_its_cost(tmp_path, monkeypatch, capsys):
+def test_what_is_missing_is_said(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     messages = [one for one in lab_messages(made_up(6.0)) if one[1] not in ("/mocap/base", "/power")]
     monkeypatch.chdir(tmp_path)
     assert main(["import", str(write_mcap(tmp_path / "a.mcap", messages)), "--suggest"]) == OK
-    said = capsys.readouterr().out
-    assert "missing: cam_* of" in said
-    assert "what floor and wheels do" in said
-    assert "missing: volt: the supply counts as nominal" in said
+    assert "missing: cam, volt" in capsys.readouterr().out
 
 
 def test_a_run_goes_out_and_comes_back_without_a_map(tmp_path, capsys):

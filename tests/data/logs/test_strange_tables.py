@@ -205,14 +205,6 @@ def test_a_quaternion_with_empty_cells_is_a_lost_frame(tmp_path, frame, missing)
     assert any(f"{len(lost)} lost frame" in note for note in imported.notes)
 
 
-@pytest.mark.parametrize(("x", "yaw", "is_pose"), [("x", "yaw", True), ("cam_x", "cam_heading", True), ("flow_x", "yaw", False),
-    ("x", "imu_yaw", False), ("target_x", "target_yaw", False)])  # fmt: skip
-def test_a_pose_of_a_table_is_of_columns_that_hold_one(tmp_path, frame, x, yaw, is_pose):
-    way = np.linspace(0.0, 0.3, len(frame))
-    path = written(tmp_path / "a.csv", frame.assign(**{x: way, x[:-1] + "y": 0.1 * way, yaw: way}).to_csv(index=False))
-    assert ("cam" in lab_map(path, cam="m", cam_yaw="rad").channels) == is_pose
-
-
 def test_an_axis_stands_apart_from_the_letters_of_a_word(tmp_path, frame):
     """The y of angular_velocity_x is no axis."""
     long = {

@@ -69,17 +69,17 @@ def check_right(run, table, start, largest, exact=1e-5):
 # ---- what is decided, and what is asked ------------------------------------------------------------------------------
 
 
-def test_what_only_numbers_would_show_is_asked(proposal):
-    """JointState and Imu define units, but these loggers write others; BatteryState and PoseStamped are borne out."""
+def test_what_names_do_not_decide_is_asked(proposal):
+    """Standard messages define units, but loggers write others: no message's type decides one."""
     kinds = [f"{kind}_{part}" for kind in ("cmd", "pos", "vel", "eff") for part in ("leg", "wheel")]
     assert set(proposal.open) == {
         *(f"joints.{joint}.sign" for joint in JOINTS), *(f"joints.{leg}.zero" for leg in LEGS),
-        *(f"channels.{kind}.unit" for kind in kinds), "channels.gyro.unit", "frames.imu", "clocks./xsens/data", "meta.profile",
+        *(f"channels.{kind}.unit" for kind in (*kinds, "gyro", "acc", "cam", "volt")),
+        "frames.imu", "frames.cam", "clocks./xsens/data", "meta.profile",
     }  # fmt: skip
     assert proposal.content["joints"]["leg_lr"]["name"] == "RL_hip"
-    assert proposal.content["channels"]["acc"] == {"topic": "/xsens/data", "field": "linear_acceleration.{axis}"}
-    assert proposal.content["channels"]["cam"] == {"topic": "/mocap/base", "field": "pose.position.{axis}"}
-    assert "'pose.position.{axis}', in m" in said(proposal, "channels.cam")
+    assert proposal.content["channels"]["cam"] == {"topic": "/mocap/base", "field": "pose.position.{axis}", "unit": OPEN}
+    assert "(geometry_msgs/msg/PoseStamped), 'pose.position.{axis}'; x -0.008002 to" in said(proposal, "channels.cam")
 
 
 def test_each_question_says_what_the_log_shows(proposal):
@@ -110,21 +110,6 @@ def test_every_message_or_every_fourth_makes_a_row(table, tmp_path):
     found = suggest_map(tmp_path / "a.csv", NO_PROFILE)
     assert said(found, "rows") == "topic 'table', 200 messages a second; every 4th makes a row"
     assert found.map.every == 4
-
-
-@pytest.mark.parametrize(
-    ("channel", "change"),
-    [
-        ("acc", lambda table: {f"acc_{axis}": table[f"acc_{axis}"] / 9.81 for axis in "xyz"}),
-        ("cam", lambda table: {f"cam_{axis}": 1e3 * table[f"cam_{axis}"] for axis in "xy"}),
-        ("cam", lambda table: {f"cam_{axis}": 1e2 * table[f"cam_{axis}"] for axis in "xy"}),
-        ("volt", lambda table: {"volt": 1e3 * table["volt"]}),
-    ],
-)
-def test_a_standard_message_whose_numbers_contradict_its_unit_is_asked(tmp_path, channel, change):
-    table = made_up(6.0)
-    found = suggest_map(write_mcap(tmp_path / "a.mcap", lab_messages(table | change(table))))
-    assert found.content["channels"][channel]["unit"] == OPEN
 
 
 def test_names_state_units_and_what_joints_differ_in_is_their_name(table, tmp_path):
@@ -173,15 +158,6 @@ def test_a_name_unlike_those_beside_it_is_asked(table, tmp_path):
     pandas.DataFrame(rows_of(table)).rename(columns={"pos_leg_lf": "pos_leg_fl"}).to_csv(tmp_path / "log.csv", index=False)
     asked = set(suggest_map(tmp_path / "log.csv", NO_PROFILE).open)
     assert asked == {"joints.leg_lf.sign", "joints.leg_lf.zero", "channels.pos_leg_lf.unit"}
-
-
-def test_a_heading_of_a_table_is_asked_for_its_sense(table, tmp_path):
-    frame = lab_frame(table)
-    way = np.linspace(0.0, 0.3, len(frame))
-    frame.assign(x_m=way, y_m=0.1 * way, heading_deg=np.degrees(way)).to_csv(tmp_path / "log.csv", index=False)
-    found = suggest_map(tmp_path / "log.csv")
-    assert found.content["channels"]["cam_yaw"] == {"topic": "table", "field": "heading_deg", "unit": "deg", "sign": OPEN}
-    assert "sign: 1, or -1 where it turns clockwise?" in said(found, "channels.cam_yaw")
 
 
 def test_names_that_are_servo_numbers(tmp_path):

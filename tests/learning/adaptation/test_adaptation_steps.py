@@ -106,6 +106,7 @@ def test_a_formula_acts_as_an_effect_and_a_name_still_in_play_is_a_family(tmp_pa
     formula = {"name": "unknown_effect", "where": ["leg_lr"], "formula": "-k * leg_angle", "parameters": {"k": 0.8}}
     patch = load_patch([{**formula, "units": {"k": "N m/rad"}}])
     other = {"round": 1, "name": "coulomb_friction", "where": ["leg_lf"], "values": {"torque": 0.1}}
+    other |= {"gain": 0.0, "screened": 0.0, "reason": ""}
     evidence = [
         {**other, "outcome": "selected", "probability": 0.5},
         {**other, "name": "command_delay", "outcome": "equivalent"},

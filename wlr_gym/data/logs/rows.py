@@ -26,11 +26,11 @@ Times = NDArray[np.int64]
 Series = tuple[Times, Array]
 
 #: Angles that can be taken of a quaternion.
-ANGLES = ("yaw", "pitch", "roll", "tilt")
+ANGLES = ("yaw", "pitch", "roll")
 
 
 def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, where: str) -> tuple[Times, Array, Times]:
-    """Return times (ns) and an angle (rad) of a quaternion: ``yaw``, ``pitch``, ``roll``, or ``tilt`` off upright.
+    """Return times (ns) and an angle (rad) of a quaternion: ``yaw``, ``pitch`` or ``roll``.
 
     Frames whose quaternion is no rotation (not known, or of length 0) are lost: their times (ns) come last.
 
@@ -56,9 +56,7 @@ def pose_angle(topic: Topic, field: str, use: str, axes: Sequence[str] | None, w
     if axes is not None:  # a proper turn of both frames: the quaternion's vector turns with them
         vector = [vector[XYZ.index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0) for axis in axes]
     yaw, pitch, roll = euler_angles(np.stack([w, *vector], axis=1))
-    x, y, _ = vector
-    tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
-    values = {"yaw": np.unwrap(yaw), "pitch": pitch, "roll": roll, "tilt": tilt}[angle]
+    values = {"yaw": np.unwrap(yaw), "pitch": pitch, "roll": roll}[angle]
     return at[seen], values, at[~seen]
 
 

@@ -1,8 +1,8 @@
 """Propose a map for a log: what names and types decide, and for all else a question with what the log shows of it.
 
-Fields are found by name. A unit is decided where a name states it, or where a standard message defines it and the numbers bear
-that out. Which way a joint counts, how a sensor is mounted, what another clock says: no log shows that for certain, so the map
-asks it (``open``), and no run is made before it is answered. Columns with the names of our own channels are those channels.
+Fields are found by name, and a unit is decided where the name states it. Other units, which way a joint counts, how a sensor is
+mounted, what another clock says: no log shows that for certain, so the map asks it (``open``), and no run is made before it is
+answered. Columns with the names of our own channels are those channels.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import overlay
-from wlr_gym.data.format import COLUMNS
+from wlr_gym.data.format import CAMERA, COLUMNS
 from wlr_gym.data.logs.map import (
     GROUPS,
     NO_PROFILE,
@@ -35,7 +35,7 @@ from wlr_gym.data.logs.map import (
     words,
 )
 from wlr_gym.data.logs.readers import TABLE
-from wlr_gym.data.logs.rows import has_angle, pose_angle
+from wlr_gym.data.logs.rows import pose_angle
 from wlr_gym.data.logs.topics import Log, Topic
 from wlr_gym.robot import JOINTS, LEGS, Robot
 from wlr_gym.robot.parameter_table import XYZ
@@ -75,22 +75,10 @@ _VECTORS = {
 }
 _SHORT = {"g": "gyro", "w": "gyro", "a": "acc"}
 _VOLTAGE = {"voltage", "volt", "volts", "vbat", "vbatt"}
-_HEADING = {"yaw", "heading"}
-#: Words that a measured pose's topic and heading do not have; words one of which its x and y have, if any.
-_NOT_POSE = {"rate", "vel", "velocity", "speed", "twist", "imu", "gyro", "odom", "odometry"}
-_PLACE = {
-    "pos", "position", "pose", "place", "translation", "location", "cam", "camera", "mocap", "optitrack", "vicon", "qualisys",
-    "tag", "apriltag", "aruco", "marker", "tracker", "body", "rigid", "base", "robot", "chassis", "trunk", "torso",
-    "world", "map", "floor", "ground", "truth", "gt", "state",
-}  # fmt: skip
-#: Packages whose types say what they hold, and those of their types that hold one measured pose.
-_STANDARD = {
-    "geometry_msgs", "nav_msgs", "sensor_msgs", "std_msgs", "tf2_msgs", "visualization_msgs", "foxglove", "foxglove_msgs",
-}  # fmt: skip
-_POSES = {
-    "Pose", "Pose2D", "PoseStamped", "PoseWithCovariance", "PoseWithCovarianceStamped", "PoseInFrame", "Transform",
-    "TransformStamped",
-}  # fmt: skip
+#: Ends of the field that is the x of a pose.
+_PLACES = ("position.x", "translation.x")
+#: Words of topics and fields whose pose is computed from wheels or an IMU.
+_COMPUTED = {"imu", "gyro", "odom", "odometry"}
 
 
 @dataclass(frozen=True)
@@ -232,13 +220,16 @@ def _bracket(field: str) -> str | None:
 def _vectors(topic: Topic) -> Iterator[FieldCandidate]:
     if read_name(topic.name).command or (_says(topic.name, {"vel"}) and "Twist" in topic.kind):
         return
+    found: dict[tuple[str, str], dict[str, str]] = {}  # what stands before and behind the axis -> axis -> field
     for field in topic.fields:
-        if "twist" in field and topic.kind.endswith("Odometry"):
-            continue  # computed, not measured
-        stem, axis = _axis_of(field)
+        if (parts := _split(field)) and not ("twist" in field and topic.kind.endswith("Odometry")):  # computed, not measured
+            found.setdefault((parts[1], parts[3] or ""), {})[parts[2].lower()] = field
+    for (stem, _), fields in found.items():
+        stem = stem.rstrip("._[ ").lower()
         kind = next((kind for kind, known in _VECTORS.items() if _says(stem, known)), None) or _SHORT.get(stem)
-        if kind is not None and axis is not None and _has(topic, field, "xyz"):
-            yield FieldCandidate(f"{kind}_{axis}", topic.name, field, unit=stated_unit(field, f"{kind}_{axis}"))
+        if kind is not None and len(fields) == len(XYZ):
+            for axis, field in fields.items():
+                yield FieldCandidate(f"{kind}_{axis}", topic.name, field, unit=stated_unit(field, f"{kind}_{axis}"))
 
 
 def _supply(topic: Topic) -> Iterator[FieldCandidate]:
@@ -247,39 +238,21 @@ def _supply(topic: Topic) -> Iterator[FieldCandidate]:
             yield FieldCandidate("volt", topic.name, field, unit=stated_unit(field, "volt"))
 
 
-def may_be_pose(field: str) -> bool:
-    """Whether a field is an x of a position or translation, whatever is there."""
-    return field.endswith(("position.x", "translation.x"))
-
-
 def _pose(topic: Topic) -> Iterator[FieldCandidate]:
-    """Yield what may be the body's pose: no setpoint, no joint's, no element of a list, and not computed from wheels."""
-    kind = re.split(r"[/.]", topic.kind)
-    if kind[-1] == "Odometry" or (kind[0] in _STANDARD and kind[-1] not in _POSES):
-        return
-    if _of_other(topic.name) or _says(topic.name, _NOT_POSE):
-        return
-    for field in topic.fields:
-        if may_be_pose(field) and "[" not in field and not _of_other(field):
+    """Yield what may be the body's measured pose: columns with our names, or the position and quaternion of a message.
+
+    It is no setpoint, no joint's, no element of a list, and not computed from wheels.
+    """
+    if topic.name == TABLE:
+        yield from (FieldCandidate(column, topic.name, column) for column in CAMERA[:3] if column in topic.fields)
+    elif not topic.kind.endswith("Odometry") and not _of_other(topic.name) and not _says(topic.name, _COMPUTED):
+        for field in (field for field in topic.fields if field.endswith(_PLACES) and "[" not in field and not _of_other(field)):
             stem = field.removesuffix("position.x").removesuffix("translation.x")
-            turn = f"{stem}orientation" if f"{stem}orientation.w" in topic.fields else f"{stem}rotation"
-            if f"{turn}.w" in topic.fields:
-                yield from (FieldCandidate(f"cam_{axis}", topic.name, f"{field[:-1]}{axis}") for axis in "xyz")
-                yield FieldCandidate("cam_yaw", topic.name, f"{turn}.yaw")
+            turns = [turn for turn in (f"{stem}orientation", f"{stem}rotation") if f"{turn}.w" in topic.fields]
+            if turns:
+                yield from (FieldCandidate(f"cam_{axis}", topic.name, f"{field[:-1]}{axis}") for axis in XYZ)
+                yield FieldCandidate("cam_yaw", topic.name, f"{turns[0]}.yaw")
                 return
-    turns = [field[:-1] for field in topic.fields if field.endswith("w") and _has(topic, f"{field[:-1]}x", "xyz")]
-    named = [field for field in topic.fields if _says(field, _HEADING) or re.fullmatch(r"(.*\.)?theta", field)]
-    headings = [*named, *(f"{turn.rstrip('._')}.yaw" for turn in turns)]
-    headings = [field for field in headings if not _says(field, _NOT_POSE) and not _of_other(field)]
-    places = []
-    for field in (field for field in topic.fields if field[:-1] not in turns and not _of_other(field)):
-        stem, axis = _axis_of(_bracket(field) or field)  # x or, as in pose.x or cam_x, the x of a place
-        if axis == "x" and (not stem or _says(stem, _PLACE)) and not _says(stem, _NOT_POSE) and _has(topic, field, "xy"):
-            places.append(field)
-    if headings and places:
-        heading = min(headings, key=lambda one: words(one)[0] != words(places[0])[0])
-        for column, field in (("cam_x", places[0]), ("cam_y", _other(places[0], "y")), ("cam_yaw", heading)):
-            yield FieldCandidate(column, topic.name, field, unit=stated_unit(field, column))
 
 
 def _of_other(name: str) -> bool:
@@ -288,26 +261,10 @@ def _of_other(name: str) -> bool:
     return facts.command or facts.corner is not None
 
 
-def _axis_of(field: str) -> tuple[str, str | None]:
-    """Return the name without its axis, and the axis: of ``gyro_x``, ``imu.acc.y``, ``gz``, ``x``, ``acc_x_mg``."""
-    found = _split(field)
-    return (found[1].rstrip("._[ ").lower(), found[2].lower()) if found else (field.lower(), None)
-
-
-def _other(field: str, axis: str) -> str:
-    """Return a field's name with another axis."""
-    found = _split(field)
-    return f"{found[1]}{axis.upper() if found[2].isupper() else axis}{found[3]}" if found else field
-
-
 def _split(field: str) -> re.Match[str] | None:
     """Split a name before and behind its axis; a letter that stands apart, as in ``velocity_x``, before one that does not."""
     end = r"([xyzXYZ])((?:\]|[_ \[(].*)?)"
     return re.fullmatch(rf"(.*[._\[ ]|){end}", field) or re.fullmatch(rf"(.*?){end}", field)
-
-
-def _has(topic: Topic, field: str, axes: Iterable[str]) -> bool:
-    return all(_other(field, axis) in topic.fields for axis in axes)
 
 
 def _says(name: str, known: set[str]) -> bool:
@@ -349,14 +306,12 @@ Series = tuple[Array, Array]
 
 #: Messages per topic that are looked at: 100 s of an IMU at 200 Hz.
 MOST = 20_000
-#: s over which a pose's speed is taken, and from the start on that count as rest.
-_WINDOW, _START = 0.5, 0.5
+#: s from the start on that count as rest.
+_START = 0.5
 #: s; a topic that is delivered so much earlier or later than the joints may have another clock.
 _LATE = 0.02
 #: Share of headers not later than the one before, from which on they are no times; ns of a clock that began anew.
 _NO_TIMES, _ANEW = 0.02, -1_000_000_000
-#: rad; a robot that drives is not tilted by so much.
-_TILTED = 1.0
 #: Columns of a table that are listed where one is asked for.
 _LISTED = 64
 #: Parts of a proposal, each a question or a set of channels that are read alike.
@@ -457,6 +412,8 @@ class _Proposer:
         given = parse_map(self.known, "map")
         names = {joint: one.name for joint, one in given.joints.items()}
         found = find_candidates(self.log, self.robot, given.namespace, names)
+        if len({one.topic for one in found.get("cam_x", ())}) > 1:  # which of them is the body's is for the user to say
+            found = {column: fields for column, fields in found.items() if not column.startswith("cam")}
         self.mapped = {column for key in given.channels for column in GROUPS.get(key, (key,))}
         self.chosen = {column: fields[0] for column, fields in found.items() if column not in self.mapped}
         for column in ("eff_" + joint for joint in JOINTS):
@@ -509,9 +466,6 @@ class _Proposer:
         else:
             at, values, _ = pose_angle(topic, chosen.field, clock.use, None, self.log.name)
         keep = np.isfinite(values)
-        yaw = self.chosen.get("cam_yaw")
-        if column.startswith("cam") and yaw is not None and yaw.topic == chosen.topic and has_angle(topic, yaw.field):
-            keep &= ~np.isin(at, pose_angle(topic, yaw.field, clock.use, None, self.log.name)[2])
         at, values = at[keep], values[keep]
         once = np.concatenate([[True], np.diff(at) > 0]) if len(at) else np.zeros(0, bool)
         origin = min(int(one.received[0]) for one in self.log.topics.values() if len(one.received))
@@ -587,15 +541,11 @@ class _Proposer:
         together = len(columns) == len(_SETS[name]) and "{" in first["field"] and all(one == first for one in entries.values())
         units = {column: self._unit(column) for column in columns}
         groups = {name: columns} if together and len(set(units.values())) == 1 else {column: [column] for column in columns}
-        is_angle = name == "cam_yaw" and self.chosen[name].field in self.log.topics[self.chosen[name].topic].fields
-        asks_sign = is_angle and name not in self.ours
         asked = []
         for key, members in groups.items():
             unit, entry = units[members[0]], dict(entries[members[0]])
             if unit != COLUMNS[members[0]].unit:
                 entry["unit"] = unit
-            if asks_sign:
-                entry["sign"] = OPEN
             self.content["channels"][key] = entry
             if OPEN in entry.values():
                 asked.append((key, members))
@@ -606,11 +556,10 @@ class _Proposer:
             self.note(f"channels.{next(iter(groups))}", f"{count}{source}, {by}", asks=False)
             return
         key, members = asked[0]
-        question = f"{', '.join(units_of(members[0]))}?" if OPEN in [units[one] for one in members] else ""
-        question += " sign: 1, or -1 where it turns clockwise?" if asks_sign else ""
+        question = f"{', '.join(units_of(members[0]))}?"
         ranges = "; ".join(f"{column.partition('_')[2] or column} {_range(self.raw(column))}" for column in columns)
         stall = f"; the motor stalls at {effort_range(columns[0], self.robot)[0]:.3g} N m" if kind == "eff" else ""
-        self.note(f"channels.{key}", f"{question.strip()} {count}{source}; {ranges}{stall}. {_MATTERS[kind]}")
+        self.note(f"channels.{key}", f"{question} {count}{source}; {ranges}{stall}. {_MATTERS[kind]}")
 
     def _frames(self) -> None:
         given = self.known.get("frames", {})
@@ -627,56 +576,28 @@ class _Proposer:
                 shown.append(f"gyro varies by {sizes} (a robot that drives turns about up)")
             self.note("frames.imu", f"{'. '.join(shown)}. {_MATTERS['frames']}")
         if "cam_z" in self.chosen and "cam_x" in self.chosen and "cam" not in given:
+            self.content["frames"]["cam"] = OPEN
             spread = [float(np.ptp(values)) if len(values) else 0.0 for _, values in map(self.raw, (f"cam_{a}" for a in XYZ))]
             shown = ", ".join(f"{axis} goes over {size:.3g}" for axis, size in zip(XYZ, spread, strict=True))
-            shown += ": the one that hardly changes points up"
-            chosen = self.chosen["cam_yaw"]
-            topic, stem = self.log.topics[chosen.topic], chosen.field.rpartition(".")[0]
-            _, tilts, _ = pose_angle(topic, f"{stem}.tilt", self.clocks[chosen.topic].use, None, self.log.name)
-            is_tilted = (tilt := float(np.median(tilts))) > _TILTED  # off upright: no run begins on its side
-            if is_tilted:
-                shown += f"; its quaternion tilts the robot by {np.degrees(tilt):.0f} deg: are its parts in another order?"
-            if is_tilted or spread[2] > 0.3 * min(spread[:2]) or spread[2] == max(spread):
-                self.content["frames"]["cam"] = OPEN
-                text = "the pose's axes that our x, y and z (up) are: [x, y, z], or [x, -z, y] where its y points up"
-                self.note("frames.cam", f"{text}. {shown}. {_MATTERS['frames']}")
-        others = [f"'{name}'" for name, topic in self.log.topics.items() if any(map(may_be_pose, topic.fields))]
+            text = "the pose's axes that our x, y and z (up) are: [x, y, z], or [x, -z, y] where its y points up"
+            up = "the one that hardly changes points up"
+            self.note("frames.cam", f"{text}. {shown}: {up}. {_MATTERS['frames']}")
+        others = [f"'{name}'" for name, topic in self.log.topics.items() if any(one.endswith(_PLACES) for one in topic.fields)]
         if others and "cam_x" not in self.chosen and not any(column.startswith("cam") for column in self.mapped):
-            text = f"not proposed: the poses of {', '.join(others)} are not known to be the body's, measured; name one if it is"
+            text = f"not proposed: which pose of {', '.join(others)} is the body's, measured, is not known; name it if one is"
             self.note("channels.cam", text, asks=False)
 
     # ---- what is decided --------------------------------------------------------------------------------------------
 
     def _unit(self, column: str) -> str:
-        """Return the unit of a column's field, as its name or its type states it, else that it is open."""
-        one, si = self.chosen[column], COLUMNS[column].unit
-        if column in self.ours or (column == "cam_yaw" and one.field not in self.log.topics[one.topic].fields):
-            return si
-        if one.unit is not None:
-            return one.unit
-        kind = self.log.topics[one.topic].kind
-        if column.startswith("acc") and re.fullmatch(r"sensor_msgs/.*Imu", kind):
-            is_right = abs(float(np.linalg.norm(self._gravity())) / 9.81 - 1.0) < 0.15
-        elif column.startswith("cam") and re.fullmatch(r"geometry_msgs/.*Pose.*", kind):
-            is_right = self._is_quick()
-        elif column == "volt" and re.fullmatch(r"sensor_msgs/.*BatteryState", kind):
-            is_right = 5.0 < float(np.median(self.raw("volt")[1])) < 60.0
-        else:
-            is_right = False
-        return si if is_right else OPEN
+        """Return the unit of a column's field: SI of our own columns and of quaternions, else as its name states, or open."""
+        one = self.chosen[column]
+        if column in self.ours or one.field not in self.log.topics[one.topic].fields:
+            return COLUMNS[column].unit
+        return one.unit or OPEN
 
     def _gravity(self) -> Array:
         return np.array([np.median(self.raw(f"acc_{axis}")[1]) for axis in XYZ])
-
-    def _is_quick(self) -> bool:
-        """Whether the pose moves as fast as the robot can in m: in cm it would crawl at a hundredth of that, or race."""
-        fastest = self.robot.servo.wheel.no_load_speed * self.robot.wheel.radius
-        steps = []
-        for axis in (axis for axis in XYZ if f"cam_{axis}" in self.chosen):
-            t, values = self.raw(f"cam_{axis}")
-            steps.append(np.diff(np.interp(np.arange(t[0], t[-1], _WINDOW), t, values)) if len(t) else values)
-        speed = np.sqrt(sum(step**2 for step in steps)) / _WINDOW
-        return bool(len(speed)) and 0.05 < float(np.quantile(speed, 0.95)) / fastest < 1.5
 
     # ---- what is shown ----------------------------------------------------------------------------------------------
 

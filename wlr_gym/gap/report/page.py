@@ -322,16 +322,16 @@ def _how_sure(analysis: Analysis) -> str:
 
 
 def _adequacy(found: Adequacy) -> str:
-    left = sorted(found.channels.items(), key=lambda pair: -pair[1][0].value)
-    pulled = found.pulled
+    ordered = sorted(found.level.channels, key=lambda name: -found.level.channels[name].value)
+    pulled = found.constancy.pulled_most
     rows = [
         ("level", "error of all channels, units of sensor noise", *_statistic(found.level)),
         ("whiteness", "integrated autocorrelation time in rows, geometric mean of the channels", *_statistic(found.whiteness)),
         ("constancy", "scatter of the runs' estimates over what their rows predict", *_statistic(found.constancy)),
-        ("", f"standard errors by which {pulled.run} pulls {pulled.number}: the largest", *_statistic(pulled.errors)),
+        ("", f"standard errors by which {pulled.run} pulls {pulled.number}: the largest", *_statistic(pulled)),
     ]
-    rows += [(f"level: {name}", channel(name), *_statistic(level)) for name, (level, _) in left]
-    rows += [(f"whiteness: {name}", channel(name), *_statistic(white)) for name, (_, white) in left]
+    for kind, tested in (("level", found.level), ("whiteness", found.whiteness)):
+        rows += [(f"{kind}: {name}", channel(name), *_statistic(tested.channels[name])) for name in ordered]
     headings = ("what", "", "measured", "expected", "95 % limit", "times", "p")
     return (
         f"<p>{escape(adequacy(found))}</p>\n{_ADEQUACY}\n"

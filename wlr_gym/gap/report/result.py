@@ -1,8 +1,9 @@
 """The result file of an analysis, ``result.json``, and the patch that adds what was found to the model, ``patch.yaml``.
 
-The models of this module, :class:`Result` and its parts, are the format: what is written has passed them, and
-:func:`read_result` checks a file against them. Keys that other versions add are kept. :func:`explanations` says what a result
-leaves open: the names that its data do not distinguish, and "nothing more".
+:class:`Result` is the format: its parts are models of this module, and those classes of :mod:`wlr_gym.gap.analysis` that the
+file has as they are. What is written has passed it, and :func:`read_result` checks a file against it. Keys that other versions
+add to the models are kept. :func:`explanations` says what a result leaves open: the names that its data do not distinguish, and
+"nothing more".
 """
 
 from __future__ import annotations
@@ -32,25 +33,23 @@ from wlr_gym.gap.analysis import (
     Adequacy,
     Analysis,
     Calibrated,
+    Detectable,
+    Evidence,
     FoundEffect,
     Recommendation,
     Relation,
-    Statistic,
+    RunGap,
+    Share,
+    Threshold,
     Turning,
+    finite,
 )
 from wlr_gym.gap.report.text import closure, sentence, unit_of
 from wlr_gym.physics.effects import Patch, PatchEffect, save_patch
 from wlr_gym.physics.plants.forces import COORDINATES
 
-
-def finite(value: Any) -> Any:
-    """JSON has no NaN: a number that is none becomes null."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 Number = Annotated[float, Field(allow_inf_nan=False)]
 MaybeNumber = Annotated[float | None, BeforeValidator(finite)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Interval = tuple[Number, Number]
 
 
@@ -133,92 +132,11 @@ class GapEntry(_Entry):
     cap: MaybeNumber = None
 
 
-class RunGapEntry(_Entry):
-    """Error of one run: of the model as given, calibrated, and with all effects; ``reduction``: the share that they remove."""
-
-    run: str
-    heldout: bool
-    before: MaybeNumber = None
-    calibrated: MaybeNumber = None
-    after: MaybeNumber
-    reduction: MaybeNumber = None
-
-
 class RunsEntry(_Entry):
     """Names of the runs that were fitted to, and of the held-out ones."""
 
     fit: list[str]
     heldout: list[str]
-
-
-class DetectableEntry(_Entry):
-    """Smallest severity of an effect that the data would have shown; null: none that is plausible."""
-
-    parameter: str
-    value: MaybeNumber
-    unit: str
-
-
-class StatisticEntry(_Entry):
-    """A statistic of what the final model leaves in the fitted runs, beside the same of runs that it made itself.
-
-    ``expected`` is their median, ``limit`` their 95 % quantile, ``p`` the share of them, the observed ones counted in, that is
-    as large, ``ratio`` value over expected.
-    """
-
-    value: MaybeNumber
-    expected: MaybeNumber
-    limit: MaybeNumber
-    p: MaybeNumber
-    ratio: MaybeNumber
-
-
-class ByChannelEntry(StatisticEntry):
-    """A statistic over all channels, and of each."""
-
-    channels: dict[str, StatisticEntry]
-
-
-class PulledEntry(StatisticEntry):
-    """By how many standard errors one run pulls a number away from the other runs: the largest there is."""
-
-    number: str
-    run: str
-
-
-class ConstancyEntry(StatisticEntry):
-    """Scatter of the runs' estimates of the model's numbers, over what their rows predict."""
-
-    pulled_most: PulledEntry
-
-
-class AdequacyEntry(_Entry):
-    """Whether the final model is adequate: information, no decision. ``replicates`` sets of runs were made by it."""
-
-    replicates: int
-    level: ByChannelEntry
-    whiteness: ByChannelEntry
-    constancy: ConstancyEntry
-
-
-class EvidenceEntry(_Entry):
-    """One candidate in one round of the search, and its outcome; see :class:`wlr_gym.gap.analysis.Evidence`."""
-
-    round: int
-    name: str
-    where: list[str]
-    values: dict[str, MaybeNumber]
-    outcome: str
-    probability: Share = 0.0
-    formula: str = ""
-    units: dict[str, str] = Field(default_factory=dict)
-
-
-class ThresholdEntry(_Entry):
-    """One round of the search; ``none``: probability that none of its candidates is missing."""
-
-    round: int
-    none: MaybeNumber = None
 
 
 class Result(_Entry):
@@ -233,16 +151,16 @@ class Result(_Entry):
     localisation: dict[str, LocalisationEntry]
     relations: list[Relation] = Field(default_factory=list)
     gap: GapEntry | None
-    run_gaps: list[RunGapEntry] = Field(default_factory=list)
+    run_gaps: list[RunGap] = Field(default_factory=list)
     runs: RunsEntry
     patch: str
-    detectable: dict[str, DetectableEntry] = Field(default_factory=dict)
+    detectable: dict[str, Detectable] = Field(default_factory=dict)
     closure: str = ""
     turning: Turning | None = None
-    evidence: list[EvidenceEntry] = Field(default_factory=list)
-    thresholds: list[ThresholdEntry] = Field(default_factory=list)
+    evidence: list[Evidence] = Field(default_factory=list)
+    thresholds: list[Threshold] = Field(default_factory=list)
     recommendations: list[Recommendation] = Field(default_factory=list)
-    adequacy: AdequacyEntry | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel
+    adequacy: Adequacy | dict[str, MaybeNumber] | None = None  # earlier versions: the level of each channel
 
 
 RESULT_FILE = "result.json"
@@ -285,7 +203,7 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
     places = sorted(analysis.localisation, key=lambda place: -place.share)
     gap, as_it_is = analysis.gap, (
         "verdict", "relations", "detectable", "turning", "evidence", "thresholds", "run_gaps", "channel_gaps", "intake",
-        "recommendations", "known_effects", "seconds",
+        "recommendations", "adequacy", "known_effects", "seconds",
     )  # fmt: skip
     content = {
         **{name: getattr(analysis, name) for name in as_it_is},
@@ -304,7 +222,6 @@ def result_of(analysis: Analysis, patch: Path | str = PATCH_FILE) -> Result:
         },
         "runs": {"fit": analysis.fit_runs, "heldout": analysis.heldout_runs},
         "patch": str(patch),
-        "adequacy": analysis.adequacy and _adequacy(analysis.adequacy),
         "provenance": {
             "made_by": MADE_BY, "data": analysis.data, "date": _today(), "version": __version__, **analysis.provenance
         },
@@ -355,20 +272,6 @@ def _interval(low: float, high: float, holding: float | None = None) -> list[flo
     if not (math.isfinite(low) and math.isfinite(high)):
         return None
     return [low, high] if holding is None else [min(low, holding), max(high, holding)]
-
-
-def _adequacy(found: Adequacy) -> dict[str, Any]:
-    def told(one: Statistic, **more: Any) -> dict[str, Any]:
-        return {**vars(one), "ratio": one.ratio, **more}
-
-    levels, whites = ({name: told(both[k]) for name, both in found.channels.items()} for k in (0, 1))
-    pulled = told(found.pulled.errors, number=found.pulled.number, run=found.pulled.run)
-    return {
-        "replicates": found.replicates,
-        "level": told(found.level, channels=levels),
-        "whiteness": told(found.whiteness, channels=whites),
-        "constancy": told(found.constancy, pulled_most=pulled),
-    }
 
 
 def _today() -> str:
@@ -434,15 +337,15 @@ def explanations(result: Result) -> tuple[Explanation, ...]:
             continue
         if selected is None and added:
             break
-        found = _of_round(entries, threshold.none or 0.0, added)
+        found = _of_round(entries, 0.0 if math.isnan(threshold.none) else threshold.none, added)
         if selected is None or len(found) > 1:
             break
         added = found[0].effects
     return tuple(found)
 
 
-def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[PatchEffect, ...]) -> list[Explanation]:
-    best: dict[str, EvidenceEntry] = {}
+def _of_round(entries: Sequence[Evidence], nothing: float, added: tuple[PatchEffect, ...]) -> list[Explanation]:
+    best: dict[str, Evidence] = {}
     total: dict[str, float] = {NOTHING: nothing}
     for entry in sorted(entries, key=lambda one: -one.probability):
         best.setdefault(entry.name, entry)
@@ -453,7 +356,7 @@ def _of_round(entries: Sequence[EvidenceEntry], nothing: float, added: tuple[Pat
         effects = added
         if name in best:
             entry = best[name]
-            values = {key: value for key, value in entry.values.items() if value is not None}
+            values = {key: value for key, value in entry.values.items() if math.isfinite(value)}
             effects = (*added, PatchEffect(name, tuple(entry.where), values, entry.formula, entry.units))
         ranked.append(Explanation(name, share / whole, effects))
     chosen = next((entry.name for entry in entries if entry.outcome == SELECTED), NOTHING)

@@ -231,12 +231,12 @@ def adequacy(found: Adequacy) -> str:
     untested = "" if math.isfinite(found.constancy.p) else " Whether the runs agree could not be tested."
     if not beyond:
         return f"{compared}, it leaves nothing in the fitted runs that chance does not explain.{untested}"
-    levels = {name: level for name, (level, _) in found.channels.items() if level.rejected}
+    levels = {name: level for name, level in found.level.channels.items() if level.rejected}
     excess = {name: one.value**2 - one.expected**2 for name, one in levels.items()}
     most = sorted(levels, key=lambda name: -excess[name])[:3]
     where = f" Most of the error that is not expected is in {listed(most)}." if found.level.rejected and most else ""
-    apart = found.pulled.errors.rejected
-    pulled = f" {found.pulled.run} pulls {found.pulled.number} farthest from the others." if apart else ""
+    most_pulled = found.constancy.pulled_most
+    pulled = f" {most_pulled.run} pulls {most_pulled.number} farthest from the others." if most_pulled.rejected else ""
     return f"{compared}, more than chance explains is left in the fitted runs: {listed(beyond)}.{where}{pulled}{untested}"
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,25 +199,12 @@ def _block_squares(found: Replayed) -> Array:
 # ---- runs that are replayed worst ------------------------------------------------------------------------------------
 
 
-class RunError(Protocol):
-    """Error of one run, as in an analysis or in a result file."""
-
-    @property
-    def run(self) -> str: ...
-
-    @property
-    def heldout(self) -> bool: ...
-
-    @property
-    def after(self) -> float | None: ...
-
-
-def most_left(fitted: float | None, runs: Iterable[RunError]) -> tuple[float, str]:
+def most_left(fitted: float | None, runs: Iterable[RunGap]) -> tuple[float, str]:
     """Return the largest error, and of which held-out run it is; "" = of the fitted runs together.
 
     Fitted runs count together, as the fit sees them. Held-out ones count one by one: a single motion may show what is missing.
     """
-    return max([(fitted or 0.0, ""), *((one.after or 0.0, one.run) for one in runs if one.heldout)], key=lambda one: one[0])
+    return max([(fitted or 0.0, ""), *((one.after, one.run) for one in runs if one.heldout)], key=lambda one: one[0])
 
 
 def most_in(channels: Iterable[ChannelGap]) -> str:

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from wlr_gym.gap.analysis import Adequacy, Pulled, Statistic, Turning
+from wlr_gym.gap.analysis import Adequacy, ByChannel, Constancy, Pulled, Statistic, Turning
 from wlr_gym.gap.estimation import Fit, Replayed, estimate_noise, run_scatter
 from wlr_gym.gap.problem import Array
 from wlr_gym.gap.selection.screening import Products
@@ -93,18 +93,18 @@ def adequacy_of(found: Fit) -> Adequacy | None:
     run, which = np.unravel_index(int(np.argmax(pulls[0])), pulls[0].shape)
     names = [quantity.name for quantity in problem.quantities]
     names += [f"{candidate.label} {one.name}" for candidate, _ in found.model.effects for one in candidate.unknowns]
-    pulled = compared(pulls.max(axis=(1, 2)))
+    number, pulled_by = names[int(which)], problem.runs[found.runs[int(run)]]
+    pulled = Pulled(**vars(compared(pulls.max(axis=(1, 2)))), number=number, run=pulled_by)
+    measured = [(c, signal.name) for c, signal in enumerate(problem.signals) if np.isfinite(levels[0, c])]
+
+    def by_channel(whole: Array, values: Array) -> ByChannel:
+        return ByChannel(**vars(compared(whole)), channels={name: compared(values[:, c]) for c, name in measured})
+
     return Adequacy(
         REPLICATES,
-        compared(np.sqrt(np.nanmean(levels**2, axis=1))),
-        compared(np.exp(np.nanmean(np.log(times), axis=1))),
-        compared(scatters),
-        Pulled(names[int(which)], problem.runs[found.runs[int(run)]], pulled),
-        {
-            signal.name: (compared(levels[:, c]), compared(times[:, c]))
-            for c, signal in enumerate(problem.signals)
-            if np.isfinite(levels[0, c])
-        },
+        by_channel(np.sqrt(np.nanmean(levels**2, axis=1)), levels),
+        by_channel(np.exp(np.nanmean(np.log(times), axis=1)), times),
+        Constancy(**vars(compared(scatters)), pulled_most=pulled),
     )
 
 
@@ -115,10 +115,12 @@ def compared(values: Array) -> Statistic:
     """
     observed, others = float(values[0]), values[1:]
     if not np.isfinite(values).all():
-        return Statistic(observed, math.nan, math.nan, math.nan)
+        return Statistic(observed, math.nan, math.nan, math.nan, math.nan)
     larger = int((others >= observed).sum())
     limit = float(np.quantile(others, 0.95, method="weibull"))  # what a value of p = 0.05 must exceed
-    return Statistic(observed, float(np.median(others)), limit, (1 + larger) / (1 + len(others)))
+    expected = float(np.median(others))
+    ratio = observed / expected if expected > 0.0 else math.nan
+    return Statistic(observed, expected, limit, (1 + larger) / (1 + len(others)), ratio)
 
 
 # ---- periodic residuals ----------------------------------------------------------------------------------------------
