@@ -28,6 +28,11 @@ def read_curve(path: Path) -> list[dict[str, float]]:
         raise InputError(f"{path}: not a learning curve: {error}") from None
 
 
+def rows_of(path: Path) -> list[dict[str, float]]:
+    """Return the rows of a curve, oldest first; none before there is a file."""
+    return read_curve(path) if path.is_file() else []
+
+
 def wall_time(curve: Iterable[Mapping[str, float]]) -> float:
     """Return the time a run took, s, by the ``seconds`` of its rows: a clock that starts anew each time the run is resumed."""
     clock = [row["seconds"] for row in curve]
