@@ -120,6 +120,18 @@ def test_scores_of_other_policies_are_refused(policy):
     assert not policy.with_suffix(".md").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["velocity_blind", "--robot", "nominal"], "--robot: of archives (.zip) only"),
+        (["velocity_blind", "path_blind"], "expected one policy, got 2"),
+    ],
+)
+def test_options_that_do_not_go_together(words, message, capsys):
+    assert main(["export", *words]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_command_line(policy, tmp_path, capsys):
     (tmp_path / "scores").mkdir()
     assert main(["export", str(policy), "--card", str(tmp_path / "scores")]) == 2

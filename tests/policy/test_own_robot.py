@@ -16,7 +16,6 @@ from wlr_gym.learning.sweep.plan import SweepPlan, resolve
 from wlr_gym.learning.training import with_robot
 from wlr_gym.policy import environment_for, load_policy, make_policy, policy_environment, write_contract
 from wlr_gym.policy.control import PidConfig, known_robot
-from wlr_gym.policy.export import reseal
 from wlr_gym.robot import load_robot, robot_content, robot_hash
 
 NOMINAL = load_robot()
@@ -83,19 +82,13 @@ def test_controllers_take_the_environments_robot():
     environment = contract(load_task("velocity", HEAVY), {})
     assert known_robot(environment, None, "pid") == load_robot(HEAVY)
     pid: Any = make_policy("pid", environment)
-    assert pid.chassis.robot == load_robot(HEAVY)
+    assert pid.robot == load_robot(HEAVY)
     with pytest.raises(InputError, match=r"agent 'pid': robot 'wlr-nominal' is not the environment's \('heavy'\)"):
         known_robot(environment, "nominal", "pid")
     old = copy.deepcopy(environment)
     del old["robot"]["description"]
     with pytest.raises(InputError, match="is not the environment's"):
         known_robot(old, None, "pid")
-
-
-def test_reseal_knows_the_robot(policy):
-    assert reseal(policy / "policy") == []
-    with pytest.raises(InputError, match="not the robot of its training"):
-        reseal(policy / "policy", "nominal")
 
 
 def test_deploy_drives_the_policys_robot_where_nobody_names_one(policy, file, tmp_path):

@@ -37,7 +37,6 @@ from wlr_gym.policy import (
     shipped_names,
     write_model_card,
 )
-from wlr_gym.policy.export import reseal
 
 #: Episodes whose observations are compared, and their length, s.
 ROBOTS = 16
@@ -50,7 +49,7 @@ ELSEWHERE = ("--out", "--resume", "--max-minutes")
 class ExportOptions(JsonOption, ForceOption):
     policy: tyro.conf.Positional[tuple[str, ...]] = ()
     """Policy folder, run folder, or archive of Stable-Baselines3 (.zip, with --env); with --card: policy file, or name of a
-    shipped policy; with --reseal: any of these; with --to: runs, or folders of runs."""
+    shipped policy; with --to: runs, or folders of runs."""
     out: Path | None = None
     """The file; default: policy.onnx. With --to: the folder; default: where each run is."""
     to: Literal["mcap", "rosbag2"] | None = None
@@ -63,15 +62,13 @@ class ExportOptions(JsonOption, ForceOption):
     """Of an archive: settings in configs/agent/, or a path, whose environment has the observations of its training."""
     normalizer: Path | None = None
     """Of an archive: saved VecNormalize that its observations went through."""
-    reseal: bool = False
-    """Instead, rewrite the contracts of policies in the present form, where the robot is the same, and say what changed."""
     robot: str | None = None
-    """Of an archive, and with --reseal: robot of the training: robot file, or name in configs/robot/; default: the task's, or
-    the contract's. Other policies carry their robot."""
+    """Of an archive: robot of the training: robot file, or name in configs/robot/; default: the task's. Other policies carry
+    their robot."""
 
 
 def run(options: ExportOptions) -> int:
-    """Export and compare, or write the card, or reseal; say what was written."""
+    """Export and compare, or write the card; say what was written."""
     found = _do(options)
     if options.json:
         print_json(found)
@@ -82,15 +79,11 @@ def _do(options: ExportOptions) -> Any:
     """Do it, say so, and return what came of it."""
     if options.to is not None:
         return _export_runs(options, options.to)
-    if options.reseal:
-        return _reseal(options)
     if len(options.policy) != 1:
-        raise InputError(f"expected one policy, got {len(options.policy)}; several go with --reseal")
+        raise InputError(f"expected one policy, got {len(options.policy)}")
     if options.policy[0].endswith(".zip"):
         return _import(options)
-    refuse_given(
-        options, ("robot",), "of archives (.zip) and with --reseal only; other policies carry the robot of their training"
-    )
+    refuse_given(options, ("robot",), "of archives (.zip) only; other policies carry the robot of their training")
     refuse_given(options, ("env", "config", "normalizer"), "of archives (.zip) only; other policies say themselves")
     if options.card is None:
         return _export(options)
@@ -112,9 +105,7 @@ def _export_runs(options: ExportOptions, form: str) -> list[Path]:
     from wlr_gym.data.logs.messages import FORMATS
     from wlr_gym.data.runs import read_run, some_runs
 
-    refuse_given(
-        options, ("card", "env", "config", "normalizer", "reseal", "robot"), f"it is of policies; --to {form} writes runs"
-    )
+    refuse_given(options, ("card", "env", "config", "normalizer", "robot"), f"it is of policies; --to {form} writes runs")
     paths = [run for name in map(Path, options.policy) for run in (some_runs(name) if name.is_dir() else [name])]
     if not paths:
         raise InputError("--to: expected runs, or folders of runs")
@@ -138,18 +129,6 @@ def _check_targets(paths: Sequence[Path], targets: Sequence[Path], force: bool) 
             raise InputError(f"{path} and {taken[target]}: both would be {target}: export them to folders of their own (--out)")
         refuse_existing(target, force)
         taken[target] = path
-
-
-def _reseal(options: ExportOptions) -> dict[str, list[str]]:
-    refuse_given(options, ("out", "card"), "--reseal rewrites policies where they are: leave it out")
-    if not options.policy:
-        raise InputError("--reseal: expected policies: files, folders or names of shipped ones")
-    changes = {}
-    for source in options.policy:
-        place = find_policy(source)
-        changes[str(place)] = list(reseal(place, options.robot))
-        print("\n  ".join([f"{place}:", *(changes[str(place)] or ["nothing changed"])]))
-    return changes
 
 
 def _export(options: ExportOptions) -> dict[str, Any]:

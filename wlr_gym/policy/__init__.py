@@ -20,7 +20,7 @@ from wlr_gym.policy.agents import (
     trained_environment,
     untrained,
 )
-from wlr_gym.policy.export import Parity, export_policy, exportable, reseal, write_model_card
+from wlr_gym.policy.export import Parity, export_policy, exportable, write_model_card
 from wlr_gym.policy.file import camera_share, check_contract, misses_camera, needs_camera, read_contract, write_contract
 
 __all__ = [
@@ -47,7 +47,6 @@ __all__ = [
     "needs_camera",
     "policy_environment",
     "read_contract",
-    "reseal",
     "shipped_names",
     "trained_environment",
     "untrained",

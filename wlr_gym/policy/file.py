@@ -12,7 +12,6 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import versions
 from wlr_gym.robot import load_robot
-from wlr_gym.robot.description import HASH_FORM
 
 Contract = Mapping[str, Any]
 Config = Mapping[str, Any]
@@ -35,8 +34,6 @@ DEFAULTS = {
     "observer.camera": True,
     "controller": None,
 }
-#: Keys that contracts have only where they are not the default.
-LEFT_OUT = ("controller",)
 _INDEX = re.compile(r"\[\d+\]")
 
 
@@ -102,9 +99,12 @@ def check_contract(policy: Contract, environment: Contract, where: str) -> None:
         InputError: naming the first difference, with both values.
     """
     for name, mine, theirs in _binding_differences(policy, environment):
+        hint = ""
+        if name in ("robot.hash", "robot.servo"):
+            ours, other = (contract["robot"].get("name") for contract in (policy, environment))
+            hint = f" (robot '{ours}' in the policy, '{other}' in the environment)"
         raise InputError(
-            f"{where}: made for another environment: {name} is {mine!r} in the policy, {theirs!r} in the environment"
-            f"{_advice(name, mine, policy, environment)}"
+            f"{where}: made for another environment: {name} is {mine!r} in the policy, {theirs!r} in the environment{hint}"
         )
 
 
@@ -122,29 +122,6 @@ def _flow_sensor(environment: Contract) -> dict[str, Any] | None:
     """Return the optical-flow sensor of a contract's robot, which is in no fingerprint."""
     flow = load_robot((environment.get("robot") or {}).get("description") or "nominal").sensors.flow
     return None if flow is None else flow.model_dump(mode="json")
-
-
-def _advice(name: str, mine: Any, policy: Contract, environment: Contract) -> str:
-    if name not in ("robot.hash", "robot.servo"):
-        return ""
-    if not str(mine).startswith(f"{HASH_FORM}-"):
-        return " (another form: if the robot is the same, 'wlr export --reseal POLICY' rewrites it)"
-    return f" (robot '{policy['robot'].get('name')}' in the policy, '{environment['robot'].get('name')}' in the environment)"
-
-
-def with_defaults(environment: Contract) -> dict[str, Any]:
-    """Return an environment's contract with every binding key, absent ones with their default."""
-    whole = dict(environment)
-    for place, default in DEFAULTS.items():
-        group, _, key = place.partition(".")
-        if not key:
-            if group not in LEFT_OUT:
-                whole.setdefault(group, default)
-        elif isinstance(whole.get(group), list):
-            whole[group] = [{**entry, key: entry.get(key, default)} for entry in whole[group]]
-        elif isinstance(whole.get(group), Mapping):
-            whole[group] = {**whole[group], key: whole[group].get(key, default)}
-    return whole
 
 
 def _is_condition(place: str, mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> bool:
