@@ -35,10 +35,10 @@ def write_curve(folder, steps):
 
 
 @pytest.fixture
-def progress(tmp_path):
+def loop(tmp_path):
     for name in ("trials", ".locks"):
         (tmp_path / name).mkdir()
-    return running.Progress(PLAN, tmp_path, lambda line: None)
+    return running.SweepLoop(PLAN, tmp_path, lambda line: None)
 
 
 @pytest.mark.parametrize(
@@ -73,11 +73,11 @@ def test_all_seeds_of_the_best_are_scored_as_one_column(tmp_path):
     assert text == str(folders[1])
 
 
-def test_what_was_stopped_early_is_read_after_its_last_checkpoint(progress, monkeypatch):
+def test_what_was_stopped_early_is_read_after_its_last_checkpoint(loop, monkeypatch):
     """Its process ends after the search has moved on; until then it holds the trial."""
-    folder = progress.folder / "trials" / TRIALS[0].name
+    folder = loop.folder / "trials" / TRIALS[0].name
     write_curve(folder, 64)
-    progress.note(TRIALS[0], "stopped early")
+    loop.note(TRIALS[0], "stopped early")
 
     @contextmanager
     def lock_that_is_free_after_the_checkpoint(path, patience):
@@ -86,12 +86,12 @@ def test_what_was_stopped_early_is_read_after_its_last_checkpoint(progress, monk
         yield
 
     monkeypatch.setattr(running, "locked", lock_that_is_free_after_the_checkpoint)
-    progress.write()
-    assert [(one.status, one.steps) for one in progress.results()] == [("stopped early", 128)]
-    assert list(pandas.read_parquet(progress.folder / "trials.parquet")["steps"]) == [128]
+    loop.write()
+    assert [(one.status, one.steps) for one in loop.results()] == [("stopped early", 128)]
+    assert list(pandas.read_parquet(loop.folder / "trials.parquet")["steps"]) == [128]
 
 
-def test_jobs_are_ended_before_an_interruption_goes_on(progress):
+def test_jobs_are_ended_before_an_interruption_goes_on(loop):
     """Ctrl-C may come while a line is printed."""
     ended = []
 
@@ -105,19 +105,19 @@ def test_jobs_are_ended_before_an_interruption_goes_on(progress):
     def interrupted(line):
         raise KeyboardInterrupt
 
-    progress.say = interrupted
+    loop.say = interrupted
     with pytest.raises(KeyboardInterrupt) as caught:
-        progress.train(TRIALS, run)
+        loop.train(TRIALS, run)
     assert (ended, caught.type) == (["in good order"], KeyboardInterrupt)
 
 
-def test_a_table_that_cannot_be_written_says_what_to_do(progress, monkeypatch):
+def test_a_table_that_cannot_be_written_says_what_to_do(loop, monkeypatch):
     def full(plan, results, folder):
         raise InputError(f"{folder}/trials.parquet: cannot be written: No space left on device")
 
     monkeypatch.setattr(running, "write_results", full)
     with pytest.raises(InputError, match=r"No space left.*wlr sweep --resume"):
-        progress.fill(lambda jobs: (Ended(job.name, "no space") for job in jobs))
+        loop.fill(lambda jobs: (Ended(job.name, "no space") for job in jobs))
 
 
 def test_two_cannot_run_one_sweep(tmp_path, monkeypatch):

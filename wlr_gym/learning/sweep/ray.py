@@ -19,7 +19,7 @@ from wlr_gym.learning.sweep.results import STOPPED_EARLY, UNFINISHED
 from wlr_gym.learning.sweep.trial import job_of
 
 if TYPE_CHECKING:
-    from wlr_gym.learning.sweep.running import Progress
+    from wlr_gym.learning.sweep.running import SweepLoop
 
 #: Address that means: start Ray on this machine.
 LOCAL = "local"
@@ -109,11 +109,11 @@ _ENVIRONMENT = {
 }
 
 
-def search_with_tune(progress: Progress, at_once: int | None) -> list[Trial]:
+def search_with_tune(loop: SweepLoop, at_once: int | None) -> list[Trial]:
     """Search on the connected cluster, or go on with a search; each settings is trained with the first seed.
 
     Args:
-        progress: of the sweep; it is told which trials begin, and how they ended.
+        loop: of the sweep; it is told which trials begin, and how they ended.
         at_once: most trials at a time; None = as many as the cluster has cores.
 
     Returns:
@@ -126,8 +126,8 @@ def search_with_tune(progress: Progress, at_once: int | None) -> list[Trial]:
     from ray.tune.search.optuna import OptunaSearch
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    plan, known = progress.plan, progress.plan.known_settings()
-    search, out = plan.search, progress.folder.resolve()
+    plan, known = loop.plan, loop.plan.known_settings()
+    search, out = plan.search, loop.folder.resolve()
     assert search is not None
     total = plan.settings.get("total_steps", 0) if search.early_stopping else 0
     stopper = None
@@ -149,12 +149,12 @@ def search_with_tune(progress: Progress, at_once: int | None) -> list[Trial]:
             seen[one.trial_id] = over
             last, trial = one.last_result or {}, trial_of(one.config)
             if not over:
-                progress.note(trial)
+                loop.note(trial)
                 continue
             error = f"Ray: {one.get_error()}" if one.status == "ERROR" else last.get("error", "")
-            found = progress.note(trial, STOPPED_EARLY if last.get("steps", total) < total else UNFINISHED, error)
+            found = loop.note(trial, STOPPED_EARLY if last.get("steps", total) < total else UNFINISHED, error)
             if one.trial_id in ran:
-                progress.tell(found, str(sum(seen.values())))
+                loop.tell(found, str(sum(seen.values())))
 
     class Watch(tune.Callback):
         def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:

@@ -134,7 +134,7 @@ def _check_machines(plan: SweepPlan, ray: str | None, workers: int | None) -> No
         require_package("optuna", "sweep")
 
 
-class Progress:
+class SweepLoop:
     """The trials of a sweep and how they ended; the loop over those that are left.
 
     Args:
@@ -221,19 +221,19 @@ def _run(plan: SweepPlan, folder: Path, ray: str | None, workers: int | None, sa
     for name in (TRIALS, LOGS, LOCKS):
         make_output_folder(folder / name)
     with locked(folder / LOCKS / "sweep", _HANDOVER):
-        progress = Progress(plan, folder, say)
+        loop = SweepLoop(plan, folder, say)
         if ray is None and not plan.needs_ray:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
             say(f"{plan.size}; {workers or cores} at a time, processes of this machine")
             with _sigterm_interrupts():
-                return progress.fill(lambda jobs: spread(jobs, workers or cores))
+                return loop.fill(lambda jobs: spread(jobs, workers or cores))
         from wlr_gym.learning.sweep.ray import LOCAL, connected, search_with_tune, spread_on_ray
 
         address = ray or LOCAL
         with connected(address, workers), _sigterm_interrupts():
             say(f"{plan.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
-            search = (lambda: search_with_tune(progress, workers)) if plan.needs_ray else None
-            return progress.fill(lambda jobs: spread_on_ray(jobs, workers), search)
+            search = (lambda: search_with_tune(loop, workers)) if plan.needs_ray else None
+            return loop.fill(lambda jobs: spread_on_ray(jobs, workers), search)
 
 
 @contextmanager
