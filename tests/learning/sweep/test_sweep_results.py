@@ -16,6 +16,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.learning.evaluation.subjects import expand
+from wlr_gym.learning.sweep import loop as loops
 from wlr_gym.learning.sweep import running
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, trials_of
 from wlr_gym.learning.sweep.results import TrialResult, summarise, write_results
@@ -38,7 +39,7 @@ def write_curve(folder, steps):
 def loop(tmp_path):
     for name in ("trials", ".locks"):
         (tmp_path / name).mkdir()
-    return running.SweepLoop(PLAN, tmp_path, lambda line: None)
+    return loops.SweepLoop(PLAN, tmp_path, lambda line: None)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +86,7 @@ def test_what_was_stopped_early_is_read_after_its_last_checkpoint(loop, monkeypa
         write_curve(folder, 128)
         yield
 
-    monkeypatch.setattr(running, "locked", lock_that_is_free_after_the_checkpoint)
+    monkeypatch.setattr(loops, "locked", lock_that_is_free_after_the_checkpoint)
     loop.write()
     assert [(one.status, one.steps) for one in loop.results()] == [("stopped early", 128)]
     assert list(pandas.read_parquet(loop.folder / "trials.parquet")["steps"]) == [128]
@@ -115,7 +116,7 @@ def test_a_table_that_cannot_be_written_says_what_to_do(loop, monkeypatch):
     def full(plan, results, folder):
         raise InputError(f"{folder}/trials.parquet: cannot be written: No space left on device")
 
-    monkeypatch.setattr(running, "write_results", full)
+    monkeypatch.setattr(loops, "write_results", full)
     with pytest.raises(InputError, match=r"No space left.*wlr sweep --resume"):
         loop.fill(lambda jobs: (Ended(job.name, "no space") for job in jobs))
 

@@ -9,17 +9,15 @@ import os
 import socket
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended, Job, follow
 from wlr_gym.learning.curves import METRICS
+from wlr_gym.learning.sweep.loop import SweepLoop
 from wlr_gym.learning.sweep.plan import REDUCTION, SCORES, Trial
 from wlr_gym.learning.sweep.results import STOPPED_EARLY, UNFINISHED
 from wlr_gym.learning.sweep.trial import job_of
-
-if TYPE_CHECKING:
-    from wlr_gym.learning.sweep.running import SweepLoop
 
 #: Address that means: start Ray on this machine.
 LOCAL = "local"
