@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: Tables beside a run that are none: what a policy was asked and answered, all samples of a log that was imported.
+#: Tables beside a run that are none: what a policy was asked and answered; all samples of a log, as older imports wrote them.
 BESIDE = (".policy", ".samples")
 
 

@@ -290,15 +290,6 @@ def test_episodes_of_lerobot(table, tmp_path):
     assert any("observation.images.top" in note for note in imported[0].notes)
 
 
-def test_every_sample_is_kept_at_its_own_time(bag, tmp_path):
-    (imported,) = import_log(bag, tmp_path / "runs", lab_map(bag))
-    samples = pandas.read_parquet(imported.path.with_name("run_01.samples.parquet"))
-    gyro = samples[samples["channel"] == "gyro_z"]
-    assert len(gyro) == 4800
-    assert np.median(np.diff(gyro["t"])) == pytest.approx(0.005, abs=1e-6)
-    assert [run.name for run in read_dataset(tmp_path / "runs").runs] == ["run_01"]
-
-
 def test_a_long_recording_becomes_several_runs(bag, tmp_path):
     imported = import_log(bag, tmp_path / "runs", lab_map(bag), split=8.0)
     runs = read_dataset(tmp_path / "runs").runs

@@ -35,7 +35,7 @@ from wlr_gym.data.logs.map import (
 )
 from wlr_gym.data.logs.messages import RUN, read_exported
 from wlr_gym.data.logs.readers import TABLE, first_messages, quiet, read_logs
-from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields, write_samples
+from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
 from wlr_gym.data.logs.topics import Share
 from wlr_gym.data.runs import check_meta, next_run, note_robot, noted, own_robot, robot_of_meta, write_meta, write_run
@@ -125,7 +125,6 @@ def import_log(
             for one in runs_of(recording, found, resolved, split):
                 findings = _check(one, recording.name, resolved, chosen)
                 path = write_run(folder / f"{len(made)}{suffix}", one.table)
-                write_samples(_samples_of(path), one)
                 notes = (*recording.notes, *one.notes, *general)
                 made.append(ImportedRun(path, recording.name, one.origin, one.facts, findings, notes))
         if not made:
@@ -134,7 +133,6 @@ def import_log(
         write_map(out / MAP_FILE, found)
         for k, run in enumerate(made):
             path = next_run(out, suffix)
-            os.replace(_samples_of(run.path), _samples_of(path))
             os.replace(run.path, path)
             made[k] = replace(run, path=path)
             _add_to_record(out, record, made[k])  # with each run: whatever stops this, it knows all that are there
@@ -240,11 +238,6 @@ def _beside(out: Path) -> Iterator[Path]:
         if new:
             shutil.rmtree(out, ignore_errors=True)
         raise
-
-
-def _samples_of(run: Path) -> Path:
-    """Return where the samples of an imported run are."""
-    return run.with_name(f"{run.stem}.samples.parquet")
 
 
 def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Robot) -> tuple[Finding, ...]:

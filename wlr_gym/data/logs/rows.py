@@ -1,4 +1,4 @@
-"""Make runs of a recording by a map: rows at the true times of one topic, and every sample of every channel beside them."""
+"""Make runs of a recording by a map: rows at the true times of one topic, in which every channel gets its value."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,14 +235,12 @@ class MadeRun:
 
     Attributes:
         table: columns of a run, (rows,).
-        samples: channel -> every sample: its time on the run's clock (s), and value (SI units).
         facts: how the rows came about.
         origin: ns on the log's clock where the run's ``t`` is 0.
         notes: what was left out or changed.
     """
 
     table: dict[str, Array]
-    samples: dict[str, tuple[Array, Array]]
     facts: tuple[ChannelFact, ...]
     origin: int
     notes: tuple[str, ...]
@@ -258,6 +255,7 @@ def wanted_fields(resolved: Mapping[str, Resolved]) -> dict[str, set[str]]:
     return wanted
 
 
+_WHEEL_ANGLES = {f"pos_{wheel}" for wheel in WHEELS}
 _MISSING = {
     "cmd": "the setpoints that drove the robot, which every replay needs; without them no simulator can be compared",
     "pos": "the joints' angles, which every replay is compared with",
@@ -284,12 +282,11 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     times = _without_holes(log, resolved, series, times, notes)
     origin, period = int(times[0]), float(np.median(np.diff(times))) * 1e-9
     table: dict[str, Array] = {"t": np.asarray((times - origin) * 1e-9, np.float64)}
-    samples, facts = {}, []
+    facts = []
     for column, source in resolved.items():
         at, values = series[column]
         values = np.unwrap(values) if column == "cam_yaw" else values
         table[column], how, moved = at_rows(times, at, values, source.take, period)
-        samples[column] = ((at - origin) * 1e-9, values)
         rate, known = 1e9 / float(np.median(np.diff(at))), float(np.isfinite(table[column]).mean())
         facts.append(ChannelFact(column, source.topic, source.field, source.unit, rate, how, moved, known))
     _note_silent(resolved, series, times, notes)
@@ -297,17 +294,13 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
     if off.any():
         column = COMMANDS[int(np.argmax(off.any(axis=1)))]
         notes.append(f"{off.any(axis=0).sum()} rows have no setpoint, '{column}' among them: torque off")
-    table = {name: table[name] for name in COLUMNS if name in table}
-    return _from_start(MadeRun(table, samples, tuple(facts), origin, tuple(notes)))
+    table = _from_start({name: table[name] for name in COLUMNS if name in table})
+    return MadeRun(table, tuple(facts), origin, tuple(notes))
 
 
-def _from_start(made: MadeRun) -> MadeRun:
-    """Return a run whose wheels' angles count from its start."""
-    table, samples = dict(made.table), dict(made.samples)
-    for wheel in (f"pos_{wheel}" for wheel in WHEELS):
-        start, (t, values) = table[wheel][0], samples[wheel]
-        table[wheel], samples[wheel] = table[wheel] - start, (t, values - start)
-    return replace(made, table=table, samples=samples)
+def _from_start(table: Mapping[str, Array]) -> dict[str, Array]:
+    """Return a run's table whose wheels' angles count from its start."""
+    return {name: values - values[0] if name in _WHEEL_ANGLES else values for name, values in table.items()}
 
 
 # ---- samples of a channel --------------------------------------------------------------------------------------------
@@ -458,8 +451,6 @@ def _note_silent(resolved: Mapping[str, Resolved], series: Mapping[str, Series],
 LONGEST = 600.0
 #: Share of a part's length by which a cut may be moved to where the robot is quieter.
 _PLAY = 0.25
-#: s that samples of a part go on at its ends.
-_AROUND = 0.1
 #: Usual steps, and s, from which on what is between two rows is a hole; s below which a piece between holes is no run.
 _HOLE, _LEAST_HOLE, _LEAST_PIECE = 5.0, 0.5, 1.0
 
@@ -504,23 +495,7 @@ def _quiet_row(made: MadeRun, middle: float, length: float) -> int:
 
 
 def _part(made: MadeRun, first: int, last: int) -> MadeRun:
-    table = {name: values[first:last] for name, values in made.table.items()}
-    begin, end = float(table["t"][0]), float(table["t"][-1])
+    table = _from_start({name: values[first:last] for name, values in made.table.items()})
+    begin = float(table["t"][0])
     table["t"] = table["t"] - begin
-    samples = {}
-    for name, (t, values) in made.samples.items():
-        inside = (t >= begin - _AROUND) & (t <= end + _AROUND)
-        samples[name] = t[inside] - begin, values[inside]
-    return _from_start(replace(made, table=table, samples=samples, origin=made.origin + round(begin * 1e9)))
-
-
-def write_samples(path: Path, made: MadeRun) -> None:
-    """Write every sample at its own time: channel, t (s, the run's clock), value (SI units)."""
-    import pyarrow
-    import pyarrow.parquet
-
-    schema = pyarrow.schema([("channel", pyarrow.string()), ("t", pyarrow.float64()), ("value", pyarrow.float64())])
-    with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-        for name, (t, values) in made.samples.items():
-            columns = [pyarrow.array([name] * len(t)), pyarrow.array(t), pyarrow.array(values)]
-            writer.write_table(pyarrow.table(columns, schema=schema))
+    return replace(made, table=table, origin=made.origin + round(begin * 1e9))
