@@ -80,13 +80,13 @@ def test_links_lead_to_what_is_there(tmp_path):
     assert all((ROOT / name).is_file() for name in named)
 
 
-def test_what_is_not_good_is_said_where_there_is_any():
+def test_caveats_are_said_where_there_is_any():
     good = Section("1. Good", "said", "<p>text</p>")
-    bad = Section("2. Bad", "said", "<p>text</p>", not_good=("this < that", "nor is this"))
-    assert "Not good" not in page_of(Demo(Path()), [good])
+    bad = Section("2. Bad", "said", "<p>text</p>", caveats=("this < that", "nor is this"))
+    assert "Caveats" not in page_of(Demo(Path()), [good])
     text = page_of(Demo(Path()), [good, bad])
-    assert text.count("<b>Not good:</b> this &lt; that; nor is this.") == 2  # at the top, and in the section
-    assert text.index("Not good") > text.index("2. Bad")
+    assert text.count("<b>Caveats:</b> this &lt; that; nor is this.") == 2  # at the top, and in the section
+    assert text.index("Caveats") > text.index("2. Bad")
 
 
 def test_what_is_not_installed_is_left_out_and_said(tmp_path, monkeypatch):
@@ -132,9 +132,9 @@ def test_training_on_is_ticked_only_where_the_interval_says_so(new, better, verd
 
 def test_what_is_won_back_of_the_fault_is_said():
     driven = numbers([0.4, 0.6], [0.3, 0.4], 30.0, 12.0, 40.0)
-    said, not_good = retraining.won_back(driven | {"healthy": [0.2, 0.2]})
+    said, caveats = retraining.won_back(driven | {"healthy": [0.2, 0.2]})
     assert "tracking error is 0.200 in these episodes: training on wins back 50 % (95 % interval 50 to 50)" in said
-    assert not_good == [
+    assert caveats == [
         "training on wins back 50 % (95 % interval 50 to 50) of what the fault costs, the rest is left (0.500 to 0.350, "
         "0.200 without the fault)"
     ]

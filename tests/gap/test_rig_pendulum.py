@@ -363,7 +363,7 @@ def test_folders_without_recordings_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"holds no \*\.json"):
         read_recordings(tmp_path)
     (tmp_path / "a.json").write_text("{")
-    with pytest.raises(InputError, match="cannot be read as JSON"):
+    with pytest.raises(InputError, match="broken JSON"):
         read_recordings(tmp_path)
 
 

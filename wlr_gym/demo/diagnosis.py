@@ -171,29 +171,22 @@ def name(demo: Demo, tell: Tell) -> Section:
     links = [link(demo, demo.gap / name, text) for name, text in files if (demo.gap / name).is_file()]
     html += f"<p>Files: {', '.join(links)}.</p>"
     verdict = SHOWN if found.verdict == EFFECT_FOUND else NOT_SHOWN
-    return Section(NAME_TITLE, sentence(found), html, verdict, left_over(found))
+    return Section(NAME_TITLE, sentence(found), html, verdict, caveats_of(found))
 
 
-def left_over(found: Analysis) -> list[str]:
-    """Return what is not good about an analysis: what is left, what is not sure, what got worse."""
-    from wlr_gym.gap.report.text import made_worse
+def caveats_of(found: Analysis) -> list[str]:
+    """Return what is left, what is not sure, and what got worse."""
+    from wlr_gym.gap.report.text import closure, made_worse
 
-    gap, said = found.gap, []
-    if gap is None:
+    if found.gap is None:
         return ["no run could be held out to validate it"]
-    if gap.heldout_after > gap.noise_floor and error(gap.heldout_after) != error(gap.noise_floor):
-        said.append(
-            f"an error of {error(gap.heldout_after)} is left in the held-out runs, above the noise floor of "
-            f"{error(gap.noise_floor)}"
-        )
-    low, high = gap.reduction_ci95
+    low, high = found.gap.reduction_ci95
+    said = [text.rstrip(".") for text in (closure(found), made_worse(found)) if text]
     if found.added and not np.isfinite([low, high]).all():
         said.append("too few runs are held out for an interval of what the effects remove")
     elif found.added and low <= 0.0 <= high:
         said.append("the interval of what the effects remove contains 0")
-    if worse := made_worse(found):
-        said.append(f"{worse[0].lower()}{worse[1:].rstrip('.')}")
-    return said
+    return [f"{text[0].lower()}{text[1:]}" for text in said]
 
 
 # ---- does it hold? ---------------------------------------------------------------------------------------------------
@@ -225,9 +218,9 @@ def check(demo: Demo, tell: Tell) -> Section:
         steps = (error(_number(value)) for value in (gap.heldout_calibrated, gap.heldout_after, gap.noise_floor))
         said = "Error of the held-out runs: {} calibrated, {} with what was found; noise floor {}.".format(*steps)
     worse = [one.run for one in heldout if one.after > one.calibrated]
-    not_good = [*answer.outside, *([f"the effects make the error of {listed(worse)} larger"] if worse else [])]
+    caveats = [*answer.outside, *([f"the effects make the error of {listed(worse)} larger"] if worse else [])]
     verdict = SHOWN if answer.right and fell(result.gap) else NOT_SHOWN
-    return Section(CHECK_TITLE, f"{answer.sentence} {said}", html, verdict, not_good)
+    return Section(CHECK_TITLE, f"{answer.sentence} {said}", html, verdict, caveats)
 
 
 def fell(gap: GapEntry | None) -> bool:

@@ -102,14 +102,14 @@ class Section:
         headline: one sentence for the top of the page; empty = none.
         html: what stands below the title.
         verdict: one of the four above.
-        not_good: what the numbers do not speak for, in clauses.
+        caveats: what the numbers do not speak for, in clauses.
     """
 
     title: str
     headline: str
     html: str
     verdict: str = SHOWN
-    not_good: Sequence[str] = ()
+    caveats: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
     title = "wlr_gym: learn, drive, find what the simulator lacks, train on"
     lines = [
         f'<li>{_VERDICTS[one.verdict][0]} <a href="#{anchor(one.title)}"><b>{escape(one.title)}</b></a> '
-        f"{escape(one.headline or _VERDICTS[one.verdict][2])}{_not_good(one)}</li>"
+        f"{escape(one.headline or _VERDICTS[one.verdict][2])}{_caveats(one)}</li>"
         for one in sections
     ]
     files = [link(demo, demo.out / path, text) for path, text in _FILES.items() if (demo.out / path).exists()]
@@ -230,9 +230,9 @@ def page(demo: Demo, sections: Sequence[Section], interrupted: bool = False) -> 
         f"<footer><p>wlr_gym {escape(__version__)}, seed {demo.seed}: the same seed gives the same numbers on one machine. "
         f"Another hidden fault: <code>wlr demo --seed {demo.seed + 1}</code>.</p></footer>"
     )
-    body = [section(one.title, _not_good(one), one.html) for one in sections]
+    body = [section(one.title, _caveats(one), one.html) for one in sections]
     return document(title, _VERDICTS[worst][1], [*header, *body, footer])
 
 
-def _not_good(one: Section) -> str:
-    return f'<p class="small"><b>Not good:</b> {escape("; ".join(one.not_good))}.</p>' if one.not_good else ""
+def _caveats(one: Section) -> str:
+    return f'<p class="small"><b>Caveats:</b> {escape("; ".join(one.caveats))}.</p>' if one.caveats else ""

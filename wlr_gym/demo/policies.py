@@ -7,8 +7,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from wlr_gym.base.html import heading, table
 from wlr_gym.demo.page import ENVIRONMENT, NOT_SHOWN, SHOWN, Demo, Section, Tell, drawn, filmed, paragraph
 from wlr_gym.envs.tasks.task import having
@@ -19,7 +17,6 @@ from wlr_gym.learning.evaluation.subjects import Subject
 
 if TYPE_CHECKING:
     from wlr_gym.learning.evaluation.metrics import Metric
-    from wlr_gym.learning.evaluation.rollout import Rollout
     from wlr_gym.policy import TrainingProgress
 
 LEARN_TITLE = "1. A policy learns"
@@ -31,7 +28,7 @@ BEST = 2.0
 def train(demo: Demo, tell: Tell) -> Section:
     """Train PPO, draw its learning curve."""
     from wlr_gym.learning.curves import read_curve
-    from wlr_gym.learning.evaluation import plots
+    from wlr_gym.learning.evaluation.plots import learning_curve
     from wlr_gym.policy import Training, load_agent, load_agent_config
 
     def on_update(done: TrainingProgress) -> None:
@@ -42,8 +39,8 @@ def train(demo: Demo, tell: Tell) -> Section:
     tell("training: compiling the simulator", 0.0)
     load_agent("ppo").train(Training(ENVIRONMENT, demo.training, config, progress=False, on_update=on_update))
     tell("training: episodes of the new policy and of references", 0.93)
-    references = {name: _reward_per_second(_play_alone(name, demo)) for name in REFERENCES}
-    episodes = _play_alone(demo.training / "policy", demo)
+    references = {name: _play_alone(name, demo) for name in REFERENCES}
+    reward = _play_alone(demo.training / "policy", demo)
     curve = read_curve(demo.training / "learning_curve.csv")
     first, last = (row["reward_per_second"] for row in (curve[0], curve[-1]))
     robots, period = int(config["num_envs"]), 0.02
@@ -60,21 +57,13 @@ def train(demo: Demo, tell: Tell) -> Section:
         "one of the policies on ice below."
     )
     html += drawn(
-        plots.learning_curve(curve, references),
+        learning_curve(curve, references),
         demo.out / "learning_curve.png",
         "Left: reward per second of simulated time, over environment steps of all robots together; the references play whole "
         "episodes of the same task without exploring. Right: the terms of the reward that count most, "
         "and the sum of the others.",
     )
-    chosen = _liveliest(episodes)
-    html += drawn(
-        plots.episode(episodes, chosen, f"The new policy on a floor of friction {episodes.friction[chosen].mean():.2f}"),
-        demo.out / "episode.png",
-        "An episode of the new policy that it has not trained on, the one of the most driving and turning.",
-    )
-    return Section(
-        LEARN_TITLE, headline, html, SHOWN if learnt else NOT_SHOWN, behind(_reward_per_second(episodes), references)
-    )
+    return Section(LEARN_TITLE, headline, html, SHOWN if learnt else NOT_SHOWN, behind(reward, references))
 
 
 def behind(reward: float, references: Mapping[str, float]) -> list[str]:
@@ -84,24 +73,15 @@ def behind(reward: float, references: Mapping[str, float]) -> list[str]:
     return [said] if better else []
 
 
-def _play_alone(source: str | Path, demo: Demo) -> Rollout:
+def _play_alone(source: str | Path, demo: Demo) -> float:
+    """Return a policy's reward per second in whole episodes."""
     from wlr_gym.learning.evaluation.rollout import roll_out
     from wlr_gym.learning.evaluation.subjects import make_player
 
     core, policy = make_player(ENVIRONMENT, source, demo.episodes, {"precision": "float32"})
     with closing(core):
-        return roll_out(core, policy, FIRST_SEED + demo.seed)
-
-
-def _reward_per_second(rollout: Rollout) -> float:
+        rollout = roll_out(core, policy, FIRST_SEED + demo.seed)
     return float(rollout.reward[rollout.active].mean() / rollout.control_period)
-
-
-def _liveliest(rollout: Rollout) -> int:
-    """Return the episode whose commands have the most driving and turning: the most to see."""
-    size = np.abs(rollout.command)
-    effort = (size / np.maximum(size.max(axis=(0, 1)), 1e-9)).sum(axis=-1)
-    return int(np.argmax(np.where(rollout.active, effort, 0.0).sum(axis=0)))
 
 
 # ---- on the same ice: the shipped policies, a classical controller and the new policy ---------------------------------

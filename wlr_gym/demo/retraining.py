@@ -60,7 +60,7 @@ def retrain(demo: Demo, tell: Tell) -> Section:
     driven = episodes_of(progress, "without_fault", {"old": POLICY}, EmulatedRobot(own), seeds_of(AFTER, asked))
     numbers = after.numbers | {"healthy": errors_of(driven["old"]).tolist()}
     headline, verdict = outcome(numbers)
-    said, not_good = won_back(numbers)
+    said, caveats = won_back(numbers)
     html = paragraph(
         f"The shipped policy {POLICY}, which has driven this robot, trains on for {demo.further_steps:,} environment steps on "
         "the simulator with what the gap workflow found and calibrated, each number drawn from its interval. It is not told "
@@ -73,11 +73,11 @@ def retrain(demo: Demo, tell: Tell) -> Section:
         "without it."
     )
     html += _episodes(numbers) + _said(after) + paragraph(said) + _film(demo, hidden, numbers, tell)
-    return Section(TITLE, headline, html, verdict, not_good)
+    return Section(TITLE, headline, html, verdict, caveats)
 
 
 def won_back(numbers: dict[str, Any]) -> tuple[str, list[str]]:
-    """Return in words what share of the fault's cost training on wins back, and what is not good about it.
+    """Return in words what share of the fault's cost training on wins back, and the caveats.
 
     Args:
         numbers: tracking errors ``old``, ``new`` and ``healthy`` (old policy, no fault) of the same episodes, ``better_ci95``.
@@ -87,17 +87,17 @@ def won_back(numbers: dict[str, Any]) -> tuple[str, list[str]]:
     old, new, healthy = (np.array(numbers[name]) for name in ("old", "new", "healthy"))
     said = f"On the same robot without the fault, the old policy's tracking error is {healthy.mean():.3f} in these episodes"
     low, high = numbers["better_ci95"]
-    not_good = ["the interval of the change contains 0"] if low <= 0.0 <= high else []
+    caveats = ["the interval of the change contains 0"] if low <= 0.0 <= high else []
     if worse := int((new > old).sum()):
-        not_good.append(f"in {worse} of {len(old)} episodes the policy that was trained on is worse")
+        caveats.append(f"in {worse} of {len(old)} episodes the policy that was trained on is worse")
     if old.mean() <= healthy.mean():
-        return f"{said}: the fault costs it nothing.", [*not_good, "the fault costs the old policy nothing in these episodes"]
+        return f"{said}: the fault costs it nothing.", [*caveats, "the fault costs the old policy nothing in these episodes"]
     share = share_regained(old, new, healthy)
     won = f"{share.mean:.0f} % (95 % interval {share.low:.0f} to {share.high:.0f}) of what the fault costs"
     if share.mean < 100.0:
         left = f"{old.mean():.3f} to {new.mean():.3f}, {healthy.mean():.3f} without the fault"
-        not_good.append(f"training on wins back {won}, the rest is left ({left})")
-    return f"{said}: training on wins back {won}.", not_good
+        caveats.append(f"training on wins back {won}, the rest is left ({left})")
+    return f"{said}: training on wins back {won}.", caveats
 
 
 def outcome(numbers: dict[str, Any]) -> tuple[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import versions
+from wlr_gym.base.settings import read_json
 from wlr_gym.robot import load_robot
 
 Contract = Mapping[str, Any]
@@ -69,12 +69,7 @@ def read_contract(folder: str | Path) -> dict[str, Any]:
         InputError: absent, broken, or of another format version.
     """
     path = Path(folder) / CONTRACT_FILE
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from None
+    content = read_json(path)
     check_content(content, str(path))
     return content
 

@@ -85,7 +85,7 @@ def test_what_names_do_not_decide_is_asked(proposal):
 def test_each_question_says_what_the_log_shows(proposal):
     shown = {
         "joints.leg_rf": ["pos 72.", "(89.43 at the start); cmd 72."],
-        "channels.pos_leg": ["rad, deg, turn, count?", "'position[{joint}]'", "leg_lf 72.", "Every replay is compared with"],
+        "channels.pos_leg": ["rad, deg, turn, count?", "'position[{joint}]'", "leg_lf 72."],
         "channels.vel_wheel": ["rpm"],
         "channels.eff_wheel": ["mA", "the motor stalls at 1.5 N m"],
         "frames.imu": ["9.81 in the median (up is", "gyro varies by 0.05"],

@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pandas
 import pytest
-from evaluation_examples import EPISODES, PERIOD, TICKS, measured, rollout
+from evaluation_examples import EPISODES, TICKS, measured, rollout
 
 from wlr_gym.base.plots import COLOURS, GREY
+from wlr_gym.envs.tasks.signals import yaw_of
 from wlr_gym.learning.evaluation.card import (
     MAIN,
     OTHER_PLANT,
@@ -23,8 +24,8 @@ from wlr_gym.learning.evaluation.card import (
 )
 from wlr_gym.learning.evaluation.conditions import SWEEPS
 from wlr_gym.learning.evaluation.metrics import Estimate, summarise
-from wlr_gym.learning.evaluation.plots import commanded_path, draw_card, improvements, learning_curve, pareto
-from wlr_gym.learning.evaluation.rollout import make_core, roll_out, saturated, yaw_of
+from wlr_gym.learning.evaluation.plots import draw_card, improvements, learning_curve, pareto
+from wlr_gym.learning.evaluation.rollout import make_core, roll_out, saturated
 from wlr_gym.policy import make_policy
 
 ONE = np.ones((TICKS, EPISODES))
@@ -143,14 +144,6 @@ def test_yaw_of_a_quaternion():
     angle = np.array([0.0, 1.0, -3.0])
     turned = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=1)
     np.testing.assert_allclose(yaw_of(*turned.T), angle)
-
-
-def test_commanded_path_of_a_circle_closes():
-    turn = 2 * np.pi / (PERIOD * (TICKS - 1))
-    command = np.stack([np.full((TICKS, EPISODES), 0.1), np.full((TICKS, EPISODES), turn)], axis=-1)
-    path, yaw = commanded_path(rollout(command=command), 0, TICKS)
-    np.testing.assert_allclose(path[-1], path[0], atol=1e-3)
-    assert yaw[-1] == pytest.approx(2 * np.pi)
 
 
 @pytest.fixture(scope="module")

@@ -323,20 +323,6 @@ _SETS = {
     "volt": ("volt",),
 }
 _NEEDED = ("cmd_leg", "cmd_wheel", "pos_leg", "pos_wheel")
-#: What a wrong answer costs.
-_MATTERS = {
-    "cmd": "Every replay drives the simulator with these setpoints",
-    "pos": "Every replay is compared with these angles",
-    "vel": "The servos' speed control is judged by these rates",
-    "eff": "Friction and motors are judged by these efforts; A, mA and counts become N m by the robot's torque constants",
-    "gyro": "Turns, and slip in them, are judged by these rates",
-    "acc": "Tilt, shocks and masses are judged by these readings",
-    "cam": "The way, and slip on it, are judged by this pose",
-    "volt": "A weak supply looks like weak motors",
-    "sign": "A joint that counts the other way moves the other way in every replay",
-    "frames": "A sensor read along other axes shows turns and pushes that were none",
-    "clocks": "A clock that is off looks like a delay of the robot or of its sensors",
-}
 
 
 @dataclass(frozen=True)
@@ -488,7 +474,7 @@ class _Proposer:
                 shown = f"messages arrive {_ms(own)} after their header's time, the joints' {_ms(base)} (medians)"
                 added = f"{{offset: S}} adds S ({apart:.3f} would make them arrive as the joints' do)"
                 text = f"{{use: header}} trusts the headers, {{use: log}} the recorder's clock, {added}: {shown}"
-                self.note(f"clocks.{name}", f"{text}. {_MATTERS['clocks']}")
+                self.note(f"clocks.{name}", text)
 
     def _rows(self) -> None:
         if not self.rows or "pos_leg_lf" not in self.chosen:
@@ -522,7 +508,7 @@ class _Proposer:
         if len(self.lines) > place:
             legs = "of a leg 1 where the number grows as the wheel goes from the front over below to the back"
             zero = "zero: the log's angle (rad) where the leg points straight forward"
-            text = f"sign: {legs}, of a wheel 1 where it grows as the wheel rolls forward, else -1. {zero}. {_MATTERS['sign']}"
+            text = f"sign: {legs}, of a wheel 1 where it grows as the wheel rolls forward, else -1. {zero}"
             self.lines.insert(place, MapLine("joints", True, text))
 
     def _set(self, name: str, columns: Sequence[str]) -> None:
@@ -533,7 +519,7 @@ class _Proposer:
         ]
         for column in [name] if len(missing) == len(_SETS[name]) else missing:
             self.content["channels"][column] = {"topic": OPEN, "field": OPEN}
-            self.note(f"channels.{column}", f"no field is known to be it{self._unnamed()}. {_MATTERS[kind]}")
+            self.note(f"channels.{column}", f"no field is known to be it{self._unnamed()}")
         if not columns:
             return
         entries = {column: {"topic": self.chosen[column].topic, "field": self._field(column)} for column in columns}
@@ -559,7 +545,7 @@ class _Proposer:
         question = f"{', '.join(units_of(members[0]))}?"
         ranges = "; ".join(f"{column.partition('_')[2] or column} {_range(self.raw(column))}" for column in columns)
         stall = f"; the motor stalls at {effort_range(columns[0], self.robot)[0]:.3g} N m" if kind == "eff" else ""
-        self.note(f"channels.{key}", f"{question} {count}{source}; {ranges}{stall}. {_MATTERS[kind]}")
+        self.note(f"channels.{key}", f"{question} {count}{source}; {ranges}{stall}")
 
     def _frames(self) -> None:
         given = self.known.get("frames", {})
@@ -574,14 +560,14 @@ class _Proposer:
             if "gyro_x" in self.chosen:
                 sizes = ", ".join(f"{np.std(self.raw(f'gyro_{axis}')[1]):.3g}" for axis in XYZ)
                 shown.append(f"gyro varies by {sizes} (a robot that drives turns about up)")
-            self.note("frames.imu", f"{'. '.join(shown)}. {_MATTERS['frames']}")
+            self.note("frames.imu", ". ".join(shown))
         if "cam_z" in self.chosen and "cam_x" in self.chosen and "cam" not in given:
             self.content["frames"]["cam"] = OPEN
             spread = [float(np.ptp(values)) if len(values) else 0.0 for _, values in map(self.raw, (f"cam_{a}" for a in XYZ))]
             shown = ", ".join(f"{axis} goes over {size:.3g}" for axis, size in zip(XYZ, spread, strict=True))
             text = "the pose's axes that our x, y and z (up) are: [x, y, z], or [x, -z, y] where its y points up"
             up = "the one that hardly changes points up"
-            self.note("frames.cam", f"{text}. {shown}: {up}. {_MATTERS['frames']}")
+            self.note("frames.cam", f"{text}. {shown}: {up}")
         others = [f"'{name}'" for name, topic in self.log.topics.items() if any(one.endswith(_PLACES) for one in topic.fields)]
         if others and "cam_x" not in self.chosen and not any(column.startswith("cam") for column in self.mapped):
             text = f"not proposed: which pose of {', '.join(others)} is the body's, measured, is not known; name it if one is"

@@ -7,7 +7,6 @@ one the result states, ``ci95`` = +-1.96 sigma, or none.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.settings import read_json
 from wlr_gym.envs.tasks.entries import EventConfig
 from wlr_gym.physics import effects
 from wlr_gym.physics.codegen.expression import finite_number
@@ -74,12 +74,7 @@ def _without(events: Mapping[str, EventConfig], elements: tuple[str, ...]) -> di
 
 
 def _read(path: str | Path) -> Mapping[str, Any]:
-    try:
-        result = _mapping(json.loads(Path(path).read_text(encoding="utf-8")), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from None
+    result = _mapping(read_json(path), str(path))
     if result.get("verdict") not in _VERDICTS:
         raise InputError(f"{path}: verdict = {result.get('verdict')!r}: expected {', '.join(_VERDICTS)}")
     return result

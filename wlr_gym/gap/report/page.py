@@ -70,7 +70,6 @@ _FAR = 0.5
 CAPTIONS = {
     "where": "In which states the calibrated model is wrong: each row a measured channel, each column a range of what is named "
     "below. The numbers are rms errors; about 1 is what sensor noise alone would leave, grey is a range without data.",
-    "localisation": "Which measured channels hold the gap, and how much of it.",
     "relations": "Which relations of the model could hold the gap: the predicted improvement by the best law that acts there "
     "alone. The true place is among the longest bars; others are long because they move the robot in a similar way.",
     "overlays": "Measured runs, and the same runs replayed by the model. Below each: the error as it is counted "
@@ -155,7 +154,7 @@ def _tiles(analysis: Analysis) -> str:
 def _where(analysis: Analysis, pictures: Mapping[str, bytes]) -> str:
     ordered = sorted(analysis.localisation, key=lambda place: -place.share)
     rows = [(place.name, channel(place.name), percent(place.share), place.dependence) for place in ordered]
-    shown = [_pictures(kind, pictures) for kind in ("localisation", "relations", "overlays", "where")]
+    shown = [_pictures(kind, pictures) for kind in ("relations", "overlays", "where")]
     if not any((rows, *shown)):
         return ""
     text = (
@@ -286,14 +285,9 @@ def _errors(before: float, calibrated: float, after: float, gap: GapFigures) -> 
 
 
 def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
-    before, calibrated, after = _errors(gap.heldout_before, gap.heldout_calibrated, gap.heldout_after, gap)
-    added = f", {after} with the effects" if analysis.added else ""
-    text = (
-        f"<p>Error of replayed runs ({escape(gap.metric)}; 1 = sensor noise). Runs that were fitted: "
-        f"{capped(gap.fit_before, gap)} before, {capped(gap.fit_after, gap)} after. Held-out runs: "
-        f"{before} as given, {calibrated} calibrated{added}; "
-        f"noise floor {error(gap.noise_floor)}. {escape(below_floor(analysis))}</p>"
-    )
+    """What the figures at the top do not say."""
+    fitted = f"{capped(gap.fit_before, gap)} as given, {capped(gap.fit_after, gap)} after"
+    text = f"<p>Error of replayed runs, as at the top. Over the runs that were fitted: {fitted}.</p>"
     if not analysis.added:
         return text
     return (
@@ -307,8 +301,7 @@ def _gap_in_words(gap: GapFigures, analysis: Analysis) -> str:
 def _how_sure(analysis: Analysis) -> str:
     parts = []
     if analysis.effects:
-        rows = [(plain(effect.name), places(effect.where), percent(effect.confidence)) for effect in analysis.effects]
-        parts += [_SELECTION_FREQUENCY, table(("effect", "where", "selection frequency"), rows, {2})]
+        parts.append(_SELECTION_FREQUENCY)
     if analysis.adequacy:
         parts += [heading("Is anything left?"), _adequacy(analysis.adequacy)]
     if analysis.detectable:

@@ -27,7 +27,7 @@ from wlr_gym.gap.analysis import (
     Threshold,
     Trace,
 )
-from wlr_gym.gap.report.text import channel, error, feature, percent, places, plain
+from wlr_gym.gap.report.text import channel, error, feature, places, plain
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -68,10 +68,8 @@ def draw(analysis: Analysis) -> dict[str, bytes]:
 
 
 def figures(analysis: Analysis) -> dict[str, Figure]:
-    """Return name -> figure, of what there is: localisation, relations, where_N, overlays_N, gap, channels, evidence."""
+    """Return name -> figure, of what there is: relations, where_N, overlays_N, gap, channels, evidence."""
     found: dict[str, Figure] = {}
-    if analysis.localisation:
-        found["localisation"] = _localisation(analysis)
     if analysis.relations:
         found["relations"] = _relations(analysis.relations[:_MOST_RELATIONS])
     for index, heat_map in enumerate(analysis.heat_maps):
@@ -91,18 +89,6 @@ def figures(analysis: Analysis) -> dict[str, Figure]:
 
 
 # ---- where -----------------------------------------------------------------------------------------------------------
-
-
-def _localisation(analysis: Analysis) -> Figure:
-    found = sorted(analysis.localisation, key=lambda place: place.share)
-    figure = new_figure(9.0, 0.9 + 0.42 * len(found))
-    axes = figure.subplots()
-    bars = axes.barh([place.name for place in found], [100.0 * place.share for place in found], color=CALIBRATED, height=0.6)
-    axes.bar_label(bars, [percent(place.share) for place in found], padding=4, fontsize=8)
-    axes.set_xlim(0.0, 115.0 * max(place.share for place in found) + 1.0)
-    axes.set_xlabel("share of the gap of the calibrated model (%)", fontsize=9)
-    tidy(axes, "x")
-    return figure
 
 
 def _relations(shown: Sequence[Relation]) -> Figure:

@@ -8,7 +8,6 @@ add to the models are kept. :func:`explanations` says what a result leaves open:
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +18,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from wlr_gym import __version__
-from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
-from wlr_gym.base.settings import SettingsModel, parse_config
+from wlr_gym.base.settings import SettingsModel, parse_config, read_json
 from wlr_gym.base.text import json_text
 from wlr_gym.gap.analysis import (
     EQUIVALENT,
@@ -287,13 +285,7 @@ def read_result(path: str | Path) -> Result:
     Raises:
         InputError: no such file, broken JSON, or contents that are not those of a result; the message names the place.
     """
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}, column {error.colno}: broken JSON: {error.msg}") from None
-    return parse_config(Result, content, str(path))
+    return parse_config(Result, read_json(path), str(path))
 
 
 # ---- what a result leaves open ---------------------------------------------------------------------------------------

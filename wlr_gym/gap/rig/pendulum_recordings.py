@@ -6,7 +6,6 @@ Format: github.com/Rhoban/bam. One file per run: ``mass`` (kg), ``length`` (m), 
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, check_folder, check_number, nearest
+from wlr_gym.base.settings import read_json
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.rig.problem import smoothed_state
 
@@ -125,10 +125,7 @@ def read_recording(path: str | Path) -> Recording:
         InputError: it cannot be read, a key is missing, a value is not a finite number, or time does not run forward.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON: {error}") from None
+    content = read_json(path)
     entries = content.get("entries") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{path}: expected a mapping with a list 'entries', one mapping per reading")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -14,10 +13,10 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from wlr_gym.base.errors import LARGEST_SEED, InputError
+from wlr_gym.base.errors import LARGEST_SEED
 from wlr_gym.base.files import check_same_request, make_output_folder, resumes, write_json, write_text
 from wlr_gym.base.html import commands, document, section, table
-from wlr_gym.base.settings import SettingsModel, parse_config
+from wlr_gym.base.settings import SettingsModel, parse_config, read_json
 from wlr_gym.base.text import duration
 from wlr_gym.learning.evaluation.scoring import COLUMNS
 
@@ -148,10 +147,7 @@ def open_folder(out: Path, asked: Asked, tell: Tell, threads: int) -> Progress:
     if not resumes(out, STATE_FILE):
         return Progress(out, asked, tell, threads)
     path = out / STATE_FILE
-    try:
-        state = parse_config(AdaptState, json.loads(path.read_text(encoding="utf-8")), str(path))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from None
+    state = parse_config(AdaptState, read_json(path), str(path))
     check_same_request(path, dict(state.asked), dict(asked))
     return Progress(out, asked, tell, threads, dict(state.steps), dict(state.spent))
 

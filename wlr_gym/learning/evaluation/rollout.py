@@ -1,4 +1,4 @@
-"""Play whole episodes, all at once as one batch, and keep what the score card and the plots need."""
+"""Play whole episodes, all at once as one batch, and keep what the score card needs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, check_number
-from wlr_gym.envs.tasks.signals import yaw_of
 from wlr_gym.robot import Robot
 
 if TYPE_CHECKING:
@@ -49,15 +48,13 @@ class Rollout:
         control_period: s.
         seeds: (N,) seed of each episode.
         measures: what the task measures itself by; see :class:`Measure`.
-        command_names: names of the commands, such as ``linear_velocity_x``.
         active: (T, N) the robot's episode had not ended before this step.
         fell: (N,) a termination term ended the episode. succeeded: (N,) as the task defines it.
         reward: (T, N).
         measured: (T, N, M) the task's measures.
         action: (T, N, 8) in [-1, 1].
         command: (T, N, C) what the robot had to follow in this step; SI units.
-        position: (T, N, 2) body origin in the floor frame, m. yaw: (T, N) rad.
-        forward_velocity: (T, N) of the body origin along the body's x, m/s. yaw_rate: (T, N) rad/s.
+        position: (T, N, 2) body origin in the floor frame, m.
         slip_velocity: (T, N, 4, 2) mean over the step, along each wheel's heading and axle, m/s.
         excess_slip: (T, N) mean slip speed of the wheels beyond what a steady skid turn needs, as the reward ``slip``, m/s.
         energy: (T, N) drawn from the supply, J; braking counts as negative.
@@ -70,7 +67,6 @@ class Rollout:
     control_period: float
     seeds: NDArray[np.int64]
     measures: tuple[Measure, ...]
-    command_names: tuple[str, ...]
     active: NDArray[np.bool_]
     fell: NDArray[np.bool_]
     succeeded: NDArray[np.bool_]
@@ -79,9 +75,6 @@ class Rollout:
     action: Array
     command: Array
     position: Array
-    yaw: Array
-    forward_velocity: Array
-    yaw_rate: Array
     slip_velocity: Array
     excess_slip: Array
     energy: Array
@@ -96,10 +89,6 @@ class Rollout:
     def episodes(self) -> int:
         """Number of episodes N."""
         return self.active.shape[1]
-
-    def commanded(self, name: str) -> Array:
-        """Return one command, (T, N)."""
-        return self.command[:, :, self.command_names.index(name)]
 
 
 def make_core(environment: str, episodes: int, keywords: Mapping[str, Any]) -> Core:
@@ -181,7 +170,6 @@ def roll_out(
         control_period=core.task.config.control_period,
         seeds=first_seed + np.arange(core.count),
         measures=measures_of(core),
-        command_names=core.task.commands,
         fell=core.terminated.copy(),
         succeeded=Infos(core).succeeded(),
         friction=friction,
@@ -201,9 +189,6 @@ def _signals(core: Core) -> dict[str, NDArray]:
         "measured": core.measures.copy(),
         "action": core.action.copy(),
         "position": truth["position"][:, :2].copy(),
-        "yaw": yaw_of(*truth["quaternion"].T),
-        "forward_velocity": truth["linear_velocity_in_body"][:, 0].copy(),
-        "yaw_rate": truth["angular_velocity_in_body"][:, 2].copy(),
         "slip_velocity": truth["slip_displacement"].reshape(shape) / core.task.config.control_period,
         "energy": truth["electrical_energy"].copy(),
         "saturated": saturated(truth, core.task.robot),
