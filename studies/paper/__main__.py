@@ -30,7 +30,7 @@ from wlr_gym.hardware.deployment import refuse_deadman
 from wlr_gym.hardware.loop import StoppedError
 from wlr_gym.hardware.operator import stop_on_request
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.physics.plants import REAL
+from wlr_gym.physics.plants import BACKENDS, REAL
 from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -42,8 +42,8 @@ _SHARES = {"tests": 0.15, "claims": 0.2, "search": 0.85, "decided": 0.9}
 class PaperOptions(JsonOption, ForceOption, RobotOption):
     out: Path
     """Folder for the report; made if it is not there."""
-    plant: tuple[str, ...] = ("reduced", "gibbs_appell", "mujoco")
-    """Models to run the tests on: reduced (the nine-velocity model), gibbs_appell, mujoco, dynamixel (a robot)."""
+    plant: tuple[str, ...] = ("gibbs_appell", "mujoco")
+    """Models to run the tests on: gibbs_appell, mujoco, dynamixel (a robot)."""
     yes: bool = False
     """Do not ask before the robot moves."""
     robot: str | None = field(default=None, kw_only=True)
@@ -71,7 +71,7 @@ def run(options: PaperOptions) -> int:
     if not options.plant:
         raise InputError("--plant: expected at least one model")
     for model in options.plant:
-        check_name("model", model, experiments.MODELS)
+        check_name("model", model, BACKENDS)
     if set(REAL) & set(options.plant):
         options.load_hardware()
     else:

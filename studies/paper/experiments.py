@@ -1,4 +1,4 @@
-"""The paper's two tests, and how to drive them: on the reduced model, on any simulator, on a robot.
+"""The paper's two tests, and how to drive them: on a simulator, on a robot.
 
 Commands as the servos take them: 80 velocity counts for the front wheels at 1 acceleration count, 15 velocity counts for the
 legs; the rear wheels have no torque. Time 0 is when the commands are written.
@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 
 from studies.paper import printed, reduced
 from studies.paper.quantities import PaperConstants, State
-from wlr_gym.base.errors import InputError, unknown_name
+from wlr_gym.base.errors import check_name
 from wlr_gym.data.excitations import Motion
 from wlr_gym.data.format import Profile
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import euler_angles, standing_at
 from wlr_gym.hardware.dynamixel.tables import load_table
-from wlr_gym.physics.plants import REAL, SIMULATORS, make_plant
+from wlr_gym.physics.plants import SIMULATORS, make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, Sensors
-from wlr_gym.physics.plants.forces import Force
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -45,10 +44,6 @@ DURATION = STOP_TIME + WHEEL_SPEED / WHEEL_ACCELERATION
 PERIOD = 0.02
 SETTLE = 1.0
 AFTER = 1.0
-#: The nine-velocity model of :mod:`studies.paper.reduced`, beside the plants of
-#: :data:`wlr_gym.physics.plants.BACKENDS`.
-REDUCED = "reduced"
-MODELS = (REDUCED, *SIMULATORS, *REAL)
 
 
 @dataclass(frozen=True)
@@ -159,8 +154,7 @@ def drive(
     test: PaperTest,
     robot: Robot,
     parameters: Parameters | None = None,
-    forces: tuple[Force, ...] = (),
-    physics_step: float | None = None,
+    physics_step: float = 0.001,
     every: int = 1,
     threads: int = 1,
     precision: str = "float64",
@@ -168,26 +162,20 @@ def drive(
     """Drive one test, N robots at once.
 
     Args:
-        model: the reduced one, or a simulator.
+        model: a simulator.
         test: of :data:`TESTS`. robot: the robot.
         parameters: (N); None = one nominal robot. The test's servo profile is written into them.
-        forces: formula forces (simulators).
-        physics_step: s; None = 1 ms, for the reduced model 2 ms.
+        physics_step: s.
         every: record every so many control ticks.
-        threads, precision: of a simulator.
+        threads, precision: of the simulator.
 
     Raises:
-        InputError: unknown model, formula forces for the reduced model.
+        InputError: unknown model.
     """
     parameters = profile_parameters(Parameters.nominal(robot) if parameters is None else parameters, PROFILE)
-    if model == REDUCED:
-        if forces:
-            raise InputError("the reduced model takes no formula forces; expected a simulator")
-        return _drive_reduced([test], robot, parameters, physics_step or 0.002, every)[0]
-    if model not in SIMULATORS:
-        raise unknown_name("backend", model, (REDUCED, *SIMULATORS))
-    options = PlantOptions(PERIOD, physics_step or 0.001, precision, threads, sensor_noise=False)
-    with closing(make_plant(model, robot, len(parameters), options, forces)) as plant:
+    check_name("backend", model, SIMULATORS)
+    options = PlantOptions(PERIOD, physics_step, precision, threads, sensor_noise=False)
+    with closing(make_plant(model, robot, len(parameters), options)) as plant:
         return drive_plant(plant, test, parameters, every)
 
 
@@ -268,50 +256,8 @@ def _record(model: str, test: PaperTest, rows: list[Row], every: int) -> Record:
     return Record(model, test, time, **found)
 
 
-def _drive_reduced(tests: list[PaperTest], robot: Robot, parameters: Parameters, step: float, every: int) -> list[Record]:
-    """All tests side by side, one block of robots each: a batch costs hardly more than one robot."""
-    count, blocks = len(parameters), len(tests)
-    model = reduced.ReducedModel(robot, Parameters(np.tile(parameters.values, (blocks, 1))), step)
-    setpoints = np.concatenate(
-        [np.repeat(test.motion().setpoints[:, None, reduced.PAIRS], count, axis=1) for test in tests], axis=1
-    )
-    starts = np.repeat([test.start for test in tests], count, axis=0)
-    rows, path, last = [], np.zeros((count * blocks, 4, 2)), np.zeros((count * blocks, 4, 2))
-    state = model.standing(*starts.T)
-    for tick, now in enumerate(reduced.run(model, state, np.nan_to_num(setpoints), np.isfinite(setpoints), PERIOD)):
-        slip = model.slip(now)
-        path, last = path + 0.5 * PERIOD * (slip + last), slip
-        if tick % every == 0:
-            rows.append(_look_at_reduced(model, now, slip, path))
-    whole = _record(REDUCED, tests[0], rows, every)
-    robots = np.arange(count)
-    return [replace(select(whole, robots + k * count), test=test) for k, test in enumerate(tests)]
-
-
-def _look_at_reduced(model: reduced.ReducedModel, state: reduced.ReducedState, slip: Array, path: Array) -> Row:
-    p = reduced.posture(model.constants, *state.legs.T)
-    b, _ = reduced.reduction(model.constants, p, state.u)
-    u = np.einsum("nij,nj->ni", b, state.u)
-    zero = np.zeros(len(u))
-    return {
-        "joint_position": np.concatenate([np.repeat(state.legs, 2, axis=1), state.wheels], axis=1),
-        "joint_velocity": np.concatenate([np.repeat(state.u[:, 3:5], 2, axis=1), state.u[:, 5:]], axis=1),
-        "torque": np.concatenate([np.repeat(state.motor[:, :2] / 2, 2, axis=1), state.motor[:, 2:]], axis=1),
-        "position": np.column_stack([state.pose[:, :2], p.height]),
-        "attitude": np.stack([state.pose[:, 2], p.pitch, zero], axis=1),
-        "velocity": np.stack([u[:, reduced.VX], u[:, reduced.VY], u[:, reduced.VZ]], axis=1),
-        "yaw_rate": state.u[:, 2].copy(),
-        "slip": slip,
-        "slip_path": path.copy(),
-        "force": np.stack([state.along, state.lateral, state.normal], axis=2),
-    }
-
-
 def drive_both(model: str, robot: Robot, parameters: Parameters | None = None) -> dict[str, Record]:
     """Drive both tests on one model; see :func:`drive`."""
-    if model == REDUCED:
-        nominal = profile_parameters(Parameters.nominal(robot) if parameters is None else parameters, PROFILE)
-        return dict(zip(TESTS, _drive_reduced(list(TESTS.values()), robot, nominal, 0.002, 1), strict=True))
     return {name: drive(model, test, robot, parameters) for name, test in TESTS.items()}
 
 

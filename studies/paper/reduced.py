@@ -1,4 +1,4 @@
-"""The paper's robot as a model that can be simulated: nine velocities, legs pairwise equal, no roll, wheels on the floor.
+"""The paper's robot in closed form: nine velocities, legs pairwise equal, no roll, wheels on the floor; its inverse dynamics.
 
 u9 = (v_x, v_y, yaw rate, alpha', beta', p_lf', p_rf', p_lr', p_rr'), velocities of G in the yaw frame, wheel rates relative to
 their leg. Height and pitch follow from the legs. The equations are written in u11, which has v_z and psi' after the yaw rate:
@@ -8,22 +8,17 @@ their leg. Height and pitch follow from the legs. The equations are written in u
 in closed form (source: audit of the paper, section 4a; tests prove it to be the projection of :mod:`wlr_gym.physics.model`).
 The two rows that B leaves over give the normal forces, equal left and right: four loads on three equations of a rigid body.
 
-Everything is batched over N robots. Of asymmetries, the model knows friction, gear drag and radius of single wheels (the last
-in rolling only); masses and loads are those of the left side.
+Everything is batched over N robots. Masses and loads are those of the left side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from studies.paper.quantities import PaperConstants, State
-from wlr_gym.physics import servo
-from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -32,8 +27,6 @@ VX, VY, YAW, VZ, PITCH, FRONT, REAR = range(7)  # indices of u11; the wheels fol
 _WHEELS = slice(7, 11)
 #: Columns of u9 in u11.
 _KEPT = [VX, VY, YAW, FRONT, REAR, 7, 8, 9, 10]
-#: One motor of each pair of legs, and all wheels.
-PAIRS = [0, 2, 4, 5, 6, 7]
 #: The paper's wheels in the order lf, rf, lr, rr.
 ORDER = {"lf": 0, "rf": 1, "lr": 2, "rr": 3}
 #: Of the corners lf, rf, lr, rr: ahead, to the left, and which leg.
@@ -263,190 +256,3 @@ def inverse_dynamics(
     normal = normal_forces(rest, j_n)
     rest -= np.einsum("nwk,nw->nk", j_n, normal)
     return InverseDynamics(rest[:, [FRONT, REAR]], rest[:, _WHEELS], along, lateral, normal)
-
-
-# ---- forward dynamics ------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class ReducedState:
-    """State of N robots: pose (N, 3: x, y, yaw), legs (N, 2), wheels (N, 4), u (N, 9), servo references (N, 6).
-
-    The last step's ``motor`` torques (N, 6: front pair, rear pair, wheels, N m), ``along`` and ``lateral`` (N, 4) floor forces,
-    and ``normal`` (N, 4) loads go with it, N.
-    """
-
-    pose: Array
-    legs: Array
-    wheels: Array
-    u: Array
-    reference: Array
-    reference_rate: Array
-    motor: Array
-    along: Array
-    lateral: Array
-    normal: Array
-
-
-class ReducedModel:
-    """N robots with servos, gear friction and Coulomb friction on a level floor.
-
-    Motors' back-EMF and viscous friction are implicit, dry friction of wheels and gears is solved by
-    :mod:`studies.paper.reduced` in every step, with the loads of the step before.
-    """
-
-    def __init__(self, robot: Robot, parameters: Parameters, step: float = 0.001) -> None:
-        self.step, self.constants = step, constants_of(parameters)
-        self.parameters = parameters
-        nominal = robot.servo.supply_voltage
-        self._many = many = np.array([2.0, 2.0, 1.0, 1.0, 1.0, 1.0])
-        self._constant, self._resistance = servo.motor_constants(
-            parameters["servo.stall_torque"][:, PAIRS], parameters["servo.no_load_speed"][:, PAIRS], nominal
-        )
-        self._kp, self._kd = servo.position_gains(parameters)[:, PAIRS], parameters["servo.kd"][:, PAIRS]
-        self._supply = parameters["servo.supply_voltage"][:, None]
-        self._viscous = many * parameters["servo.viscous_friction"][:, PAIRS]
-        self._dry = many * parameters["servo.coulomb_friction"][:, PAIRS]
-        velocity, acceleration = servo.profile_limits(
-            parameters["servo.profile_velocity"], parameters["servo.profile_acceleration"]
-        )
-        self._speed, self._ramp = velocity[:, PAIRS], acceleration[:, PAIRS]
-        self._radius = parameters["wheel.radius"]
-        self._mu = np.stack([parameters["ground.mu_x"], parameters["ground.mu_y"]], axis=2)
-
-    def standing(self, front: Array, rear: Array) -> ReducedState:
-        """Return robots at rest with leg angles (N,), loads from (16) and (17), motors off."""
-        count = len(front)
-        p = posture(self.constants, front, rear)
-        _, bias = mass_matrix_and_bias(self.constants, front, rear, p.pitch, np.zeros((count, 11)))
-        _, _, j_n = contact_rows(self.constants, p, self._radius)
-        legs = np.stack([front, rear], axis=1)
-        reference = np.concatenate([legs, np.zeros((count, 4))], axis=1)
-        zero = [np.zeros((count, size)) for size in (3, 4, 9, 6, 6, 4, 4)]
-        return ReducedState(
-            zero[0], legs.copy(), zero[1], zero[2], reference, zero[3], zero[4], zero[5], zero[6], normal_forces(bias, j_n)
-        )
-
-    def advance(self, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_]) -> None:
-        """Advance by one step, in place. ``setpoints``, ``torque_on`` (N, 6): front legs, rear legs, wheels lf, rf, lr, rr."""
-        h, c = self.step, self.constants
-        self._drift(state)
-        p = posture(c, *state.legs.T)
-        b, b_dot = reduction(c, p, state.u)
-        u11 = np.einsum("nij,nj->ni", b, state.u)
-        mass, bias = mass_matrix_and_bias(c, state.legs[:, 0], state.legs[:, 1], p.pitch, u11)
-        lag = np.einsum("nij,nj->ni", b_dot, state.u)
-        small = b.transpose(0, 2, 1) @ mass @ b
-        free = np.einsum("nki,nk->ni", b, bias + np.einsum("nij,nj->ni", mass, lag))
-        drive, damping = self._motors(state, setpoints, torque_on)
-        small_damped = small.copy()
-        small_damped[:, range(3, 9), range(3, 9)] += h * damping
-        pull = np.einsum("nij,nj->ni", small, state.u) - h * free
-        pull[:, 3:] += h * drive
-        j_x, j_y, j_n = contact_rows(c, p, self._radius)
-        rows = np.ascontiguousarray(np.stack([j_x @ b, j_y @ b], axis=2))
-        new, impulse = rub(small_damped, pull, rows, h * state.normal, self._mu, h * self._dry, state.u)
-        force = impulse / h
-        state.motor = drive - (damping - self._viscous) * new[:, 3:]
-        acceleration = np.einsum("nij,nj->ni", b, (new - state.u) / h) + lag
-        rest = np.einsum("nij,nj->ni", mass, acceleration) + bias - np.einsum("nwk,nw->nk", j_x, force[:, :, 0])
-        state.normal = np.maximum(normal_forces(rest, j_n), 0.0)
-        state.along, state.lateral, state.u = force[:, :, 0], force[:, :, 1], new
-        self._drift(state)
-
-    def slip(self, state: ReducedState) -> Array:
-        """Return slip velocities (N, 4, 2), m/s."""
-        p = posture(self.constants, *state.legs.T)
-        b, _ = reduction(self.constants, p, state.u)
-        j_x, j_y, _ = contact_rows(self.constants, p, self._radius)
-        return np.einsum("nwak,nk->nwa", np.stack([j_x @ b, j_y @ b], axis=2), state.u)
-
-    def _drift(self, state: ReducedState) -> None:
-        """Move the positions on by half a step."""
-        half, (vx, vy, w) = 0.5 * self.step, state.u.T[:3]
-        yaw = state.pose[:, 2] + 0.5 * half * w
-        state.pose += half * np.stack([vx * np.cos(yaw) - vy * np.sin(yaw), vx * np.sin(yaw) + vy * np.cos(yaw), w], axis=1)
-        state.legs += half * state.u[:, 3:5]
-        state.wheels += half * state.u[:, 5:]
-
-    def _motors(self, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Torque at rest (N, 6) and implicit damping (N, 6) of both motors of a leg pair and of each wheel's."""
-        h = self.step
-        position = np.concatenate([state.legs, state.wheels], axis=1)
-        old, rate = state.reference, state.reference_rate
-        legs = servo.leg_profile_step(old[:, :2], rate[:, :2], setpoints[:, :2], self._speed[:, :2], self._ramp[:, :2], h)
-        wheels = servo.wheel_profile_step(
-            old[:, 2:], rate[:, 2:], setpoints[:, 2:], self._ramp[:, 2:], h, position[:, 2:], self._kp[:, 2:], self._supply
-        )
-        place, speed, middle, mean = (np.concatenate(pair, axis=1) for pair in zip(legs, wheels, strict=True))
-        state.reference = np.where(torque_on, place, position)
-        state.reference_rate = np.where(torque_on, speed, 0.0)
-        voltage = servo.controller_voltage(self._kp, self._kd, middle, mean, position, state.u[:, 3:], self._supply)
-        on = self._many * torque_on
-        return on * servo.motor_torque(self._constant, self._resistance, voltage, 0.0), (
-            self._viscous + on * self._constant**2 / self._resistance
-        )
-
-
-def run(
-    model: ReducedModel, state: ReducedState, setpoints: Array, torque_on: NDArray[np.bool_], period: float
-) -> Iterator[ReducedState]:
-    """Hold each row of ``setpoints`` (ticks, N, 6) for ``period`` s and yield the states before the first and after each."""
-    yield state
-    for goal, on in zip(setpoints, torque_on, strict=True):
-        for _ in range(round(period / model.step)):
-            model.advance(state, goal, on)
-        yield state
-
-
-# ---- dry friction: the velocities that minimise 1/2 (u - u*)' A (u - u*) + h D(u) ------------------------------------
-#
-# D sums mu N |s| over wheels (an ellipse) and bound |rate| over gears, each rounded to sqrt(s^2 + creep^2). Reweighting: with
-# the roots held, the sum is quadratic; solve, take the roots anew, repeat.
-
-
-#: m/s and rad/s: what sticks may creep at most: 20 um in a test, far below an encoder count at the tread.
-CREEP = 1e-6
-JOINT_CREEP = 1e-5
-_ITERATIONS = 60
-_TOLERANCE = 1e-7
-#: Wheels; index of the first joint among the velocities.
-_CONTACTS, _FIRST_JOINT = 4, 3
-
-
-@njit(cache=True)
-def rub(a: Array, pull: Array, rows: Array, load: Array, mu: Array, dry: Array, start: Array) -> tuple[Array, Array]:
-    """Return velocities (N, 9) and impulses of the floor on the wheels (N, 4, 2), along and across.
-
-    Args:
-        a: (N, 9, 9) mass matrix with implicit damping. pull: (N, 9) momentum without dry friction.
-        rows: (N, 4, 2, 9) slip velocity of every wheel along and across. load: (N, 4) normal impulse, N s.
-        mu: (N, 4, 2). dry: (N, 6) friction impulse of the joints, N m s. start: (N, 9) first guess.
-    """
-    count = len(a)
-    velocity, impulse = start.copy(), np.zeros((count, _CONTACTS, 2))
-    weight = np.empty((_CONTACTS, 2))
-    for n in range(count):
-        u = velocity[n]
-        for _ in range(_ITERATIONS):
-            matrix = a[n].copy()
-            for wheel in range(_CONTACTS):
-                squared = (mu[n, wheel, 0] * CREEP) ** 2 + 1e-30
-                for axis in range(2):
-                    squared += (mu[n, wheel, axis] * (rows[n, wheel, axis] * u).sum()) ** 2
-                for axis in range(2):
-                    weight[wheel, axis] = load[n, wheel] * mu[n, wheel, axis] ** 2 / np.sqrt(squared)
-                    row = rows[n, wheel, axis]
-                    matrix += weight[wheel, axis] * np.outer(row, row)
-            for joint in range(dry.shape[1]):
-                i = _FIRST_JOINT + joint
-                matrix[i, i] += dry[n, joint] / np.sqrt(u[i] ** 2 + JOINT_CREEP**2)
-            new = np.linalg.solve(matrix, pull[n])
-            change = np.abs(new - u).max()
-            u[:] = new
-            if change < _TOLERANCE:
-                break
-        for wheel in range(_CONTACTS):
-            for axis in range(2):
-                impulse[n, wheel, axis] = -weight[wheel, axis] * (rows[n, wheel, axis] * u).sum()
-    return velocity, impulse

@@ -20,8 +20,6 @@ from studies.paper import printed, slip_search
 from studies.paper.claims import CheckedClaim, PaperEvidence, claims_table, variant_row
 from studies.paper.experiments import (
     DURATION,
-    MODELS,
-    REDUCED,
     TESTS,
     FromMeasurement,
     IdealMotion,
@@ -43,13 +41,12 @@ from studies.paper.verdicts import verdict_table
 from studies.tables import markdown_table
 from wlr_gym.base.files import write_json, write_text
 from wlr_gym.base.plots import BLUE, GREEN, GREY, ORANGE, WINE, legend_below, new_figure, save, tidy
-from wlr_gym.physics.plants import REAL, SIMULATORS
+from wlr_gym.physics.plants import BACKENDS, REAL, SIMULATORS
 from wlr_gym.robot import Robot
 
 Array = NDArray[np.float64]
 
 _STYLES: dict[str, dict[str, Any]] = {
-    REDUCED: {"label": "reduced model", "color": ORANGE, "linewidth": 2.4, "alpha": 0.7},
     "gibbs_appell": {"label": "Gibbs-Appell", "color": BLUE, "linewidth": 1.2},
     "mujoco": {"label": "MuJoCo", "color": "black", "linewidth": 1.0, "linestyle": (0, (4, 3))},
     **{model: {"label": model, "color": GREEN, "linewidth": 1.0} for model in REAL},
@@ -149,7 +146,7 @@ def torque_figure(records: Sequence[Record], ideal: IdealMotion, measured: FromM
         measured: inverse dynamics of the first simulator's record; None = none.
     """
     figure, axes = _panels(_heading(ideal.test, 2, "motor torque of the joints"), 2, 2, 2.8)
-    source = next((record for record in records if record.model != REDUCED), None)
+    source = next(iter(records), None)
 
     def of_joint(legs: Array, wheels: Array, joint: int) -> Array:
         return legs[:, joint // 2] / 2 if joint < 4 else wheels[:, joint - 4]
@@ -277,7 +274,7 @@ def agreement(records: Records) -> dict[str, dict[str, dict[str, float]]]:
     left and right taken together (how wheels that stick share a load is open), from the commands on.
     """
     reference = records.get("gibbs_appell")
-    others = [model for model in records if model in (REDUCED, *SIMULATORS) and model != "gibbs_appell"]
+    others = [model for model in records if model in SIMULATORS and model != "gibbs_appell"]
     if reference is None:
         return {}
     return {model: {name: _apart(reference[name], records[model][name]) for name in TESTS} for model in others}
@@ -326,7 +323,7 @@ def write_figures(folder: Path, records: Records, evidence: PaperEvidence, findi
         ideal, variants = evidence.ideal[name], evidence.variants[name]
         labels = "more drag left", "left front wheel 2 % small"
         paths = {label: variants.position[:, variant_row(label), :2] for label in labels}
-        own = sorted((record[name] for record in records.values()), key=lambda record: MODELS.index(record.model))
+        own = sorted((record[name] for record in records.values()), key=lambda record: list(BACKENDS).index(record.model))
         drawn = (
             rotation_figure(own, ideal),
             speed_figure(own, ideal),

@@ -203,7 +203,7 @@ def measure(robot: Robot, parameters: Parameters, test: PaperTest, threads: int 
     dials = [dial for candidate in CANDIDATES for dial in candidate.dials]
     everything = make_parameters(robot, dials, scaled(dials, np.full((1, len(dials)), 0.1)))
     batch = Parameters(np.concatenate([parameters.values, everything.values]))
-    record = drive("gibbs_appell", test, robot, batch, (), step, every=50, threads=threads, precision=precision)
+    record = drive("gibbs_appell", test, robot, batch, step, every=50, threads=threads, precision=precision)
     record = select(record, np.arange(len(parameters)))
     x, y = record.end.T
     yaw, scale = parameters["camera.mount_yaw"], parameters["camera.scale"]

@@ -179,23 +179,23 @@ def test_later_patches_lie_on_top_and_empty_ones_are_not_drawn(parameters):
     lay_patch(parameters, 0, 0.1, (0.0, 1.0), (0.0, 1.0))
     lay_patch(parameters, 2, 0.9, (0.5, 1.5), (0.0, 1.0))
     lay_patch(parameters, 3, 0.9, (1.0, 1.0), (0.0, 1.0))
-    low, high = marks.areas(parameters, 0, np.zeros(2))
+    low, high = marks.areas(parameters, np.zeros(2))
     assert (low.mu, high.mu) == (0.1, 0.9)
     assert high.height > low.height
 
 
 def test_half_a_world_of_ice_is_cut_to_what_can_be_seen(parameters):
     lay_patch(parameters, 0, 0.1, (-1000, 1000), (0, 1000))
-    (area,) = marks.areas(parameters, 0, np.array([100.0, -3.0, 0.2]))
+    (area,) = marks.areas(parameters, np.array([100.0, -3.0, 0.2]))
     assert area.low == (100 - marks.REACH, 0.0)
     assert area.high == (100 + marks.REACH, marks.REACH - 3.0)
-    assert marks.areas(parameters, 0, np.array([0.0, -50.0])) == []
+    assert marks.areas(parameters, np.array([0.0, -50.0])) == []
 
 
 def test_anisotropy_acts_on_the_shown_friction(parameters):
     parameters["ground.mu_y"][:] = 0.5 * parameters["ground.mu_x"]
     lay_patch(parameters, 0, 0.4, (0, 1), (0, 1))
-    assert marks.areas(parameters, 0, np.zeros(2))[0].mu == pytest.approx(0.3)
+    assert marks.areas(parameters, np.zeros(2))[0].mu == pytest.approx(0.3)
 
 
 def test_floor_colour_follows_its_friction(new_scene, parameters):
@@ -209,9 +209,9 @@ def test_floor_colour_follows_its_friction(new_scene, parameters):
 
 def test_wheels_on_floors_of_their_own_get_pads(robot, parameters):
     stage = posed(robot, truth_of(parameters), parameters)
-    assert marks.spots(stage, parameters, 0) == []
+    assert marks.spots(stage) == []
     parameters["ground.mu_x"][0] = parameters["ground.mu_y"][0] = [0.1, 0.6, 0.1, 0.6]
-    pads = marks.spots(stage, parameters, 0)
+    pads = marks.spots(posed(robot, truth_of(parameters), parameters))
     assert [pad.mu for pad in pads] == [0.1, 0.6, 0.1, 0.6]
     assert np.allclose(pads[1].centre[:2], [0.175, -0.16])
 
@@ -250,7 +250,7 @@ def test_slip_arrow_points_where_the_contact_skids(robot, parameters, yaw):
     quaternion = [[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]]
     truth = truth_of(parameters, quaternion=quaternion, slip_velocity=[[0, 0, 0.03, 0.04, 0, 0, 0, 0]])
     stage = posed(robot, truth, parameters)
-    (arrow,) = marks.slip_arrows(stage, truth, parameters, 0)
+    (arrow,) = marks.slip_arrows(stage)
     ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
     assert np.allclose(arrow.end - arrow.start, marks.SLIP_SCALE * (0.03 * ahead + 0.04 * left))
     contact = 0.175 * ahead - 0.16 * left
@@ -281,7 +281,7 @@ def test_contact_frames_of_a_tilted_robot_are_the_slip_definitions(robot, parame
     )
     truth = truth_of(parameters, quaternion=quaternion, position=[[0.3, -0.2, 0.25]])
     stage = posed(robot, truth, parameters)
-    points, heading, left = stage.contact_frames(parameters)
+    points, heading, left = stage.contact_frames()
     turn = np.array([0.3, -0.2, 0.9])  # rad/s, floor frame, about the body origin
     body = stage.data.body("body").xmat.reshape(3, 3)
     expected = contact_slip_velocity(
@@ -296,14 +296,14 @@ def test_too_little_too_much_and_no_slip(robot, parameters):
     slip = [[0.5 * marks.SLIP_FLOOR, 0, 10.0, 0, 0, 0, np.nan, 0]]
     truth = truth_of(parameters, slip_velocity=slip)
     stage = posed(robot, truth, parameters)
-    (arrow,) = marks.slip_arrows(stage, truth, parameters, 0)
+    (arrow,) = marks.slip_arrows(stage)
     assert np.linalg.norm(arrow.end - arrow.start) == pytest.approx(marks.LONGEST_ARROW)
 
 
 def test_force_arrows_are_the_friction_on_the_wheels(robot, parameters):
     truth = truth_of(parameters, contact_force=[[2.0, -1.0, 7.0] + [0.0, 0.0, 7.0] * 3])
     stage = posed(robot, truth, parameters)
-    (arrow,) = marks.force_arrows(stage, truth, parameters, 0)
+    (arrow,) = marks.force_arrows(stage)
     assert np.allclose(arrow.end - arrow.start, marks.FORCE_SCALE * np.array([2.0, -1.0, 0.0]))
 
 
@@ -334,9 +334,9 @@ def test_up_is_against_the_gravity_of_the_plants(robot, parameters):
 
 
 @pytest.mark.parametrize(("slope", "line"), [((0.1, 0.4), None), ((-0.7, 0.3), "slope -0.7° along x"), ((2, 1), "along y")])
-def test_only_slopes_that_matter_are_written(parameters, slope, line):
+def test_only_slopes_that_matter_are_written(robot, parameters, slope, line):
     parameters["ground.slope"][0] = np.radians(slope)
-    last = describe(truth_of(parameters), parameters, 0)[-1]
+    last = describe(posed(robot, truth_of(parameters), parameters))[-1]
     assert (line in last and "-0.0" not in last) if line else "slope" not in last
 
 
@@ -358,7 +358,7 @@ def test_the_robot_is_not_written_over(new_scene, parameters):
     lay_patch(parameters, 0, 0.05, (-0.5, 0.5), (-0.5, 0.5))
     scene = new_scene(View(size=(320, 240), camera="top"))
     scene.draw(truth_of(parameters), parameters)
-    ((_, place),) = scene._labels(marks.areas(parameters, 0, np.zeros(2)), np.zeros(3))
+    ((_, place),) = scene._labels(marks.areas(parameters, np.zeros(2)), np.zeros(3))
     robot, corner = scene.pixels([[0, 0, 0.1], [0.175, 0.16, 0.2]])
     assert np.linalg.norm(np.array(place) - robot) > np.abs(corner - robot).max()
 

@@ -288,7 +288,7 @@ class Pictures:
 
             self._viewer = Viewer(self.core.task.robot, self.core.settings.picture_view)
         period = self.core.task.config.control_period
-        self._viewer.show(self.core.plant.truth(), self.core.parameters, 0, period=period, **self._texts(0))
+        self._viewer.show(self.core.plant.truth(), self.core.parameters, period=period, **self._texts(0))
 
     def close(self) -> None:
         """Close the window and give OpenGL back."""

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import mujoco
 import numpy as np
@@ -158,22 +158,20 @@ class Scene:
         parameters: Parameters,
         row: int = 0,
         *,
-        time: float | None = None,
-        command: Mapping[str, float] | None = None,
-        title: str = "",
         result: str = "",
         look_at: ArrayLike | None = None,
         trails: Sequence[Trail] = (),
+        **texts: Unpack[Texts],
     ) -> Picture:
         """Return the picture (H, W, 3), uint8, of one robot.
 
         Args:
             truth: of a plant, any number of robots; nothing in it is changed. row: which robot.
             parameters: of the same robots: sizes of wheels and legs, payload, friction of the floor, slope.
-            time: s. command: name -> value in SI units; both are written into the picture.
-            title, result: first and last line of the text.
+            result: last line of the text.
             look_at: (x, y) of the floor in the middle of the picture, m; None = the robot.
             trails: paths over the floor to draw.
+            texts: what else is written into the picture.
 
         Raises:
             InputError: no OpenGL on this machine; the message says what to install or set.
@@ -185,7 +183,7 @@ class Scene:
             self._scene = mujoco.MjvScene(stage.model, maxgeom=stage.model.ngeom + MAX_MARKS)
         scene, eye = self._scene, mujoco.MjvCamera()
         middle = truth.position[row] if look_at is None else np.asarray(look_at)
-        up = up_direction(parameters["ground.slope"][row])
+        up = up_direction(stage.parameters["ground.slope"][0])
         place = (CAMERAS[self.view.camera], middle, stage.yaw(), up, magnification(self.robot))
         # The endless floor is laid out around the camera the scene had before, so it gets its own first.
         mujoco.mjv_updateCamera(stage.model, stage.data, eye, scene)
@@ -193,15 +191,15 @@ class Scene:
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(stage.model, stage.data, mujoco.MjvOption(), None, eye, everything, scene)
         aim(scene, *place)
-        floor = marks.areas(parameters, row, truth.position[row]) if self.view.friction else []
-        marks.add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+        floor = marks.areas(stage.parameters, truth.position[row]) if self.view.friction else []
+        marks.add_marks(scene, marks_of(stage, floor, self.view))
         marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail)])
         picture = self._canvas.draw(scene)
         if not self.view.text:
             return picture
-        lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip) + [result] * bool(result)
+        lines = describe(stage, slip=self.view.slip, **texts) + [result] * bool(result)
         notes = self._labels(floor, truth.position[row])
-        return annotate(picture, lines, legend(parameters, row, self.view), self.view.friction, notes)
+        return annotate(picture, lines, legend(stage.parameters, self.view), self.view.friction, notes)
 
     def pixels(self, points: object) -> NDArray[np.float64]:
         """Return where points (..., 3) of the floor frame are in the last picture: (..., 2) column and row, NaN if behind."""
@@ -235,21 +233,21 @@ class Scene:
         return notes
 
 
-def marks_of(stage: Stage, truth: Truth, parameters: Parameters, row: int, floor: list[Area], view: View) -> list[Mark]:
+def marks_of(stage: Stage, floor: list[Area], view: View) -> list[Mark]:
     """Return all that is drawn besides the robot, posed in ``stage``."""
-    drawn: list[Mark] = [marks.squares(stage, truth.position[row]), *floor]
+    drawn: list[Mark] = [marks.squares(stage), *floor]
     if view.friction:
-        drawn += marks.spots(stage, parameters, row)
+        drawn += marks.spots(stage)
     if view.forces:
-        drawn += marks.force_arrows(stage, truth, parameters, row)
+        drawn += marks.force_arrows(stage)
     if view.slip:
-        drawn += marks.slip_arrows(stage, truth, parameters, row)
+        drawn += marks.slip_arrows(stage)
     return drawn
 
 
-def legend(parameters: Parameters, row: int, view: View) -> list[str]:
-    """Return what the colours and arrows of a picture mean, line by line."""
-    mu = 0.5 * (parameters["ground.mu_x"][row] + parameters["ground.mu_y"][row])
+def legend(parameters: Parameters, view: View) -> list[str]:
+    """Return what the colours and arrows of one robot's picture mean, line by line."""
+    mu = 0.5 * (parameters["ground.mu_x"][0] + parameters["ground.mu_y"][0])
     low, high = f"{mu.min():.2f}", f"{mu.max():.2f}"
     floor = f"floor µ {low}" if low == high else f"floors µ {low} to {high}"
     lines = [f"{floor}, squares 0.2 m" if view.friction else "squares 0.2 m"]
@@ -269,29 +267,28 @@ _ANSWERS = {
 }
 
 
-def describe(
-    truth: Truth,
-    parameters: Parameters,
-    row: int,
-    time: float | None = None,
-    command: Mapping[str, float] | None = None,
-    title: str = "",
-    *,
-    slip: bool = True,
-) -> list[str]:
+class Texts(TypedDict, total=False):
+    """What is written into a picture besides what the robot does; absent or None = nothing."""
+
+    title: str  #: first line
+    time: float | None  #: s
+    command: Mapping[str, float] | None  #: name -> value in SI units
+
+
+def describe(stage: Stage, *, slip: bool = True, **texts: Unpack[Texts]) -> list[str]:
     """Return the lines of text of a picture."""
-    lines = [title] if title else []
-    if time is not None:
+    lines = [title] if (title := texts.get("title")) else []
+    if (time := texts.get("time")) is not None:
         lines.append(f"t {time:.2f} s")
-    command = command or {}
+    truth, command = stage.truth, texts.get("command") or {}
     for name, (label, unit, channel, axis) in _ANSWERS.items():
         asked = f" of {command[name]:.2f}" if name in command else ""
-        value = round(float(truth[channel][row, axis]), 2) + 0.0  # no minus before zero
+        value = round(float(truth[channel][0, axis]), 2) + 0.0  # no minus before zero
         lines.append(f"{label} {value:.2f}{asked} {unit}")
     if slip:
-        pairs = truth.slip_velocity[row].reshape(4, 2)
+        pairs = truth.slip_velocity[0].reshape(4, 2)
         lines.append(f"slip {np.hypot(pairs[:, 0], pairs[:, 1]).max():.3f} m/s (fastest wheel)")
-    pitch, roll = np.degrees(parameters["ground.slope"][row])
+    pitch, roll = np.degrees(stage.parameters["ground.slope"][0])
     slopes = [f"{angle:.1f}° along {axis}" for angle, axis in ((pitch, "x"), (roll, "y")) if abs(angle) >= LEAST_SLOPE]
     return [*lines, f"slope {', '.join(slopes)}"] if slopes else lines
 

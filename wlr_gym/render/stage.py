@@ -46,22 +46,27 @@ class Stage:
     Attributes:
         model, data: MuJoCo's; the model's structure never changes, so viewers and canvases may keep it.
         shape: changes when sizes or colours of the model do.
+        truth, parameters: (1) of the robot as it was posed last.
     """
+
+    truth: Truth
 
     def __init__(self, robot: Robot, parameters: Parameters, row: int = 0, size: tuple[int, int] = (640, 480)) -> None:
         self.robot = robot
         self._size = size
-        self.shape: bytes = self._shape_of(parameters, row)
-        self.model: Any = self._build(parameters, row)
+        self.parameters: Parameters = Parameters(parameters.values[[row]])
+        self.shape: bytes = self._shape_of_parameters()
+        self.model: Any = self._build()
         self.data: Any = mujoco.MjData(self.model)
         self._addresses = [int(self.model.joint(joint).qposadr[0]) for joint in JOINTS]
         self.wheel_bodies: list[int] = [int(self.model.body(wheel).id) for wheel in WHEELS]
 
     def pose(self, truth: Truth, parameters: Parameters, row: int = 0) -> None:
         """Put the robot where row ``row`` of a plant's truth is, in the shape that row of its parameters gives it."""
-        shape = self._shape_of(parameters, row)
+        self.truth, self.parameters = Truth(truth.values[[row]]), Parameters(parameters.values[[row]])
+        shape = self._shape_of_parameters()
         if shape != self.shape:
-            other = self._build(parameters, row)
+            other = self._build()
             for name in _SHAPES:
                 getattr(self.model, name)[:] = getattr(other, name)
             self.shape = shape
@@ -72,33 +77,33 @@ class Stage:
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
-    def contact_frames(self, parameters: Parameters, row: int = 0) -> tuple[Array, Array, Array]:
-        """Return contact points, headings and axle directions in the floor, each (4, 3), of the pose drawn last."""
+    def contact_frames(self) -> tuple[Array, Array, Array]:
+        """Return contact points, headings and axle directions in the floor, each (4, 3)."""
         centres = self.data.xpos[self.wheel_bodies]
         axles = self.data.xmat[self.wheel_bodies].reshape(4, 3, 3)[:, :, 1]
         left = axles * [1.0, 1.0, 0.0]
         left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
         heading = np.cross(left, [0.0, 0.0, 1.0])
         upwards = np.cross(heading, axles)  # in the disc, away from its lowest point
-        return centres - parameters["wheel.radius"][row][:, None] * upwards, heading, left
+        return centres - self.parameters["wheel.radius"][0][:, None] * upwards, heading, left
 
     def yaw(self) -> float:
         """Return the heading of the body drawn last, rad."""
         ahead = self.data.body("body").xmat.reshape(3, 3)[:, 0]
         return float(np.arctan2(ahead[1], ahead[0]))
 
-    def _shape_of(self, parameters: Parameters, row: int) -> bytes:
-        return b"".join(np.asarray(parameters[name][row]).tobytes() for name in SHAPING)
+    def _shape_of_parameters(self) -> bytes:
+        return b"".join(np.asarray(self.parameters[name]).tobytes() for name in SHAPING)
 
-    def _build(self, parameters: Parameters, row: int) -> mujoco.MjModel:
+    def _build(self) -> mujoco.MjModel:
         shape = Parameters.nominal(self.robot)  # masses may be such that MuJoCo takes no model of them; they are not seen
         for name in SHAPING:
-            shape[name] = parameters[name][row]
+            shape[name] = self.parameters[name]
         model = build_model(self.robot, shape, contacts=False, wheel_shape="capsule", extend=self._dress)
-        model.geom("floor").rgba = (*floor_colour(parameters, row), 1.0)
+        model.geom("floor").rgba = (*floor_colour(shape), 1.0)
         payload = model.geom("payload")
-        payload.size = 0.5 * np.cbrt(parameters["payload.mass"][row] / PAYLOAD_DENSITY)
-        payload.rgba[3] = float(parameters["payload.mass"][row] > 0)
+        payload.size = 0.5 * np.cbrt(shape["payload.mass"][0] / PAYLOAD_DENSITY)
+        payload.rgba[3] = float(shape["payload.mass"][0] > 0)
         return model
 
     def _dress(self, spec: mujoco.MjSpec) -> None:
@@ -110,9 +115,9 @@ class Stage:
             _dress_wheel(spec.body(wheel), self.robot)
 
 
-def floor_colour(parameters: Parameters, row: int) -> Colour:
-    """Return the colour of the bare floor, by its mean friction."""
-    return friction_colour(float(np.mean([parameters[f"ground.mu_{axis}"][row] for axis in "xy"])))
+def floor_colour(parameters: Parameters) -> Colour:
+    """Return the colour of a robot's bare floor, by its mean friction."""
+    return friction_colour(float(np.mean([parameters[f"ground.mu_{axis}"][0] for axis in "xy"])))
 
 
 # --- dressing ---------------------------------------------------------------------------------------------------------
@@ -273,38 +278,38 @@ class Squares:
 Mark = Squares | Area | Spot | Arrow
 
 
-def squares(stage: Stage, around: Array) -> Squares:
-    """Return the squares around a place (x, y); they stay where they are when it moves."""
+def squares(stage: Stage) -> Squares:
+    """Return the squares around the robot; they stay where they are when it moves."""
     pattern = 2.0 * SQUARE
-    return Squares(pattern * np.round(around[:2] / pattern), int(stage.model.material("squares").id))
+    return Squares(pattern * np.round(stage.truth.position[0, :2] / pattern), int(stage.model.material("squares").id))
 
 
-def areas(parameters: Parameters, row: int, around: Array) -> list[Area]:
-    """Return the non-empty friction patches, cut to what can be seen from ``around`` (x, y); later ones lie on top.
+def areas(parameters: Parameters, around: Array) -> list[Area]:
+    """Return one robot's non-empty friction patches, cut to what can be seen from ``around`` (x, y); later ones lie on top.
 
     The colour is that of the friction along the heading and the axle on average (along the axle: times mu_y/mu_x).
     """
     found = []
-    mu_x, mu_y = parameters["ground.mu_x"][row].mean(), parameters["ground.mu_y"][row].mean()
+    mu_x, mu_y = parameters["ground.mu_x"][0].mean(), parameters["ground.mu_y"][0].mean()
     share = 0.5 * (1.0 + (mu_y / mu_x if mu_x > 0 else 1.0))
     for index in range(len(PATCHES)):
-        box = [parameters[f"patch.{side}"][row, index] for side in ("x_min", "x_max", "y_min", "y_max")]
+        box = [parameters[f"patch.{side}"][0, index] for side in ("x_min", "x_max", "y_min", "y_max")]
         if not (box[0] < box[1] and box[2] < box[3]):
             continue
         low = np.maximum([box[0], box[2]], around[:2] - REACH)
         high = np.minimum([box[1], box[3]], around[:2] + REACH)
         if (low < high).all():
-            mu = float(parameters["patch.mu"][row, index]) * float(share)
+            mu = float(parameters["patch.mu"][0, index]) * float(share)
             found.append(Area((float(low[0]), float(low[1])), (float(high[0]), float(high[1])), mu, LAYER * (index + 1)))
     return found
 
 
-def spots(stage: Stage, parameters: Parameters, row: int) -> list[Spot]:
+def spots(stage: Stage) -> list[Spot]:
     """Return a pad under every wheel where the wheels have different floors, none where they share one."""
-    mu = 0.5 * (parameters["ground.mu_x"][row] + parameters["ground.mu_y"][row])
+    mu = 0.5 * (stage.parameters["ground.mu_x"][0] + stage.parameters["ground.mu_y"][0])
     if np.ptp(mu) < 1e-9:
         return []
-    points, _, _ = stage.contact_frames(parameters, row)
+    points, _, _ = stage.contact_frames()
     return [Spot(point, float(value)) for point, value in zip(points, mu, strict=True)]
 
 
@@ -319,34 +324,32 @@ def pieces(trail: Trail) -> list[Arrow]:
     return [Arrow(a, b, trail.colour, has_head=False) for a, b in parts if np.hypot(*(b - a)[:2]) > 1e-6]
 
 
-def slip_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
+def slip_arrows(stage: Stage) -> list[Arrow]:
     """Return one arrow per slipping wheel: where its contact point skids to over the floor."""
-    slip = truth.slip_velocity[row].reshape(4, 2)
+    slip = stage.truth.slip_velocity[0].reshape(4, 2)
     speed = np.hypot(slip[:, 0], slip[:, 1])
     colours = [slip_colour(float(value)) for value in speed]
-    return _arrows(stage, parameters, row, SLIP_SCALE * slip, SLIP_SCALE * SLIP_FLOOR, SLIP_BESIDE, colours)
+    return _arrows(stage, SLIP_SCALE * slip, SLIP_SCALE * SLIP_FLOOR, SLIP_BESIDE, colours)
 
 
-def force_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
+def force_arrows(stage: Stage) -> list[Arrow]:
     """Return one arrow per wheel: the floor's friction force on it."""
-    force = truth.contact_force[row].reshape(4, 3)[:, :2]
-    return _arrows(stage, parameters, row, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * 4)
+    force = stage.truth.contact_force[0].reshape(4, 3)[:, :2]
+    return _arrows(stage, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * 4)
 
 
-def load_arrows(stage: Stage, truth: Truth, parameters: Parameters, row: int) -> list[Arrow]:
+def load_arrows(stage: Stage) -> list[Arrow]:
     """Return one arrow per loaded wheel: the floor's normal force on it, upwards beside the wheel."""
-    load = truth.contact_force[row].reshape(4, 3)[:, 2]
-    points, _, left = stage.contact_frames(parameters, row)
+    load = stage.truth.contact_force[0].reshape(4, 3)[:, 2]
+    points, _, left = stage.contact_frames()
     starts = points + FORCE_BESIDE * OUTWARDS * left
     ends = starts + np.minimum(FORCE_SCALE * load, LONGEST_ARROW)[:, None] * [0.0, 0.0, 1.0]
     return [Arrow(starts[wheel], ends[wheel], LOAD) for wheel in np.flatnonzero(load >= FORCE_FLOOR)]
 
 
-def _arrows(
-    stage: Stage, parameters: Parameters, row: int, vectors: Array, shortest: float, beside: float, colours: list[Colour]
-) -> list[Arrow]:
+def _arrows(stage: Stage, vectors: Array, shortest: float, beside: float, colours: list[Colour]) -> list[Arrow]:
     """Return an arrow in the floor per wheel with a vector (4, 2) along heading and left, m, that is not too short."""
-    points, heading, left = stage.contact_frames(parameters, row)
+    points, heading, left = stage.contact_frames()
     starts = points + beside * OUTWARDS * left + [0.0, 0.0, SHAFT + LAYER * 5]
     length = np.hypot(vectors[:, 0], vectors[:, 1])
     scale = np.minimum(1.0, LONGEST_ARROW / np.maximum(length, 1e-12))[:, None]

@@ -10,15 +10,15 @@ from __future__ import annotations
 import importlib
 import platform
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Unpack
 
 import mujoco
 import numpy as np
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants.base import Truth
-from wlr_gym.render.scene import describe, marks_of
+from wlr_gym.render.scene import Texts, describe, marks_of
 from wlr_gym.render.stage import Stage, add_marks, areas
 from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, View, magnification, require_display
 from wlr_gym.robot import Robot
@@ -81,21 +81,11 @@ class Viewer:
         """False before the first picture, and once the user has closed the window."""
         return self._window is not None and self._window.is_running()
 
-    def show(
-        self,
-        truth: Truth,
-        parameters: Parameters,
-        row: int = 0,
-        *,
-        period: float,
-        time: float | None = None,
-        command: Mapping[str, float] | None = None,
-        title: str = "",
-    ) -> bool:
-        """Show one robot and wait until its control period is over.
+    def show(self, truth: Truth, parameters: Parameters, *, period: float, **texts: Unpack[Texts]) -> bool:
+        """Show the first robot and wait until its control period is over.
 
         Args:
-            truth, parameters, row, time, command, title: as in :meth:`wlr_gym.render.scene.Scene.draw`.
+            truth, parameters, texts: as in :meth:`wlr_gym.render.scene.Scene.draw`.
             period: s that this picture stands for.
 
         Returns:
@@ -104,8 +94,8 @@ class Viewer:
         Raises:
             InputError: no display.
         """
-        self._stage = stage = self._stage or Stage(self.robot, parameters, row, self.view.size)
-        stage.pose(truth, parameters, row)
+        self._stage = stage = self._stage or Stage(self.robot, parameters, size=self.view.size)
+        stage.pose(truth, parameters)
         if self._window is None:
             self._window = open_window(stage.model, stage.data, self._on_key)
             start, eye = CAMERAS[self.view.camera], self._window.cam
@@ -115,13 +105,13 @@ class Viewer:
         if not self._window.is_running():
             return False
         with self._window.lock():
-            self._window.cam.lookat[:] = [*truth.position[row, :2], magnification(self.robot) * LOOK_HEIGHT]
+            self._window.cam.lookat[:] = [*truth.position[0, :2], magnification(self.robot) * LOOK_HEIGHT]
             scene = self._window.user_scn
             scene.ngeom = 0
-            floor = areas(parameters, row, truth.position[row]) if self.view.friction else []
-            add_marks(scene, marks_of(stage, truth, parameters, row, floor, self.view))
+            floor = areas(stage.parameters, truth.position[0]) if self.view.friction else []
+            add_marks(scene, marks_of(stage, floor, self.view))
         if self.view.text:
-            lines = describe(truth, parameters, row, time, command, title, slip=self.view.slip)
+            lines = describe(stage, slip=self.view.slip, **texts)
             self._window.set_texts([(None, mujoco.mjtGridPos.mjGRID_TOPLEFT, "\n".join(lines).replace("°", " deg"), "")])
         self._window.sync()
         self._pace.wait(period)

@@ -1,4 +1,4 @@
-"""The same tests through reduced model, Gibbs-Appell and MuJoCo; inverse dynamics of what they do; a robot without truth."""
+"""The same tests through Gibbs-Appell and MuJoCo; inverse dynamics of what they do; a robot without truth."""
 
 from dataclasses import replace
 
@@ -8,7 +8,6 @@ import pytest
 from studies.paper import reduced, report
 from studies.paper.experiments import (
     PERIOD,
-    REDUCED,
     TESTS,
     drive,
     drive_both,
@@ -39,7 +38,7 @@ def with_drag():
 @pytest.fixture(scope="module")
 def pairs():
     """Both tests with both robots on every model."""
-    return {model: drive_both(model, ROBOT, with_drag()) for model in (REDUCED, *SIMULATORS)}
+    return {model: drive_both(model, ROBOT, with_drag()) for model in SIMULATORS}
 
 
 @pytest.fixture(scope="module")
@@ -107,35 +106,8 @@ def test_models_slip_alike(pairs):
     error = {model: float(error_of_ignoring_slip(ROBOT, tests["test_1"])[1]) for model, tests in pairs.items()}
     assert error["gibbs_appell"] < -0.08
     assert error["mujoco"] == pytest.approx(error["gibbs_appell"], abs=0.005)
-    assert error[REDUCED] == pytest.approx(error["gibbs_appell"], abs=0.005)
     ends = {model: float(tests["test_1"].end[1, 0]) for model, tests in pairs.items()}
     assert max(ends.values()) - min(ends.values()) < 0.02 * ends["gibbs_appell"]
-
-
-def test_energy_of_the_reduced_model_is_accounted_for():
-    """Motors off, no friction: a rolling robot keeps its kinetic energy while the legs are held by nothing but symmetry."""
-    parameters = Parameters.nominal(ROBOT)
-    parameters["servo.coulomb_friction"] = 0.0
-    parameters["ground.mu_x"] = parameters["ground.mu_y"] = 0.0
-    model = reduced.ReducedModel(ROBOT, parameters, 0.0005)
-    state = model.standing(np.array([1.2]), np.array([1.9]))
-    state.u[0, :3], state.u[0, 3:5] = (0.2, 0.1, 0.5), (0.3, -0.2)
-
-    def energy():
-        p = reduced.posture(model.constants, *state.legs.T)
-        b, _ = reduced.reduction(model.constants, p, state.u)
-        u = np.einsum("nij,nj->ni", b, state.u)
-        m, _ = reduced.mass_matrix_and_bias(model.constants, state.legs[:, 0], state.legs[:, 1], p.pitch, u)
-        c = model.constants
-        raised = np.sin(p.f) + np.sin(p.r)
-        height = c.M_G * (c.a + c.l / 2 * raised) + 2 * c.m_l * (2 * c.a + (1 - c.lam) * c.l * raised) + 4 * c.m_w * c.a
-        return float((0.5 * np.einsum("ni,nij,nj->n", u, m, u) + c.g * height)[0])
-
-    before = energy()
-    for _ in range(400):
-        model.advance(state, np.zeros((1, 6)), np.zeros((1, 6), bool))
-    assert abs(float(state.u[0, 3])) > 0.3  # the legs do give way
-    assert energy() == pytest.approx(before, abs=2e-3 * abs(before - ROBOT.total_mass * 9.81 * 0.034))
 
 
 class Blind:

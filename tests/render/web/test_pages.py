@@ -81,18 +81,19 @@ def test_arrows_come_and_go(server, parameters):
 def test_the_floor_has_areas_and_pads_of_other_friction(server, parameters):
     floor, stage, truth = PageFloor(server), Stage(ROBOT, parameters), truth_of(parameters)
     stage.pose(truth, parameters)
-    floor.show(stage, truth, parameters, 0, View())
+    floor.show(stage, View())
     assert "/floor/area_0" not in server.scene._handle_from_node_name
     for name, value in (("mu", 0.1), ("x_min", 1), ("x_max", 2), ("y_min", 1), ("y_max", 2)):
         parameters[f"patch.{name}"][:, 0] = value
     parameters["ground.mu_x"][0, 0] = 0.2
-    floor.show(stage, truth, parameters, 0, View())
+    stage.pose(truth, parameters)
+    floor.show(stage, View())
     area = node(server, "/floor/area_0")
     assert np.allclose(area.position[:2], [1.5, 1.5])
     assert np.allclose(area.dimensions[:2], [1.0, 1.0])
     assert "µ 0.1" in node(server, "/floor/label_0").text
     assert len({tuple(node(server, f"/floor/pad_{k}").color) for k in range(4)}) == 2
-    floor.show(stage, truth, parameters, 0, View(friction=False))
+    floor.show(stage, View(friction=False))
     assert "/floor/area_0" not in server.scene._handle_from_node_name
 
 
@@ -127,13 +128,13 @@ def test_plots_of_a_running_plant_hold_the_last_seconds(live, parameters):
     viewer, truth = live[0], truth_of(parameters)
     for k in range(3000):
         truth["contact_force"][0, 2] = k
-        viewer._note(truth, 0, 0.02 * k)
+        viewer._note(truth, 0.02 * k)
     curves = viewer.curves("contact_force")
     assert curves[0].t[[0, -1]] == pytest.approx([39.98, 59.98])
     assert curves[2].label == "contact_force[wheel_lf,z]"
     assert curves[2].values[-1] == 2999
     assert len(curves) == 12
-    viewer._note(truth, 0, 0.0)
+    viewer._note(truth, 0.0)
     assert len(viewer.curves("contact_force")[0].t) == 1
 
 

@@ -12,7 +12,7 @@ import time as clock
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Unpack
 
 import mujoco
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth
 from wlr_gym.render import stage as marks
-from wlr_gym.render.scene import describe, legend
+from wlr_gym.render.scene import Texts, describe, legend
 from wlr_gym.render.stage import SQUARE, Stage
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP
 from wlr_gym.render.view import CAMERAS, Colour, View, friction_colour, up_direction
@@ -74,10 +74,10 @@ class Figure:
         if self._frame.visible:
             self._frame.visible = False
 
-    def pose(self, truth: Truth, parameters: Parameters, row: int = 0) -> Stage:
-        """Put it where row ``row`` of a plant's truth is, in the sizes that row of its parameters gives it."""
-        self._stage = stage = self._stage or Stage(self.robot, parameters, row)
-        stage.pose(truth, parameters, row)
+    def pose(self, truth: Truth, parameters: Parameters) -> Stage:
+        """Put it where the first robot of a plant's truth is, in the sizes that its parameters give it."""
+        self._stage = stage = self._stage or Stage(self.robot, parameters)
+        stage.pose(truth, parameters)
         if stage.shape != self._shape:
             self._nodes = [(body.index, self._add(body)) for body in bodies(stage)]
             self._shape = stage.shape
@@ -122,12 +122,13 @@ class PageFloor:
         self._shown: list[Any] = []
         self._pads: list[Any] = []
 
-    def show(self, stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> None:
+    def show(self, stage: Stage, view: View) -> None:
         """Draw the floor around the robot that is posed in ``stage``, and move it so that ``view``'s camera sees the robot."""
-        up = up_direction(parameters["ground.slope"][row])
-        self._frame.wxyz, self._frame.position = page.floor_pose(truth.position[row], stage.yaw(), up, CAMERAS[view.camera])
+        parameters, place = stage.parameters, stage.truth.position[0]
+        up = up_direction(parameters["ground.slope"][0])
+        self._frame.wxyz, self._frame.position = page.floor_pose(place, stage.yaw(), up, CAMERAS[view.camera])
         scene = self._server.scene
-        if (colour := marks.floor_colour(parameters, row)) != self._colour:
+        if (colour := marks.floor_colour(parameters)) != self._colour:
             scene.add_grid(
                 f"{FLOOR}/plane", _WIDE, _WIDE, cell_size=SQUARE, section_size=5 * SQUARE, cell_color=(170, 170, 170),
                 section_color=(140, 140, 140), plane_color=rgb(colour), plane_opacity=1.0, shadow_opacity=0.3,
@@ -135,14 +136,14 @@ class PageFloor:
             )  # fmt: skip
             self._colour = colour
         # Far around, so that areas need not be drawn anew at each step.
-        middle = np.round(truth.position[row] / marks.REACH) * marks.REACH
-        areas = marks.areas(parameters, row, middle) if view.friction else []
+        middle = np.round(place / marks.REACH) * marks.REACH
+        areas = marks.areas(parameters, middle) if view.friction else []
         if areas != self._areas:
             for node in self._shown:
                 node.remove()
             self._shown = [node for k, area in enumerate(areas) for node in self._area(k, area)]
             self._areas = areas
-        spots = marks.spots(stage, parameters, row) if view.friction else []
+        spots = marks.spots(stage) if view.friction else []
         if len(spots) != len(self._pads):
             for node in self._pads:
                 node.remove()
@@ -161,11 +162,11 @@ class PageFloor:
         return [box, scene.add_label(f"{FLOOR}/label_{k}", f"µ {area.mu:.2g}", position=(x, y, 0.01))]
 
 
-def arrows_of(stage: Stage, truth: Truth, parameters: Parameters, row: int, view: View) -> list[marks.Arrow]:
+def arrows_of(stage: Stage, view: View) -> list[marks.Arrow]:
     """Return the arrows of a posed robot: slip, and the floor's friction and normal force, where the view has them."""
-    arrows = marks.slip_arrows(stage, truth, parameters, row) if view.slip else []
+    arrows = marks.slip_arrows(stage) if view.slip else []
     if view.forces:
-        arrows += marks.force_arrows(stage, truth, parameters, row) + marks.load_arrows(stage, truth, parameters, row)
+        arrows += marks.force_arrows(stage) + marks.load_arrows(stage)
     return arrows
 
 
@@ -249,11 +250,12 @@ class _Page:
         self._ground = PageFloor(self.server)
         self._told = -np.inf
 
-    def _show(self, figure: Figure, truth: Truth, parameters: Parameters, row: int, view: View, arrows: View) -> None:
+    def _show(self, figure: Figure, truth: Truth, parameters: Parameters, view: View, arrows: View) -> Stage:
         """Pose the robot that the page goes along with, with the arrows that a view has, and the floor under it."""
-        stage = figure.pose(truth, parameters, row)
-        figure.point(arrows_of(stage, truth, parameters, row, arrows))
-        self._ground.show(stage, truth, parameters, row, view)
+        stage = figure.pose(truth, parameters)
+        figure.point(arrows_of(stage, arrows))
+        self._ground.show(stage, view)
+        return stage
 
     def _texts_are_due(self) -> bool:
         now = clock.monotonic()
@@ -318,29 +320,19 @@ class WebViewer(_Page):
         self._plots = page.Plots(self.server, page.plot_panel(self.server), _TITLES, _FIRST)
         print(self._address, flush=True)
 
-    def show(
-        self,
-        truth: Truth,
-        parameters: Parameters,
-        row: int = 0,
-        *,
-        period: float,
-        time: float | None = None,
-        command: Mapping[str, float] | None = None,
-        title: str = "",
-    ) -> bool:
-        """Show one robot and wait until its control period is over; the arguments are those of the window's viewer.
+    def show(self, truth: Truth, parameters: Parameters, *, period: float, **texts: Unpack[Texts]) -> bool:
+        """Show the first robot and wait until its control period is over; the arguments are those of the window's viewer.
 
         Returns:
             True: browsers come and go, the page stays.
         """
         view = self._look.view
-        self._note(truth, row, time or 0.0)
+        self._note(truth, texts.get("time") or 0.0)
         with self.server.atomic():
-            self._show(self._figure, truth, parameters, row, view, view)
+            stage = self._show(self._figure, truth, parameters, view, view)
         if self._texts_are_due():
-            lines = describe(truth, parameters, row, time, command, title, slip=view.slip)
-            self._text.content = page.html_lines([*lines, *legend(parameters, row, view)])
+            lines = describe(stage, slip=view.slip, **texts)
+            self._text.content = page.html_lines([*lines, *legend(stage.parameters, view)])
             if len(self._past) > 1:
                 curves = {name: self.curves(name) for name in self._plots.chosen if name in _TITLES}
                 begin, now = self._past[0][0], self._past[-1][0]
@@ -348,11 +340,11 @@ class WebViewer(_Page):
         self._pace.wait(period)
         return True
 
-    def _note(self, truth: Truth, row: int, time: float) -> None:
+    def _note(self, truth: Truth, time: float) -> None:
         """Keep the present and the last :data:`WINDOW` seconds; a time that goes back begins anew."""
         if self._past and time <= self._past[-1][0]:
             self._past.clear()
-        self._past.append((time, truth.values[row].copy()))
+        self._past.append((time, truth.values[0].copy()))
         while time - self._past[0][0] > WINDOW:
             self._past.popleft()
 
@@ -504,16 +496,15 @@ class Player(_Page):
         moment, ghost = recording.at(time), recording.ghost_at(time) if self._show_ghost.value else None
         arrows = replace(view, slip=view.slip and moment.slip, forces=view.forces and moment.forces)
         with self.server.atomic():
-            self._show(self._robot, moment.truth, moment.parameters, 0, view, arrows)
+            stage = self._show(self._robot, moment.truth, moment.parameters, view, arrows)
             if ghost is None:
                 self._ghost.hide()
             else:  # it has arrows only where the robot has none of its own
                 arrows = replace(view, slip=False, forces=view.forces and not moment.forces)
-                stage = self._ghost.pose(ghost.truth, ghost.parameters)
-                self._ghost.point(arrows_of(stage, ghost.truth, ghost.parameters, 0, arrows))
+                self._ghost.point(arrows_of(self._ghost.pose(ghost.truth, ghost.parameters), arrows))
         if texts:
-            lines = describe(moment.truth, moment.parameters, 0, time, None, recording.name, slip=moment.slip)
-            self._text.content = page.html_lines([*lines, *recording.lines(time), *legend(moment.parameters, 0, view)])
+            lines = describe(stage, slip=moment.slip, time=time, title=recording.name)
+            self._text.content = page.html_lines([*lines, *recording.lines(time), *legend(moment.parameters, view)])
 
     def _plot(self, time: float) -> None:
         width, length, now = WINDOWS[str(self._window.value)], self.recording.length, clock.monotonic()
