@@ -22,7 +22,6 @@ from wlr_gym.cli.options import ForceOption, JsonOption
 from wlr_gym.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
-    from studies.bench.engine import EngineReport
     from studies.bench.speed import Deviation
     from studies.bench.vision import VisionResult
 
@@ -92,7 +91,8 @@ def run(options: BenchOptions) -> int:
             module, _, function = MEASUREMENTS[name].partition(":")
             rows = getattr(importlib.import_module(module), function)(Size(options.rounds, options.quick, told))
             if name == "engine":
-                rows = _engine_pairs(rows, report, console, options.save)
+                report["engine"] = rows
+                rows = _engine_pairs(rows, console, options.save)
             report[name if name in _TABLES else "measurements"] += [row.as_dict() for row in rows]
             _TABLES.get(name, _print_speed)(rows, console)
     if options.json:
@@ -103,18 +103,17 @@ def run(options: BenchOptions) -> int:
     return OK
 
 
-def _engine_pairs(found: EngineReport, report: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:
-    """Put accuracy and speed of all settings into the report, print them, draw them beside it; return the ratios."""
+def _engine_pairs(found: dict[str, Any], console: Console, save: Path | None) -> list[Measurement]:
+    """Print accuracy and speed of all settings, draw them beside the report; return the ratios."""
     from studies.bench import engine
 
-    report["engine"] = found.as_dict()
-    console.print(engine.reference_text(report["engine"]), markup=False, highlight=False)
-    print_table(console, *engine.settings_table(report["engine"]), "all settings")
+    console.print(engine.reference_text(found), markup=False, highlight=False)
+    print_table(console, *engine.settings_table(found), "all settings")
     if save is not None:
         picture = save.with_name(f"{save.stem}_engine.png")
-        engine.save_picture(report["engine"], picture)
+        engine.save_picture(found, picture)
         print(f"written: {picture}")
-    return engine.pairs(found.results)
+    return engine.pairs(found["settings"])
 
 
 def _print_speed(rows: Sequence[Measurement], console: Console) -> None:

@@ -28,7 +28,7 @@ from scipy.stats import quantile_test
 
 from studies.bench.blind.cases import strange
 from studies.tables import hand_over, markdown_table, plain_console
-from wlr_gym.base.errors import InputError, check_name
+from wlr_gym.base.errors import check_name
 from wlr_gym.base.files import keep_request, make_output_folder
 from wlr_gym.base.provenance import git_commit
 from wlr_gym.base.text import tally
@@ -256,23 +256,9 @@ def run_adapt_study(study: AdaptStudy, say: Say = print) -> list[dict[str, Any]]
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a study; none without a file.
-
-    Raises:
-        InputError: a line that is none.
-    """
-    if not path.is_file():
-        return []
-    found = []
-    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
-        try:
-            line = json.loads(text)
-        except ValueError:
-            raise InputError(f"{path}, line {number}: broken JSON") from None
-        if not isinstance(line, dict) or not {"case", "contender", "errors"} <= line.keys():
-            raise InputError(f"{path}, line {number}: expected case, contender and errors")
-        found.append(line)
-    return found
+    """Return the lines of a study; none without a file."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return [json.loads(line) for line in lines]
 
 
 def _order(study: AdaptStudy, lines: Sequence[Mapping[str, Any]]) -> Iterator[tuple[AdaptCase, str]]:

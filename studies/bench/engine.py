@@ -189,30 +189,6 @@ class EngineSetting:
 
 
 @dataclass(frozen=True)
-class EngineResult:
-    """A setting, how far from the reference it ends, and how fast it is.
-
-    Attributes:
-        setting: what was run.
-        error, worst: m, rms and largest over the motions of :func:`studies.bench.engine.distance`.
-        upright: whether all robots were, at the end.
-        speed: simulated seconds of a robot per second, one value per round.
-    """
-
-    setting: EngineSetting
-    error: float
-    worst: float
-    upright: bool
-    speed: tuple[float, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain JSON types; errors that are not finite as None."""
-        error, worst = (value if np.isfinite(value) else None for value in (self.error, self.worst))
-        described = {**asdict(self.setting), "label": self.setting.label, "is_usual": self.setting.is_usual}
-        return {**described, "error": error, "worst": worst, "upright": self.upright, "speed": summary(self.speed)}
-
-
-@dataclass(frozen=True)
 class Reference:
     """Final poses that neither side made alone: the mean of both limits.
 
@@ -228,21 +204,30 @@ class Reference:
     convergence: Array
     closed_form: dict[str, float]
 
+    def summary(self) -> dict[str, Any]:
+        """Return what the report says of it."""
+        limits = {"disagreement": self.disagreement, "convergence": self.convergence}
+        said = {name: {"median": float(np.median(apart)), "max": float(apart.max())} for name, apart in limits.items()}
+        return {"closed_form": self.closed_form, **said}
 
-@dataclass(frozen=True)
-class EngineReport:
-    """What the measurement found."""
 
-    reference: Reference
-    results: list[EngineResult]
+#: A setting in the report: its fields, and what came of it; plain JSON types.
+Row = dict[str, Any]
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain JSON types."""
-        said: dict[str, Any] = {"closed_form": self.reference.closed_form}
-        for name in ("disagreement", "convergence"):
-            apart = getattr(self.reference, name)
-            said[name] = {"median": float(np.median(apart)), "max": float(apart.max())}
-        return {"reference": said, "settings": [result.as_dict() for result in self.results]}
+
+def row_of(setting: EngineSetting, apart: Array, upright: bool, speed: Sequence[float]) -> Row:
+    """Return a setting for the report; errors that are not finite as None.
+
+    Args:
+        setting: what was run.
+        apart: (N,) m between reference and end of each motion, as of :func:`distance`.
+        upright: whether all robots were, at the end.
+        speed: simulated seconds of a robot per second, one value per round.
+    """
+    errors = {"error": float(np.sqrt(np.mean(apart**2))), "worst": float(apart.max())}
+    row: Row = {**asdict(setting), "label": setting.label, "is_usual": setting.is_usual}
+    row |= {name: value if np.isfinite(value) else None for name, value in errors.items()}
+    return row | {"upright": upright, "speed": summary(speed)}
 
 
 def settings(*, quick: bool = False) -> list[EngineSetting]:
@@ -269,8 +254,8 @@ def _peer(step: float, kind: Kind, **others: Any) -> EngineSetting:
     return EngineSetting("MuJoCo", step, contact=contact, cone=cone, integrator=integrator, **others)
 
 
-def measure_engine(size: Size) -> EngineReport:
-    """Return the reference and all settings: accuracy once, speed in rounds that take the settings in turn."""
+def measure_engine(size: Size) -> dict[str, Any]:
+    """Return reference and all settings, as plain JSON types: accuracy once, speed in rounds that take the settings in turn."""
     chosen = motions(load_robot(), size(TICKS, 2))
     reference = make_reference(chosen, *(((2e-3, 1e-3),) * 2 if size.quick else (ENGINE_LIMIT, MUJOCO_LIMIT)))
     runs = {setting: prepare(setting, chosen, size(COPIES, 1)) for setting in settings(quick=size.quick)}
@@ -283,12 +268,11 @@ def measure_engine(size: Size) -> EngineReport:
         warm_up=False,
         tell=lambda share: size.tell(first + (1.0 - first) * share),
     )
-    results = []
-    for setting, pose in poses.items():
-        apart = distance(pose, reference.pose, _hip())
-        error, worst = float(np.sqrt(np.mean(apart**2))), float(apart.max())
-        results.append(EngineResult(setting, error, worst, is_upright(pose), speeds[setting]))
-    return EngineReport(reference, results)
+    rows = [
+        row_of(setting, distance(pose, reference.pose, _hip()), is_upright(pose), speeds[setting])
+        for setting, pose in poses.items()
+    ]
+    return {"reference": reference.summary(), "settings": rows}
 
 
 def _hip() -> Array:
@@ -457,12 +441,12 @@ def level_name(level: float) -> str:
     return f"error at most {1e3 * level:g} mm"
 
 
-def pairs(results: Sequence[EngineResult]) -> list[Measurement]:
+def pairs(rows: Sequence[Row]) -> list[Measurement]:
     """Return the ratios of speed: at equal error, at MuJoCo's defaults and equal step, and with two threads."""
     found: list[Measurement] = []
     for precision in ("float64", "float32"):
-        ours = [one for one in results if one.setting.side == "engine" and one.setting.precision == precision]
-        peers = [one for one in results if one.setting.side == "MuJoCo"]
+        ours = [one for one in rows if one["side"] == "engine" and one["precision"] == precision]
+        peers = [one for one in rows if one["side"] == "MuJoCo"]
         for level in LEVELS:
             bar = COMPARABLE_BARS[precision] if level < COMPARABLE else None
             found += _pair(f"{precision}, {level_name(level)}", _fastest(ours, level), _fastest(peers, level), bar)
@@ -472,26 +456,26 @@ def pairs(results: Sequence[EngineResult]) -> list[Measurement]:
     return found
 
 
-def _pair(what: str, ours: EngineResult | None, peer: EngineResult | None, bar: float | None) -> list[Measurement]:
+def _pair(what: str, ours: Row | None, peer: Row | None, bar: float | None) -> list[Measurement]:
     if ours is None or peer is None:
         return []
-    text = f"{what}: {ours.setting.label} ({_millimetres(ours.error)})"
-    name = f"MuJoCo {peer.setting.label} ({_millimetres(peer.error)})"
-    return [Measurement("engine", text, UNIT, ours.speed, peer.speed, name, bar)]
+    text = f"{what}: {ours['label']} ({_millimetres(ours['error'])})"
+    name = f"MuJoCo {peer['label']} ({_millimetres(peer['error'])})"
+    speed, other = (tuple(one["speed"]["values"]) for one in (ours, peer))
+    return [Measurement("engine", text, UNIT, speed, other, name, bar)]
 
 
-def _fastest(results: Iterable[EngineResult], level: float) -> EngineResult | None:
+def _fastest(rows: Iterable[Row], level: float) -> Row | None:
     """Return the fastest on one thread that stays upright with an error of at most ``level``."""
-    fit = [one for one in results if one.upright and one.error <= level and one.setting.threads == 1]
-    return max(fit, key=lambda one: sorted(one.speed)[len(one.speed) // 2], default=None)
+    fit = [one for one in rows if one["upright"] and one["threads"] == 1 and one["error"] <= level]
+    return max(fit, key=lambda one: one["speed"]["median"], default=None)
 
 
-def _standard(results: Iterable[EngineResult], call: str, threads: int) -> EngineResult | None:
+def _standard(rows: Iterable[Row], call: str, threads: int) -> Row | None:
     """Return the setting of 1 ms with everything else at its default."""
-    for one in results:
-        own = one.setting
-        usual = own.is_usual and (own.side == "engine" or (own.cone, own.contact, own.integrator) == KINDS[0])
-        if usual and (own.step, own.call, own.threads) == (1e-3, call, threads):
+    for one in rows:
+        usual = one["is_usual"] and (one["side"] == "engine" or (one["cone"], one["contact"], one["integrator"]) == KINDS[0])
+        if usual and (one["step"], one["call"], one["threads"]) == (1e-3, call, threads):
             return one
     return None
 
@@ -501,7 +485,7 @@ def _millimetres(value: float | None) -> str:
 
 
 def reference_text(report: dict[str, Any]) -> str:
-    """Return what the errors are against, and how far that is known; ``report`` is ``EngineReport.as_dict()``."""
+    """Return what the errors are against, and how far that is known; ``report`` is that of :func:`measure_engine`."""
     reference = report["reference"]
     apart, rest = reference["disagreement"], reference["convergence"]
     closed = "; ".join(f"{name}: {1e3 * value:+.2f} mm" for name, value in reference["closed_form"].items())
@@ -529,7 +513,7 @@ _COLOURS = {"float64": BLUE, "float32": ORANGE, "default": "black", "stiff frict
 
 
 def save_picture(report: dict[str, Any], path: Path) -> None:
-    """Write error against speed of every setting on one thread as a PNG; ``report`` is ``EngineReport.as_dict()``."""
+    """Write error against speed of every setting on one thread as a PNG; ``report`` as for :func:`reference_text`."""
     figure = new_figure(9.5, 6.6)
     axes = figure.subplots()
     axes.set(xscale="log", yscale="log", xlabel=_ERROR)

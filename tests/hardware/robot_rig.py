@@ -86,13 +86,14 @@ def jabbering_port() -> Iterator[tuple[str, Callable[[], bytes]]]:
 
 
 def machine_of(core: Any) -> Any:
-    """The emulated robot that a core drives."""
-    return core.plant.loop.clock.machine
+    """The emulated robot that a core drives: its clock, or behind it."""
+    clock = core.plant.loop.clock
+    return getattr(clock, "machine", clock)
 
 
 def emulated_imu(link: Any, port: ImuPort) -> ImuStream:
     """The IMU of an emulated robot's link, read with other ranges or another calibration."""
-    return ImuStream(port, link.clock.now, lambda *_: MemoryDevice(link.clock.machine, "imu"))
+    return ImuStream(port, link.clock.now, lambda *_: MemoryDevice(link.clock, "imu"))
 
 
 def imu_that_reads(*counts):

@@ -60,14 +60,14 @@ def interrupt():
 
 def unplug(loop):
     """Take the wheels' adapter away, and let that be noticed."""
-    loop.clock.machine.inject("unplug wheels")
+    loop.clock.inject("unplug wheels")
     loop.clock.wait_until(loop.clock.now() + 0.002)
 
 
 def emulated_plant(folder):
     plant = RobotPlant(ROBOT, 1, PlantOptions(), RobotOptions(emulated=True, log=folder))
-    clock: Any = plant.loop.clock
-    return plant, clock.machine
+    machine: Any = plant.loop.clock
+    return plant, machine
 
 
 def short(name="straight"):

@@ -132,11 +132,11 @@ def run(options: DeployOptions) -> int:
             require_ports(loop.hardware)
             wait_for_enter(console, "The robot will move. Wheels off the ground? Hand on the switch?")
         if options.stepped:
-            from wlr_gym.hardware.emulator.link import EmulatedWorld
+            from wlr_gym.hardware.emulator.machine import Machine
 
-            assert isinstance(loop.clock, EmulatedWorld)
+            assert isinstance(loop.clock, Machine)
             for fault in options.fault:
-                loop.clock.machine.inject(fault)
+                loop.clock.inject(fault)
         recorder = loop.recorder
         if options.mcap is not None:
             from wlr_gym.data.logs.messages import McapStream

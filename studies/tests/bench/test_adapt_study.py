@@ -1,7 +1,5 @@
 """The study of adaptation: its cases are fixed, it resumes contender by contender, and its table says what its lines say."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -83,13 +81,6 @@ def test_regained_is_the_share_of_what_the_truth_wins():
 def test_bad_input(capsys, option, said):
     assert main(["adapt", "--out", "x", option, "our"]) == 2
     assert said in capsys.readouterr().err
-
-
-def test_a_broken_line_is_named(tmp_path):
-    path = tmp_path / "adapt.jsonl"
-    path.write_text(json.dumps(line("a", "none", [1.0])) + "\n{}\n")
-    with pytest.raises(InputError, match="line 2: expected case, contender and errors"):
-        adapt.read_lines(path)
 
 
 @pytest.mark.parametrize("name", ["friction_asymmetry_copy0", "command_delay_copy1"])

@@ -5,8 +5,6 @@ import pytest
 
 from studies.bench.engine import (
     KINDS,
-    EngineReport,
-    EngineResult,
     EngineSetting,
     distance,
     make_reference,
@@ -14,6 +12,7 @@ from studies.bench.engine import (
     pairs,
     prepare,
     reference_text,
+    row_of,
     save_picture,
     settings_table,
 )
@@ -67,7 +66,7 @@ def _result(side, step, error, speed, **others):
     upright, precision = others.pop("upright", True), others.pop("precision", "float64")
     iterations = 4 if side == "engine" else 100
     setting = EngineSetting(side, step, precision, iterations, contact, cone, integrator)
-    return EngineResult(setting, error, 2 * error, upright, (speed, 2 * speed, 3 * speed))
+    return row_of(setting, np.full(10, error), upright, (speed, 2 * speed, 3 * speed))
 
 
 RESULTS = [
@@ -92,7 +91,7 @@ def test_ratios_compare_the_fastest_that_stay_upright_at_equal_error():
 
 def test_table_and_picture_are_made_from_the_report(short, tmp_path):
     _, reference = short
-    report = EngineReport(reference, RESULTS).as_dict()
+    report = {"reference": reference.summary(), "settings": RESULTS}
     _, rows = settings_table(report)
     assert ("MuJoCo", "4 ms, pyramidal, default contact, Euler", "float64", "falls", "falls", "400 [200..600]") in rows
     assert "Not measured, for want of a GPU" in reference_text(report)

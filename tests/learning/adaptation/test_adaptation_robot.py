@@ -12,7 +12,7 @@ pytest.importorskip("onnxruntime")
 
 from wlr_gym.cli import OK, run_command
 from wlr_gym.hardware.deployment import Deployment
-from wlr_gym.hardware.emulator.link import EmulatedWorld
+from wlr_gym.hardware.emulator.machine import Machine
 from wlr_gym.learning.adaptation import driving
 from wlr_gym.learning.adaptation.driving import EmulatedRobot, RealRobot, drive_episode, paired
 from wlr_gym.learning.evaluation.rollout import make_core
@@ -93,8 +93,8 @@ class Failing(EmulatedRobot):
 
     def start(self, log, seed, meta=None):
         plant, truth = super().start(log, seed, meta)
-        assert isinstance(plant.loop.clock, EmulatedWorld)
-        plant.loop.clock.machine.inject("dead imu after=1.5")
+        assert isinstance(plant.loop.clock, Machine)
+        plant.loop.clock.inject("dead imu after=1.5")
         return plant, truth
 
 

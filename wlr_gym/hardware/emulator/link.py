@@ -21,22 +21,6 @@ from wlr_gym.physics.effects.patch import Source
 from wlr_gym.robot import Robot
 
 
-class EmulatedWorld:
-    """A machine as a clock that passes when somebody waits; see :class:`wlr_gym.hardware.timing.Clock`."""
-
-    def __init__(self, machine: Machine) -> None:
-        self.machine = machine
-
-    def now(self) -> float:
-        """Return emulated time, s."""
-        return self.machine.time
-
-    def wait_until(self, moment: float) -> None:
-        """Let emulated time pass until ``moment`` (s)."""
-        while self.machine.time < moment - 1e-9:
-            self.machine.step()
-
-
 class MemoryDevice:
     """A serial device of the emulated robot; see :class:`wlr_gym.hardware.serial_frames.Device`.
 
@@ -98,24 +82,24 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     require_package("dynamixel_sdk", "robot")
     from wlr_gym.hardware.dynamixel.port import DynamixelPort
 
-    robot, hardware, world = machine.robot, machine.hardware, EmulatedWorld(machine)
+    robot, hardware = machine.robot, machine.hardware
     names = {bus.port: name for name, bus in hardware.buses.items()}
 
     def make_port(path: str, baud_rate: int, patience: float) -> DynamixelPort:
-        return DynamixelPort(names[path], baud_rate, patience, world.now, partial(MemoryDevice, machine))
+        return DynamixelPort(names[path], baud_rate, patience, machine.now, partial(MemoryDevice, machine))
 
     flow = eye = None
     if hardware.flow is not None and robot.sensors.flow is not None:
-        flow = FlowStream(hardware.flow, robot.sensors.flow, world.now, lambda *_: MemoryDevice(machine, "flow"))
+        flow = FlowStream(hardware.flow, robot.sensors.flow, machine.now, lambda *_: MemoryDevice(machine, "flow"))
     if camera is not None:
         from wlr_gym.hardware.emulator.camera import EmulatedCamera
 
         require_package("cv2", "vision")
         eye = EmulatedCamera(machine, camera)
     return Link(
-        servos=Servos(robot, hardware, hardware.safety.patience, world.now, make_port),
-        imu=ImuStream(hardware.imu, world.now, lambda *_: MemoryDevice(machine, "imu")),
-        clock=world,
+        servos=Servos(robot, hardware, hardware.safety.patience, machine.now, make_port),
+        imu=ImuStream(hardware.imu, machine.now, lambda *_: MemoryDevice(machine, "imu")),
+        clock=machine,
         is_serial=False,
         finish=machine.close,
         flow=flow,

@@ -1,4 +1,4 @@
-"""The emulated robot, in emulated time: eight servos and sensors around any one-robot plant. No ports, no clock of its own.
+"""The emulated robot, in emulated time: eight servos and sensors around any one-robot plant. No ports.
 
 :class:`PlantCoupling` joins servos and plant: what their firmware asks of the motors becomes setpoints, what the physics did
 becomes their shafts. The plant's own servo model is the physics: it takes leg angles and wheel speeds and runs the servo's law
@@ -189,6 +189,15 @@ class Machine:
             self._pull_and_plug()
         for watcher in self.watchers:
             watcher()
+
+    def now(self) -> float:
+        """Return emulated time, s: who drives the robot in emulated time has it for a clock."""
+        return self.time
+
+    def wait_until(self, moment: float) -> None:
+        """Let emulated time pass until ``moment`` (s)."""
+        while self.time < moment - 1e-9:
+            self.step()
 
     def pause(self, duration: float) -> None:
         """Let ``duration`` s pass in which nothing happens (a busy computer): quartzes do not stop, so all clocks go on."""
