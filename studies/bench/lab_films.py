@@ -18,16 +18,14 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from studies.bench.lab_renderer import Lab, frames, lens, true_places
 from studies.bench.measure import YES_NO, machine
 from studies.bench.vision import FilmedDrive, lab_drive, pose_at, true_slip
+from studies.tables import hand_over, markdown_table, plain_console
 from wlr_gym.base.errors import InputError, Interval, require_package
 from wlr_gym.base.files import write_json
-from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
-from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.perception.markers.targets import Target, load_target
 from wlr_gym.perception.vision.analysis import VideoAnalysis, analyse
 from wlr_gym.perception.vision.self_calibration import UNSURE
@@ -64,17 +62,13 @@ class LabFilmsOptions(JsonOption):
 
 def run(options: LabFilmsOptions) -> int:
     """Film a lab that is not perfect; print and write the score."""
-    console = Console(soft_wrap=True, highlight=False)
-    results = run_lab_films(options.out, options.count, options.seed, lambda text: console.print(text, markup=False))
-    found = score(results)
+    results = run_lab_films(options.out, options.count, options.seed, plain_console.print)
+    found, file = score(results), options.out / "score.json"
     report = {"machine": machine(), "seed": options.seed, "score": found, "films": [asdict(result) for result in results]}
-    write_json(options.out / "score.json", report)
+    write_json(file, report)
     rows = [(what, value, bar, YES_NO[met]) for what, value, bar, met in bars(found)]
-    print_table(console, ("what", "found", "bar", "met"), rows, f"{options.count} films of a lab")
-    if options.json:
-        print_json(report)
-    console.print(f"written: {options.out / 'score.json'}")
-    return OK
+    table = "\n".join([f"{options.count} films of a lab", "", *markdown_table(("what", "found", "bar", "met"), rows), ""])
+    return hand_over(options.out / "score.md", table, report, options.json, file)
 
 
 @dataclass(frozen=True)
