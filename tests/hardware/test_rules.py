@@ -511,6 +511,14 @@ def test_every_limit_stands_in_the_file_with_its_reason():
         assert re.search(rf"^  {name}: \S+ +# .{{15,}}$", section, re.MULTILINE), name
 
 
+@pytest.mark.parametrize(
+    "wrong", [{"coast": 0.5}, {"warm": 70.0}, {"watchdog": 3.0}, {"start_error": 0.0}, {"speed": 1.0}, {"load": np.inf}]
+)
+def test_limits_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        SafetyLimits(**wrong)
+
+
 def test_every_limit_does_something():
     """Each attribute of SafetyLimits is read somewhere in the hardware package."""
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "wlr_gym/hardware").rglob("*.py"))
