@@ -32,7 +32,7 @@ from wlr_gym.gap.rig.pendulum import (
     open_pendulum,
     pack,
 )
-from wlr_gym.gap.rig.pendulum_recordings import Recording, decode_load, findings, read_recording, read_recordings
+from wlr_gym.gap.rig.pendulum_recordings import Recording, findings, read_recording, read_recordings
 from wlr_gym.gap.rig.problem import LOST, law_candidates, smoothed_state
 from wlr_gym.gap.selection.search import search_effects
 from wlr_gym.gap.validation.data_split import named_split
@@ -237,7 +237,7 @@ def test_arm_and_load_give_gravity_and_inertia():
 
 def read_recording_of(mass, length):
     none = np.zeros(0)
-    return Recording("none", "none", mass, length, None, 200.0, 7.4, *([none] * 8), enabled=none.astype(bool))
+    return Recording("none", "none", mass, length, 200.0, *([none] * 6), enabled=none.astype(bool))
 
 
 # --- the compiled law is the scalar one
@@ -282,16 +282,6 @@ def made(tmp_path_factory):
 
 def kinds(recordings, run=None):
     return {f.kind for f in findings(recordings) if run is None or f.run == run}
-
-
-def test_unsigned_readings_of_a_signed_register_are_decoded():
-    np.testing.assert_allclose(decode_load(np.array([0.0, 885.0, 65535.0, 64651.0])), [0.0, 1.0, -1 / 885, -1.0])
-
-
-def test_decoded_duty_is_what_the_gain_asks_for(made):
-    for recording in read_recordings(made):
-        wish = recording.gain * 4096 / (2 * np.pi) / (256 * 885) * (recording.goal - recording.angle)
-        assert np.abs(recording.duty - np.clip(wish, -1, 1)).max() < 0.01 + 0.5 * np.ptp(wish) / 885
 
 
 def test_states_come_from_the_rows_around(made):
@@ -370,12 +360,8 @@ def test_folders_without_recordings_are_refused(tmp_path):
 # --- intake
 
 
-def test_a_clean_set_is_told_only_what_is_true(made):
-    recordings = read_recordings(made)
-    found = kinds(recordings)
-    assert "wrap" in found
-    assert "missing" in found
-    assert not found & {"supply", "gap", "dead", "units", "few_runs", "control_law", "off"}
+def test_nothing_is_odd_about_a_clean_set(made):
+    assert findings(read_recordings(made)) == ()
 
 
 def test_intake_notices_what_is_odd(made):
@@ -386,15 +372,10 @@ def test_intake_notices_what_is_odd(made):
     def with_one(**changes):
         return kinds([dataclasses.replace(one, **changes), *rest], one.name)
 
-    supply = one.supply.copy()
-    supply[100] = 5.7
-    assert "supply" in with_one(supply=supply)
     late = one.t + 0.1 * (np.arange(len(one.t)) > 200)
     assert "gap" in with_one(t=late)
     assert "dead" in with_one(angle=np.zeros_like(one.angle))
     assert "off" in with_one(enabled=one.t < 2.0)
-    assert "control_law" in with_one(gain=200.0)
-    assert "wrap" not in with_one(raw_load=np.abs(one.duty) * 885)
 
 
 def test_wrong_units_and_signs_are_fatal(made):
@@ -409,14 +390,6 @@ def test_wrong_units_and_signs_are_fatal(made):
         assert [f.kind for f in fatal] == ["units"] * len(fatal)
         assert fatal
         assert {f.run for f in fatal} == {one.name}
-
-
-def test_what_goes_together_over_the_runs_is_said(made):
-    recordings = read_recordings(made)
-    warming = [dataclasses.replace(r, temperature=r.temperature + k) for k, r in enumerate(recordings)]
-    texts = [f.text for f in findings(warming) if f.kind == "confounded"]
-    assert any("temperature and order of recording" in text for text in texts)
-    assert not any("temperature" in f.text for f in findings(recordings) if f.kind == "confounded")
 
 
 # --- opening a folder
@@ -526,17 +499,9 @@ def test_real_recordings_are_read_and_flagged():
     assert len(recordings) == 12
     found = findings(recordings)
     assert not any(f.fatal for f in found)
-    per_kind = {kind: {f.run for f in found if f.kind == kind} for kind in ("wrap", "supply", "off")}
-    assert len(per_kind["wrap"]) == 9
-    assert len(per_kind["supply"]) == 12
-    assert len(per_kind["off"]) == 3
+    assert len({f.run for f in found if f.kind == "off"}) == 3
     assert min(r.supply.min() for r in recordings) == 5.7
     assert max(r.supply.max() for r in recordings) == 9.2
-    assert any(f.kind == "missing" and f.channel == "arm_mass" for f in found)
-    confounded = " ".join(f.text for f in found if f.kind == "confounded")
-    for pair in ("P gain and temperature", "P gain and order", "temperature and order"):
-        assert pair in confounded
-    assert all(np.abs(r.duty).max() <= 1.0 for r in recordings)
 
 
 # ---- the problem -----------------------------------------------------------------------------------------------------
