@@ -535,7 +535,7 @@ class _Proposer:
             self.content["channels"][key] = entry
             if OPEN in entry.values():
                 asked.append((key, members))
-        source = f"{', '.join(dict.fromkeys(self._source(column) for column in columns))}"
+        source = ", ".join(dict.fromkeys(self._source(column) for column in columns))
         count = f"{len(columns)} of {len(_SETS[name])} joints; " if kind in ("cmd", "pos", "vel", "eff") and missing else ""
         if not asked:
             by = "as in our own names" if set(columns) <= self.ours else f"in {', '.join(dict.fromkeys(units.values()))}"
@@ -544,8 +544,10 @@ class _Proposer:
         key, members = asked[0]
         question = f"{', '.join(units_of(members[0]))}?"
         ranges = "; ".join(f"{column.partition('_')[2] or column} {_range(self.raw(column))}" for column in columns)
-        stall = f"; the motor stalls at {effort_range(columns[0], self.robot)[0]:.3g} N m" if kind == "eff" else ""
-        self.note(f"channels.{key}", f"{question} {count}{source}; {ranges}{stall}")
+        if kind == "eff":
+            stall, _ = effort_range(columns[0], self.robot)
+            ranges += f"; A, mA and counts become N m by the robot's torque constants; the motor stalls at {stall:.3g} N m"
+        self.note(f"channels.{key}", f"{question} {count}{source}; {ranges}")
 
     def _frames(self) -> None:
         given = self.known.get("frames", {})
@@ -555,7 +557,7 @@ class _Proposer:
             self.content["frames"]["imu"] = OPEN
             shown = ["the log's axes that our x (forward), y (left) and z (up) are: [x, y, z] where it is mounted so"]
             if "acc_x" in self.chosen:
-                gravity = ", ".join(f"{value:.3g}" for value in self._gravity())
+                gravity = ", ".join(f"{np.median(self.raw(f'acc_{axis}')[1]):.3g}" for axis in XYZ)
                 shown.append(f"acc reads {gravity} in the median (up is where it is positive)")
             if "gyro_x" in self.chosen:
                 sizes = ", ".join(f"{np.std(self.raw(f'gyro_{axis}')[1]):.3g}" for axis in XYZ)
@@ -581,9 +583,6 @@ class _Proposer:
         if column in self.ours or one.field not in self.log.topics[one.topic].fields:
             return COLUMNS[column].unit
         return one.unit or OPEN
-
-    def _gravity(self) -> Array:
-        return np.array([np.median(self.raw(f"acc_{axis}")[1]) for axis in XYZ])
 
     # ---- what is shown ----------------------------------------------------------------------------------------------
 
