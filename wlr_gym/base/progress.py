@@ -28,23 +28,21 @@ def progress(console: Console, workers: Sequence[str] = ("",), shown: bool = Tru
 
     A stage's name ends at the first colon of its text.
     """
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.table import Column
 
     columns = (
-        BarColumn(bar_width=16), TaskProgressColumn(), TextColumn("{task.fields[time]}"),
+        BarColumn(bar_width=16), TaskProgressColumn(), TimeRemainingColumn(compact=True, elapsed_when_finished=True),
         TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True)),
     )  # fmt: skip
     begin, last, printed = time.monotonic(), dict.fromkeys(workers, ""), 0.0
     live = shown and console.is_terminal
     with Progress(*columns, console=console, transient=True, expand=True, disable=not live) as bar:
-        clocks = {worker: _Clock(begin) for worker in workers}
-        tasks = {worker: bar.add_task("", total=1.0, time=clocks[worker]) for worker in workers}
+        tasks = {worker: bar.add_task("", total=1.0) for worker in workers}
 
         def tell(worker: str, text: str, share: float) -> None:
             nonlocal printed
-            clock, stage, now = clocks[worker], text.partition(":")[0], time.monotonic()
-            clock.set(share)
+            stage, now = text.partition(":")[0], time.monotonic()
             bar.update(tasks[worker], description=text, completed=share)
             is_new = stage != last[worker]
             if shown and not live and (is_new or now - printed >= EVERY):
@@ -74,35 +72,5 @@ def tracked(items: Iterable[Item], count: int, text: str, console: Console, show
 
 def time_left(passed: float, share: float) -> str:
     """Return the remaining time in words; empty while it is not known."""
-    return f"about {duration(passed * (1.0 - share) / share)} left" if _is_known(passed, share) else ""
-
-
-def _is_known(passed: float, share: float) -> bool:
-    return LEAST_SHARE <= share < 1.0 and passed > 1.0
-
-
-class _Clock:
-    """The time column of a bar, which asks for its text at every refresh: the remaining time; before, what has passed."""
-
-    def __init__(self, begin: float) -> None:
-        self._begin = begin
-        self._end: float | None = None
-        self._is_done = False
-
-    def set(self, share: float) -> None:
-        """Go by the share that is done now; what is done stays so."""
-        if self._is_done:
-            return
-        now = time.monotonic()
-        passed = now - self._begin
-        self._end = self._begin + passed / share if _is_known(passed, share) else None
-        if share >= 1.0:
-            self._end, self._is_done = now, True
-
-    def __str__(self) -> str:
-        now = time.monotonic()
-        if self._is_done:
-            return f"in {duration((self._end or now) - self._begin)}"
-        if self._end is None:
-            return f"{duration(now - self._begin)} passed"
-        return f"about {duration(max(self._end - now, 0.0))} left"
+    is_known = LEAST_SHARE <= share < 1.0 and passed > 1.0
+    return f"about {duration(passed * (1.0 - share) / share)} left" if is_known else ""
