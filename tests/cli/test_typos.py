@@ -40,7 +40,6 @@ COMMANDS = {
     "no episodes elsewhere": ("evaluate pid --other-episodes 0", "--other-episodes 0: expected 1 or more"),
     "no step": ("compare --out x --physics-step 0", "--physics-step 0: expected more than 0 s"),
     "no time to drive": ("record --excitation straight --seconds -1 --out x", "--seconds -1: expected more than 0 s"),
-    "no workers": ("sweep WLR-Velocity-v0 --workers 0", "--workers 0: expected 1 or more"),
     "no time to cut at": ("import . --split -3 --out x", "--split -3: expected more than 0 s"),
     "no columns of a board": (
         "calibrate camera x --square 0.02 --out x.yaml --columns 1",
@@ -119,14 +118,9 @@ KEYWORDS = {
     "a seed": ({"seed": 3}, "'seed'; it goes to env.reset(seed=3); valid: backend,"),
     "sensors": ({"sensors": "cam"}, "'sensors'; it is of the task: task={\"sensors\": {\"camera\": 1.0}}; valid: backend,"),
     "nothing like it": ({"foo": 1}, "got an unexpected keyword argument 'foo'; valid: backend,"),
-    "no effects": ({"effects": 3}, "effects = 3: expected a name, a path, a mapping or a list of these"),
     "no keys": ({"task": {"sensors": ["camera"]}}, "sensors = ['camera']: expected keys and values; keys: camera, flow"),
     "a simulator": ({"backend": "mujco"}, "did you mean 'mujoco'?"),
-    "a randomization": ({"randomization": "wyde"}, "did you mean 'wide'?"),
-    "a robot": ({"robot": "nominall"}, "did you mean 'nominal'?"),
     "a precision": ({"precision": "float16"}, "unknown precision 'float16' (did you mean 'float64'?); valid: float32, float64"),
-    "a time in words": ({"episode_length": "long"}, "episode_length = 'long': expected a time above 0 s"),
-    "a task": ({"task": "velocty"}, "did you mean 'velocity'?"),
     "an effect where a patch goes": ({"effects": ["backlash"]}, "'backlash' is an effect"),
     "what an effect acts on": (
         {"effects": [{"name": "weak_motor", "where": ["wheel_fl"], "parameters": {"scale": 0.9}}]}, "did you mean 'wheel_lf'?",

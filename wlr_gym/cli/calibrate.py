@@ -24,7 +24,7 @@ from wlr_gym.base.paths import find_config
 from wlr_gym.base.progress import progress
 from wlr_gym.base.text import tally
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import Count, ForceOption, JsonOption, RobotOption, WiredRobotOption
+from wlr_gym.cli.options import Count, ForceOption, HardwareOption, JsonOption, MarkersOption, RobotOption, WiredRobotOption
 from wlr_gym.cli.terminal import NobodyThereError, ask_terminal, print_json
 from wlr_gym.hardware import calibration as find
 from wlr_gym.hardware.calibration import RestPose, save_hardware, with_calibration
@@ -86,15 +86,11 @@ class CameraOptions(JsonOption, ForceOption):
 
 
 @dataclass(frozen=True)
-class TargetsOptions(JsonOption, ForceOption):
+class TargetsOptions(JsonOption, ForceOption, MarkersOption):
     """Write the sheets to print, as PDF and SVG to scale: markers on the robot, markers on the floor, calibration board."""
 
     out: Path
     """Folder; made if it is not there."""
-    markers: str = "body"
-    """Markers on the robot: name in configs/vision/ or path."""
-    floor: str = "floor"
-    """Markers on the floor: name in configs/vision/ or path."""
 
 
 @dataclass(frozen=True)
@@ -105,22 +101,26 @@ class ServoOptions(JsonOption, WiredRobotOption):
     """Which one it is to be."""
 
 
-@dataclass(frozen=True)
-class JointsOptions(JsonOption, WiredRobotOption):
-    """Find sign and zero of each servo by moving the robot by hand, torque off. Put it on a stand, wheels off the ground."""
+@dataclass(frozen=True, kw_only=True)
+class HardwareFileOption:
+    """``--out`` of what is written into a hardware file."""
 
     out: Path
     """Hardware file to write; may be the one of --hardware."""
+
+
+@dataclass(frozen=True)
+class JointsOptions(JsonOption, WiredRobotOption, HardwareFileOption):
+    """Find sign and zero of each servo by moving the robot by hand, torque off. Put it on a stand, wheels off the ground."""
+
     only: tuple[str, ...] = ()
     """Joints to calibrate; the others stay as they are."""
 
 
 @dataclass(frozen=True)
-class ImuOptions(JsonOption, RobotOption):
+class ImuOptions(JsonOption, RobotOption, HardwareFileOption):
     """Find biases, scale and mounting of the IMU of a robot that stands still."""
 
-    out: Path
-    """Hardware file to write; may be the one of --hardware."""
     poses: Literal[1, 6] = 1
     """1 = gyroscope's bias, and accelerometer's offset on a level floor; 6 = its offset and scale from six sides up."""
     mounting: bool = False
@@ -130,7 +130,7 @@ class ImuOptions(JsonOption, RobotOption):
 
 
 @dataclass(frozen=True)
-class FlowOptions(JsonOption):
+class FlowOptions(JsonOption, HardwareOption, HardwareFileOption):
     """Find scale and mounting of the optical-flow sensor from a straight run on a floor that grips, driven or pushed.
 
     Record it with: wlr record --excitation straight
@@ -138,12 +138,6 @@ class FlowOptions(JsonOption):
 
     run: Positional[Path]
     """The run."""
-    out: Path
-    """Hardware file to write; may be the one of --hardware."""
-    hardware: str = "nominal"
-    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
-    robot: str | None = None
-    """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
     distance: float | None = None
     """Way straight ahead by a tape measure, m (negative: back); default: what the wheels rolled."""
     yes: bool = False

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, Seconds, Seed
+from wlr_gym.cli.options import HardwareOption, PatchOption, Seconds, Seed
 from wlr_gym.robot import load_robot
 
 if TYPE_CHECKING:
@@ -22,13 +22,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class EmulateOptions(PatchOption):
+class EmulateOptions(HardwareOption, PatchOption):
     backend: str = "gibbs_appell"
     """Simulator behind the servos."""
-    robot: str | None = None
-    """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
-    hardware: str = "nominal"
-    """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
     links: Path | None = None
     """Folder for links to the ports with fixed names (one per bus, imu, and flow); made if it is not there."""
     control: Path | None = None

@@ -209,6 +209,16 @@ class RunsRobotOption:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MarkersOption:
+    """``--markers`` and ``--floor`` of commands about the marker sheets."""
+
+    markers: str = "body"
+    """Markers on the robot: name in configs/vision/ or path."""
+    floor: str = "floor"
+    """Markers on the floor: name in configs/vision/ or path."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorsOption:
     """``--sensors`` of commands that make robots."""
 
@@ -289,15 +299,21 @@ def ray_address(words: tuple[str, ...] | None) -> str | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WiredRobotOption:
-    """Which robot, and how it is wired; a real one, for work that is done at a real robot only."""
+class HardwareOption:
+    """Which robot, and what it is made of."""
 
     hardware: str = "nominal"
     """Hardware file (wiring, mounting, safety limits), or name in configs/hardware/."""
-    port: tuple[str, ...] = ()
-    """Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the one that the hardware file names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WiredRobotOption(HardwareOption):
+    """Which robot, and how it is wired; a real one, for work that is done at a real robot only."""
+
+    port: tuple[str, ...] = ()
+    """Other ports than the hardware file's, such as legs=/dev/ttyUSB1 imu=/dev/ttyACM0."""
     emulated = False  # an option of RobotOption
     camera = None  # an option of CameraOption
 

@@ -24,7 +24,7 @@ from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import JsonOption, OutOption, RunsRobotOption, Seconds, settings_of
+from wlr_gym.cli.options import JsonOption, MarkersOption, OutOption, RunsRobotOption, Seconds, settings_of
 from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.perception.markers.targets import Target, load_target
 
@@ -37,17 +37,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class VisionOptions(JsonOption, OutOption, RunsRobotOption):
+class VisionOptions(JsonOption, OutOption, RunsRobotOption, MarkersOption):
     video: Positional[str]
     """Video file, folder of images, or number of a live camera: filmed until Ctrl-C, or --seconds."""
     run: Path
     """What the robot logged meanwhile (CSV or Parquet); with a live camera it may appear while it films."""
     camera: Path
     """Calibration file; make one with: wlr calibrate camera."""
-    markers: str = "body"
-    """Markers on the robot: name in configs/vision/ or path."""
-    floor: str = "floor"
-    """Markers on the floor: name in configs/vision/ or path."""
     offset: float | None = None
     """Servo time minus camera time, s; default: found from the motion."""
     around: float = 0.0
@@ -65,17 +61,13 @@ class VisionOptions(JsonOption, OutOption, RunsRobotOption):
 
 
 @dataclass(frozen=True)
-class VisionCheckOptions(JsonOption):
+class VisionCheckOptions(JsonOption, MarkersOption):
     """Check print and layout of the marker sheets from one photograph: which are there, stretch of the print, what misfits."""
 
     photo: Positional[Path]
     """Picture, taken by the calibrated camera, focus and size as in the calibration."""
     camera: Path
     """Calibration file; make one with: wlr calibrate camera."""
-    markers: str = "body"
-    """Markers on the robot: name in configs/vision/ or path."""
-    floor: str = "floor"
-    """Markers on the floor: name in configs/vision/ or path."""
     only: Literal["markers", "floor"] | None = None
     """Which of them the photograph shows, when it is one: markers or floor."""
 

@@ -115,7 +115,7 @@ class SweepLoop:
     def write(self) -> None:
         """Write table and page; trials that do not run to their end write their last checkpoint before they are read."""
         for one in self.results():
-            if one.status in (STOPPED_EARLY, UNFINISHED):
+            if one.status in (STOPPED_EARLY, UNFINISHED) and one.folder.is_dir():
                 with suppress(InputError), locked(self.folder / LOCKS / one.trial.name, 2 * PATIENCE):
                     self.note(one.trial, one.status)
         if self._found:  # else no trial has begun
