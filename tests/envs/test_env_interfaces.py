@@ -1,11 +1,7 @@
 """Three faces, one robot: Gymnasium single and vector, calling conventions, autoreset, errors."""
 
-import inspect
 import pickle
-import re
 import warnings
-from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -16,11 +12,8 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from velocity import ID, TIMED, make, make_vec
 
-import wlr_gym
 from wlr_gym.base.errors import InputError
-from wlr_gym.envs import interfaces as classes
 from wlr_gym.envs.settings import EnvironmentOptions
-from wlr_gym.envs.tasks.task import read_task
 
 SHORT = {"episode_length": 0.4, "randomization": "wide"}
 
@@ -65,21 +58,6 @@ def test_a_vector_environment_is_pickled_by_its_arguments(fake):
     copy = pickle.loads(pickle.dumps(env))
     assert (copy.num_envs, copy.autoreset_mode, copy.core.limit) == (3, AutoresetMode.SAME_STEP, 5)
     assert np.array_equal(copy.reset(seed=4)[0], env.reset(seed=4)[0])
-
-
-@pytest.mark.parametrize("name", ["velocity", "path", "posture", "slope"])
-def test_classes_begin_as_the_task_files_do(name):
-    single, vector = (getattr(classes, f"{name.capitalize()}{kind}") for kind in ("Env", "VectorEnv"))
-    assert read_task(name).summary.startswith(f"{single.__doc__}\n")
-    assert single.task_name == vector.task_name == name
-
-
-def test_every_option_is_described():
-    document = str(inspect.getdoc(EnvironmentOptions))
-    table = Path(__file__).parents[2].joinpath("docs", "tables", "keywords.md").read_text(encoding="utf-8")
-    names = [field.name for field in fields(EnvironmentOptions)]
-    assert re.findall(r"^    (\w+): ", document, re.MULTILINE) == names
-    assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == names
 
 
 def test_options_are_keywords():
@@ -381,7 +359,3 @@ def test_returned_arrays_are_the_users_own(fake):
     for action in actions_for(40, 2):
         env.step(action)
     assert all(data_equivalence(a, b, exact=True) for a, b in zip(kept, copies, strict=True))
-
-
-def test_version():
-    assert wlr_gym.__version__.count(".") == 2
