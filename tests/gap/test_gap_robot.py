@@ -18,7 +18,7 @@ from wlr_gym.data.format import CHANNELS, COMMANDS
 from wlr_gym.data.record import record_simulation
 from wlr_gym.data.replay import replay
 from wlr_gym.data.runs import write_run
-from wlr_gym.gap.analysis import ParameterEstimate
+from wlr_gym.gap.analysis import LEAST_RUNS, ParameterEstimate
 from wlr_gym.gap.estimation import FittedModel, level, mean_squares, nominal_model
 from wlr_gym.gap.problem import Setting, Unknown
 from wlr_gym.gap.report.recommendation import relation_of
@@ -32,7 +32,7 @@ from wlr_gym.gap.robot.candidates import (
     wave_order,
     write,
 )
-from wlr_gym.gap.robot.problem import LEAST_RUNS, LOST, WORTH_APART, RobotProblem, open_robot
+from wlr_gym.gap.robot.problem import LOST, WORTH_APART, RobotProblem, open_robot
 from wlr_gym.gap.robot.replay import PHYSICS_STEP
 from wlr_gym.gap.robot.windows import RunClock
 from wlr_gym.gap.selection.hypotheses import within_tolerance
@@ -460,7 +460,7 @@ def test_too_few_runs(tmp_path, good):
     problem, findings = open_robot(folder_of(tmp_path, good, LEAST_RUNS - 1))
     assert problem is None
     assert ("", "few_runs") in kinds(findings)
-    assert "wlr record" in findings[-1].text
+    assert "wlr record" in findings[-1].said
 
 
 def test_short_run_is_left_out(tmp_path, good):

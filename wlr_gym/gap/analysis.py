@@ -84,6 +84,16 @@ class IntakeFinding:
         return "; ".join(filter(None, [self.text, self.expected and f"expected {self.expected}", self.remedy]))
 
 
+#: Runs that an analysis needs: two to fit, one to hold out.
+LEAST_RUNS = 3
+
+
+def few_runs(usable: int, there: int, remedy: str = "") -> list[IntakeFinding]:
+    """Return that too few runs are usable; nothing where there are enough."""
+    text = f"{usable} usable runs of {there}: at least {LEAST_RUNS} are needed, two to fit and one to hold out"
+    return [] if usable >= LEAST_RUNS else [IntakeFinding("", "", "few_runs", text, fatal=True, remedy=remedy)]
+
+
 @dataclass(frozen=True)
 class ParameterEstimate:
     """A fitted number with its 95 % interval."""

@@ -31,12 +31,12 @@ from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import META_FILE, Profile
 from wlr_gym.data.record import motion_of, record_simulation
 from wlr_gym.data.runs import Run, read_meta, read_run, robot_of, run_files
-from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, NOT_EXCITED, Adequacy
+from wlr_gym.gap.analysis import BAD_DATA, FAILS_CROSS_VALIDATION, LEAST_RUNS, NOT_EXCITED, Adequacy
 from wlr_gym.gap.estimation import TWO_SIDED_95
 from wlr_gym.gap.problem import Array, Setting
 from wlr_gym.gap.report.result import DECIDED, NOTHING, RESULT_FILE, Explanation, Result, explanations, read_result
 from wlr_gym.gap.robot.candidates import shown_by
-from wlr_gym.gap.robot.problem import LEAST_RUNS, MISFIT, RobotProblem
+from wlr_gym.gap.robot.problem import MISFIT, RobotProblem
 from wlr_gym.gap.validation.held_out import most_left
 from wlr_gym.gap.workflow import Tell, analyse
 from wlr_gym.physics.effects import EFFECTS, Patch, PatchEffect, Source, load_patch

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, check_file, check_folder, check_name, check_number, nearest
 from wlr_gym.base.random import generator
 from wlr_gym.base.text import row_words
-from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.gap.analysis import IntakeFinding, few_runs
 from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting, since_reversal
-from wlr_gym.gap.rig.problem import RigLaw, RigProblem, few_runs, smoothed_state
+from wlr_gym.gap.rig.problem import RigLaw, RigProblem, smoothed_state
 from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.effects import EffectParameter, PatchEffect
 
@@ -346,7 +346,7 @@ def open_own_rig(
         InputError: files that are no runs of the rig, or equations that cannot be compiled.
     """
     runs = read_rig_runs(data, rig)
-    too_few = few_runs(f"{len(runs)} runs", len(runs))
+    too_few = few_runs(len(runs), len(runs))
     return (None, too_few) if too_few else (OwnRigProblem(runs, rig, known), [])
 
 

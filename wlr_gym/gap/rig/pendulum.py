@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.random import generator
-from wlr_gym.gap.analysis import IntakeFinding
+from wlr_gym.gap.analysis import IntakeFinding, few_runs
 from wlr_gym.gap.problem import MeasuredSignal, Quantity, Setting, Unknown, since_reversal
 from wlr_gym.gap.rig.pendulum_recordings import DUTY_PER_GAIN, Recording, findings, read_recordings
-from wlr_gym.gap.rig.problem import RigLaw, RigProblem, few_runs, smoothed_state
+from wlr_gym.gap.rig.problem import RigLaw, RigProblem, smoothed_state
 from wlr_gym.gap.validation.data_split import HELD_OUT_SHARE
 from wlr_gym.physics import servo
 from wlr_gym.physics.codegen import Graph, emit, load_module, ops
@@ -555,6 +555,6 @@ def open_pendulum(data: str | Path, known: Patch | None = None) -> tuple[Pendulu
     good = [recording for recording in recordings if recording.name not in bad]
     if "" in bad:
         return None, found
-    if too_few := few_runs(f"{len(good)} usable runs of {len(recordings)}", len(good)):
+    if too_few := few_runs(len(good), len(recordings)):
         return None, [*found, *too_few]
     return PendulumProblem(good, known.effects if known else ()), found

@@ -16,15 +16,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import Candidate, MeasuredSignal, Probe, Quantity, Range, Setting, Start, Unknown
 from wlr_gym.physics.effects import EffectParameter, Patch, PatchEffect, Source, load_patch
 from wlr_gym.physics.effects.effect import Change, Guess
 
 Array = NDArray[np.float64]
 
-#: Runs that an analysis needs: two to fit, one to hold out.
-LEAST_RUNS = 3
 #: Noise units that every residual of a simulation that broke down counts: more than two turns of a servo.
 LOST = 1e4
 #: Steps of finite differences per plausible range.
@@ -175,12 +172,6 @@ class RigProblem(ABC):
     def reach(self, effect: PatchEffect, setting: Setting, runs: Sequence[int]) -> Mapping[str, Range]:
         """Return over which range of each feature a formula was tried: none is."""
         return {}
-
-
-def few_runs(text: str, usable: int) -> list[IntakeFinding]:
-    """Return that there are too few runs, ``text`` saying how many; nothing where there are enough."""
-    text = f"{text}: record {LEAST_RUNS} or more, two to fit and one to hold out"
-    return [] if usable >= LEAST_RUNS else [IntakeFinding("", "", "few_runs", text, fatal=True)]
 
 
 def smoothed_state(time: Array, values: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.runs import Run, read_dataset, robot_of
 from wlr_gym.data.sensors import channel_noise, noise_parts
-from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding
+from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding, few_runs
 from wlr_gym.gap.problem import Array, Candidate, MeasuredSignal, Probe, Problem, Range, Setting, since_reversal
 from wlr_gym.gap.robot.candidates import Knob, formula_candidates, knobs, robot_candidates, shown_by, tried_effects, write
 from wlr_gym.gap.robot.intake import CHECKS, findings_of
@@ -330,8 +330,6 @@ def _features(truth: Array, t: Array) -> Mapping[str, Array]:
 
 # ---- opening a folder of runs ----------------------------------------------------------------------------------------
 
-#: Runs that an analysis needs: two to fit, one to hold out.
-LEAST_RUNS = 3
 #: Rows of all runs from which on the memory that an analysis needs is said.
 MANY_ROWS = 20_000
 #: GB; eight runs of 20 s need 1.4 GB.
@@ -361,12 +359,8 @@ def open_robot(
         findings.append(IntakeFinding("", "", NO_PROFILE, _NO_PROFILE))
     findings += findings_of(runs, CHECKS, robot_of(runs[0], robot))
     good = [run for run in runs if not any(f.fatal and f.run == run.name for f in findings)]
-    if len(good) < LEAST_RUNS:
-        text = (
-            f"{len(good)} usable runs of {len(runs)}: at least {LEAST_RUNS} are needed, two to fit and one to hold out. "
-            "Record more, of different kinds: wlr record --list"
-        )
-        return None, [*findings, IntakeFinding("", "", "few_runs", text, fatal=True)]
+    if too_few := few_runs(len(good), len(runs), "record more, of different kinds: wlr record --list"):
+        return None, [*findings, *too_few]
     rows = sum(len(run["t"]) for run in good)
     if rows > MANY_ROWS:
         text = f"{rows} rows in all: needs about {rows * MEMORY_PER_ROW:.0f} GB of memory; eight runs of 20 s are enough"
