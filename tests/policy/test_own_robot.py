@@ -11,12 +11,11 @@ from wlr_gym.base.paths import find_config
 from wlr_gym.cli.deploy import DeployOptions, driven_robot
 from wlr_gym.envs.tasks import load_task
 from wlr_gym.envs.tasks.describe import contract
-from wlr_gym.learning.controllers import known_robot
 from wlr_gym.learning.evaluation.subjects import common_robot, read_subjects
 from wlr_gym.learning.sweep.plan import SweepPlan, resolve
 from wlr_gym.learning.training import with_robot
 from wlr_gym.policy import environment_for, load_policy, make_policy, policy_environment, write_contract
-from wlr_gym.policy.control import PidConfig
+from wlr_gym.policy.control import PidConfig, known_robot
 from wlr_gym.robot import load_robot, robot_content, robot_hash
 
 NOMINAL = load_robot()

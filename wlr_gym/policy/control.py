@@ -1,16 +1,79 @@
-"""Hand-written controllers: their gains and settings.
+"""Hand-written controllers: their gains and settings, and what reads an observation by name.
 
 The law is :func:`wlr_gym.envs.tasks.terms.observations.feedback`; :mod:`wlr_gym.learning.controllers` makes policies of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, parse_config
+from wlr_gym.robot import Robot, load_robot, robot_hash
+
+Array = NDArray[np.float64]
+#: Reads one quantity in its own unit (N,) from observations (N, D).
+Reader = Callable[[NDArray[np.floating]], Array]
+
+
+def known_robot(contract: Mapping[str, Any], name: str | None, agent: str) -> Robot:
+    """Return the robot whose numbers a controller uses: the environment's, as its contract describes it.
+
+    Args:
+        contract: of the environment.
+        name: robot that the settings name; None = any.
+        agent: whose settings, for messages.
+
+    Raises:
+        InputError: the settings name another one, or an older contract names one that it does not describe.
+    """
+    robot = load_robot(contract["robot"].get("description") or name or "nominal")
+    named = robot if name is None else load_robot(name)
+    if robot_hash(robot) != contract["robot"]["hash"] or robot_hash(named) != robot_hash(robot):
+        raise InputError(f"agent '{agent}': robot '{named.name}' is not the environment's ('{contract['robot']['name']}')")
+    return robot
+
+
+class Readings:
+    """Quantities of an observation by their names in the contract; of a term with a history, the newest reading.
+
+    Args:
+        contract: of the environment.
+        agent: who reads, for messages.
+    """
+
+    def __init__(self, contract: Mapping[str, Any], agent: str) -> None:
+        numbered = enumerate(contract["observation"])
+        self.columns: dict[Any, tuple[int, Any]] = {
+            column["name"]: (index, column) for index, column in numbered if column["lag"] == 0
+        }
+        self.agent = agent
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def first(self, names: Sequence[str]) -> Reader:
+        """Return what reads the first of ``names`` that the observation has.
+
+        Raises:
+            InputError: it has none of them; names the nearest.
+        """
+        found = [name for name in names if name in self.columns]
+        if not found:
+            raise unknown_name("observation", names[0], list(self.columns), f"agent '{self.agent}' needs")
+        index, column = self.columns[found[0]]
+        scale, offset = column["scale"], column["offset"]
+        return lambda observations: observations[:, index].astype(np.float64) / scale + offset
+
+    def optional(self, *names: str) -> Reader:
+        """Return what reads the first of ``names`` that the observation has, zeros where it has none."""
+        known = any(name in self.columns for name in names)
+        return self.first(names) if known else lambda observations: np.zeros(len(observations))
 
 
 class SearchConfig(SettingsModel):
