@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from wlr_gym.learning.controllers import Pid
-from wlr_gym.policy.control import PidConfig, task_settings
+from wlr_gym.policy.control import Pid, PidConfig, task_settings
 
 
 def make_policy(contract: Mapping[str, Any], config: Mapping[str, Any]) -> Pid:

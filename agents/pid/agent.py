@@ -1,6 +1,6 @@
 """Feedback on the gyroscope, with gains found by search: the tuned controller of a robot that cannot see its slip.
 
-The law is in ``wlr_gym/envs/tasks/terms/observations.py``. ``wlr train ENV --agent pid`` searches the
+The law is in ``wlr_gym/policy/control.py``. ``wlr train ENV --agent pid`` searches the
 gains (``wlr_gym/learning/tuning.py``).
 """
 
@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.learning.controllers import Pid
 from wlr_gym.policy import Training
-from wlr_gym.policy.control import PidConfig, task_settings
+from wlr_gym.policy.control import Pid, PidConfig, task_settings
 
 
 def check_settings(config: Mapping[str, Any]) -> None:

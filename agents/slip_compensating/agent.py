@@ -1,4 +1,4 @@
-"""The feedback of ``pid`` with what the slip observer knows; the law is :mod:`wlr_gym.learning.controllers`."""
+"""The feedback of ``pid`` with what the slip observer knows; the law is :mod:`wlr_gym.policy.control`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wlr_gym.learning.controllers import SlipCompensating
 from wlr_gym.policy import Training
-from wlr_gym.policy.control import SlipCompensatingConfig, task_settings
+from wlr_gym.policy.control import SlipCompensating, SlipCompensatingConfig, task_settings
 
 
 def check_settings(config: Mapping[str, Any]) -> None:

@@ -1,6 +1,14 @@
-"""Hand-written controllers: their gains and settings, and what reads an observation by name.
+"""Hand-written controllers: readings by name, the wheel speeds of a motion, and the feedback that agents are made of.
 
-The law is :func:`wlr_gym.envs.tasks.terms.observations.feedback`; :mod:`wlr_gym.learning.controllers` makes policies of it.
+Forward velocity v and yaw rate w are commanded, or follow from the errors of a path. A wheel y to the left of the body
+origin rolls at (v - y u) / radius, where the turn u is
+
+    u = steering * w + P (w - gyro) + I integral(w - gyro):
+
+a skid-steered robot turns less than its wheels would, ``steering`` times less on even friction. On a path, w is the
+curvature times v, minus ``heading`` times the heading error, minus ``lateral`` times the lateral error; on a slope gravity
+tells which way is up. Where the forward velocity is estimated, its error is corrected likewise. Moving legs are made up for
+in the wheel speeds.
 """
 
 from __future__ import annotations
@@ -14,11 +22,14 @@ from pydantic import Field
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.settings import SettingsModel, parse_config
-from wlr_gym.robot import Robot, load_robot, robot_hash
+from wlr_gym.robot import CORNER_SIGNS, LEGS, WHEELS, Robot, load_robot, robot_hash
 
 Array = NDArray[np.float64]
 #: Reads one quantity in its own unit (N,) from observations (N, D).
 Reader = Callable[[NDArray[np.floating]], Array]
+#: Where the wanted forward velocity stands, by task.
+FORWARD = ("command[linear_velocity_x]", "speed_command", "climb_command")
+ESTIMATED_FORWARD = "estimated_linear_velocity_in_body[x]"
 
 
 def known_robot(contract: Mapping[str, Any], name: str | None, agent: str) -> Robot:
@@ -74,6 +85,50 @@ class Readings:
         """Return what reads the first of ``names`` that the observation has, zeros where it has none."""
         known = any(name in self.columns for name in names)
         return self.first(names) if known else lambda observations: np.zeros(len(observations))
+
+    def legs(self, term: str) -> Reader:
+        """Return what reads a quantity of the four legs (N, 4), zeros where the observation does not have it."""
+        readers = [self.optional(f"{term}[{leg}]") for leg in LEGS]
+        return lambda observations: np.stack([read(observations) for read in readers], axis=1)
+
+
+class Chassis:
+    """Geometry of a robot whose wheels stand in a rectangle, and its actions.
+
+    Attributes:
+        left: (4,) y of each wheel in the body frame, m.
+        front: (4,) +1 for front wheels, -1 for rear ones.
+    """
+
+    def __init__(self, contract: Mapping[str, Any], robot: Robot) -> None:
+        self.robot = robot
+        signs = np.array(CORNER_SIGNS, np.float64)
+        self.front: NDArray[np.float64] = signs[:, 0]
+        self.left: NDArray[np.float64] = robot.hip_position.y * signs[:, 1]
+        self._centre = np.array([column["centre"] for column in contract["action"]])
+        self._scale = np.array([column["scale"] for column in contract["action"]])
+
+    def rolling_speed(self, forward: Array, turn: Array) -> Array:
+        """Return how fast each wheel moves ahead (N, 4), m/s, for forward velocities and yaw rates (N,)."""
+        return forward[:, None] - turn[:, None] * self.left
+
+    def wheel_rate(self, rolling_speed: Array, leg_angle: Array, leg_rate: Array) -> Array:
+        """Return the wheel rates (N, 4) in rad/s, relative to the legs, that move the hips ahead at ``rolling_speed`` (N, 4).
+
+        A turning leg carries its wheel along at -l sin(angle) * rate and turns it by its own rate (``wlr_gym/robot/slip.py``).
+        """
+        wheel, leg = self.robot.wheel.radius, self.robot.leg.length
+        return (rolling_speed - leg * np.sin(leg_angle) * leg_rate) / wheel - leg_rate
+
+    def within(self, leg_angle: Array) -> Array:
+        """Return leg setpoints (N, 4), rad, as far as actions reach."""
+        centre, scale = self._centre[: len(LEGS)], self._scale[: len(LEGS)]
+        return np.clip(leg_angle, centre - scale, centre + scale)
+
+    def actions(self, leg_angle: Array, wheel_rate: Array) -> NDArray[np.float32]:
+        """Return the actions (N, 8) for setpoints (N, 4) in rad and (N, 4) in rad/s, clipped to [-1, 1]."""
+        setpoints = np.concatenate([leg_angle, wheel_rate], axis=1)
+        return np.clip((setpoints - self._centre) / self._scale, -1.0, 1.0).astype(np.float32)
 
 
 class SearchConfig(SettingsModel):
@@ -140,6 +195,121 @@ class PidConfig(PidGains):
 Settings = TypeVar("Settings", bound=PidConfig)
 
 
+class Integral:
+    """Integrals of errors, of each robot, bounded.
+
+    Args:
+        gain: 1/s; the integral is of gain * error.
+        period: s per reading.
+        limit: bound of the integral.
+    """
+
+    def __init__(self, gain: float, period: float, limit: float) -> None:
+        self.step = gain * period
+        self._limit = limit
+        self.value: Array = np.zeros(0)
+
+    def add(self, error: Array) -> Array:
+        """Return the integrals (N, ...) with the present errors (N, ...) in them."""
+        if self.value.shape != error.shape:
+            self.value = np.zeros(error.shape)
+        self.value = np.clip(self.value + self.step * error, -self._limit, self._limit)
+        return self.value
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Forget the robots in ``mask`` (N,)."""
+        if len(self.value) == len(mask):
+            self.value[mask] = 0.0
+
+
+class Pid:
+    """The controller; integrals and how far the legs reach under the body are what it remembers."""
+
+    def __init__(self, contract: Mapping[str, Any], config: PidConfig, agent: str = "pid") -> None:
+        self.config = config
+        self.chassis: Chassis = Chassis(contract, known_robot(contract, config.robot, agent))
+        self.readings: Readings = Readings(contract, agent)
+        read = self.readings
+        self.forward: Reader = read.first(FORWARD)
+        self.turn: Reader = read.optional("command[yaw_rate]")
+        self.curvature: Reader = read.optional("path_curvature[0 m]")
+        self.lateral_error: Reader = read.optional("path_error[lateral]", "course_error[lateral]")
+        self.heading_error: Reader = read.optional("path_error[heading]", "course_error[heading]")
+        self.gyro: Reader = read.first(("gyro[z]",))
+        self.leftward_force: Reader = read.first(("accelerometer[y]",))
+        self.estimated_forward: Reader | None = read.first((ESTIMATED_FORWARD,)) if ESTIMATED_FORWARD in read else None
+        self.leg_offset, self.leg_rate = read.legs("leg_reference"), read.legs("leg_reference_rate")
+        self.leg_angle: Reader = read.legs("leg_position")
+        period = contract["control_period"]
+        self._yaw_rate_integral = Integral(config.yaw_rate_i, period, config.integral_limit)
+        self._velocity_integral = Integral(config.velocity_i, period, config.integral_limit)
+        self._sweeping = f"leg_reference[{LEGS[0]}]" in read
+        self._leg_integral = Integral(config.leg_i if self._sweeping else 0.0, period, config.integral_limit)
+        self._period = period
+        self._sees_legs = f"leg_position[{LEGS[0]}]" in read
+        self._sent: Array = np.zeros((0, 4))
+
+    def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return actions (N, 8) for observations (N, D)."""
+        forward, turn = self.motion(observations)
+        reach, reach_rate = self._reach_under(observations)
+        without = self.legs(observations)
+        legs = without + reach
+        self._sent = self.chassis.within(legs) - without
+        rolling = self.rolling_speed(observations, forward, turn)
+        wheels = self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + reach_rate)
+        return self.chassis.actions(legs + self._leg_integral.add(legs - self.leg_angle(observations)), wheels)
+
+    def _reach_under(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
+        """Return how far the legs reach under the body after this step (N, 4), rad from home, and how fast they move, rad/s."""
+        config = self.config
+        wanted = np.broadcast_to(config.legs_inward * self.chassis.front, (len(observations), 4))
+        if config.lean_time * config.legs_inward == 0.0 or self._sweeping:
+            return wanted, np.zeros(wanted.shape)
+        if len(self._sent) != len(observations):
+            self._sent = np.full(wanted.shape, np.nan)
+        angle = self.leg_angle(observations)
+        error = angle - self.chassis.robot.home.leg_angle if self._sees_legs else np.zeros(angle.shape)
+        before = np.where(np.isnan(self._sent), error, self._sent)
+        step = abs(config.legs_inward) * self._period / max(config.lean_time, self._period)
+        change = np.clip(wanted - before, -step, step)
+        return before + change, change / self._period
+
+    def motion(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
+        """Return the forward velocity and turn (N,) to roll at: what is wanted, with corrections."""
+        config = self.config
+        forward = self.forward(observations)
+        turn = self.wanted_yaw_rate(observations, forward)
+        error = turn - self.gyro(observations)
+        turn = config.steering * turn + config.yaw_rate_p * error + self._yaw_rate_integral.add(error)
+        if self.estimated_forward is not None:
+            error = forward - self.estimated_forward(observations)
+            forward = forward + config.velocity_p * error + self._velocity_integral.add(error)
+        return forward, turn
+
+    def wanted_yaw_rate(self, observations: NDArray[np.floating], forward: Array) -> Array:
+        """Return the commanded yaw rate (N,), or the one that leads back to the path."""
+        lateral, heading = self.lateral_error(observations), self.heading_error(observations)
+        steer = self.curvature(observations) * forward - self.config.lateral * lateral - self.config.heading * heading
+        return self.turn(observations) + steer + self.config.uphill * self.leftward_force(observations)
+
+    def legs(self, observations: NDArray[np.floating]) -> Array:
+        """Return the leg setpoints (N, 4), rad, without what reaches under the body."""
+        return self.chassis.robot.home.leg_angle + self.leg_offset(observations)
+
+    def rolling_speed(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
+        """Return how fast each wheel is to roll ahead (N, 4), m/s."""
+        return self.chassis.rolling_speed(forward, turn)
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Forget the integrals of the robots in ``mask`` (N,), and where their legs were sent."""
+        self._yaw_rate_integral.reset(mask)
+        self._velocity_integral.reset(mask)
+        self._leg_integral.reset(mask)
+        if len(self._sent) == len(mask):
+            self._sent[mask] = np.nan
+
+
 def task_settings(model: type[Settings], contract: Mapping[str, Any], config: Mapping[str, Any], agent: str) -> Settings:
     """Return checked settings with those of the contract's task laid over."""
     where = f"agent '{agent}'"
@@ -169,3 +339,57 @@ class SlipGains(PidGains):
 
 class SlipCompensatingConfig(SlipGains, PidConfig):
     """Settings: the gains, and those of ``pid``."""
+
+
+class SlipCompensating(Pid):
+    """The feedback of ``pid`` with what the slip observer knows: true forward velocity, limited slip, load where the grip is.
+
+    Traction limiting: a wheel is asked to run at most so much faster or slower than it travels; more slip gives no more force.
+    What a steady skid turn needs is allowed on top: yaw rate * reach^2 / side along the heading, see
+    ``envs/tasks/terms/rewards.py``.
+
+    Load shift: all four legs lean alike, which moves the wheels under the body. With leg angle phi, hips l_x apart and legs of
+    length l the front wheels carry the share 1/2 - l cos(phi) / l_x of the body: equations (16) and (17) of the paper,
+    corrected (``studies/paper/corrected.py``), for parallel legs on a level floor, their own mass neglected. Load goes to the
+    axle that slips less: the smoothed difference of the axles' slip is remembered.
+    """
+
+    def __init__(self, contract: Mapping[str, Any], config: SlipCompensatingConfig) -> None:
+        super().__init__(contract, config, "slip_compensating")
+        self.settings = config
+        self.velocity = self.readings.first((ESTIMATED_FORWARD,))
+        self._slip = [self.readings.first((f"estimated_slip_velocity[{wheel},x]",)) for wheel in WHEELS]
+        self._share = min(1.0, contract["control_period"] / config.load_shift_time)
+        self._difference: Array = np.zeros(0)
+        hip = self.chassis.robot.hip_position
+        self._reach = hip.x * hip.x / hip.y
+
+    def rolling_speed(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
+        """Return how fast each wheel is to roll ahead (N, 4), m/s: as in ``pid``, within the slip limit of what it travels."""
+        travel = self.chassis.rolling_speed(self.velocity(observations), self.gyro(observations))
+        allowed = self.settings.slip_limit + self._reach * np.abs(turn / max(self.config.steering, 1.0))
+        wanted = super().rolling_speed(observations, forward, turn)
+        return np.clip(wanted, travel - allowed[:, None], travel + allowed[:, None])
+
+    def legs(self, observations: NDArray[np.floating]) -> Array:
+        """Return the leg setpoints (N, 4), rad: leaning so that the load is on the axle that slips less."""
+        home = super().legs(observations)
+        slip = np.abs(np.stack([read(observations) for read in self._slip], axis=1))
+        difference = (slip * self.chassis.front).sum(axis=1) / 2
+        if len(self._difference) != len(difference):
+            self._difference = np.zeros(len(difference))
+        self._difference = self._difference + self._share * (difference - self._difference)
+        bound = self.settings.largest_shift
+        shift = np.clip(-self.settings.load_shift * self._difference, -bound, bound)
+        return home + lean(self.chassis.robot, shift)[:, None]
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Forget the robots in ``mask`` (N,)."""
+        super().reset(mask)
+        known = len(self._difference) == len(mask)
+        self._difference = np.where(mask, 0.0, self._difference) if known else np.zeros(len(mask))
+
+
+def lean(robot: Robot, shift: Array) -> Array:
+    """Return by how much all legs lean back (rad) from straight down to put the share 1/2 + ``shift`` of the body in front."""
+    return np.arcsin(2 * robot.hip_position.x * shift / robot.leg.length)

@@ -299,7 +299,7 @@ def test_a_computed_term_returns_a_list_of_its_elements(monkeypatch, count, got)
         compile_computed(task)
 
 
-# ---- the controller that the environment computes, compiled, is the agent ``slip_compensating``, on numpy --------------
+# ---- the controller that the environment computes is the agent ``slip_compensating``: two implementations, one law ---
 
 
 PROMPT = {"joints": {"delay": [0.0, 0.0]}, "imu": {"delay": [0.0, 0.0]}}

@@ -424,25 +424,8 @@ def climb_command(signals: Signals) -> list[Value]:
 
 # ---- the hand-written controller, for a policy that acts on top of it ------------------------------------------------
 
-# Forward velocity v and yaw rate w are commanded, or follow from the errors of a path. A wheel y to the left of the body origin
-# rolls at (v - y u) / radius, where the turn u is
-#
-#     u = steering * w + P (w - gyro) + I integral(w - gyro):
-#
-# a skid-steered robot turns less than its wheels would, ``steering`` times less on even friction. On a path, w is the curvature
-# times v, minus ``heading`` times the heading error, minus ``lateral`` times the lateral error; on a slope gravity tells which
-# way is up. The error of the estimated forward velocity is corrected likewise. Moving legs are made up for in the wheel speeds.
-#
-# Traction limiting: a wheel is asked to run at most so much faster or slower than it travels; more slip gives no more force.
-# What a steady skid turn needs is allowed on top: yaw rate * reach^2 / side along the heading, see :mod:`.rewards`.
-#
-# Load shift: all four legs lean alike, which moves the wheels under the body. With leg angle phi, hips l_x apart and legs of
-# length l the front wheels carry the share 1/2 - l cos(phi) / l_x of the body: equations (16) and (17) of the paper, corrected
-# (``studies/paper/corrected.py``), for parallel legs on a level floor, their own mass neglected. Load goes to the axle that
-# slips less: the smoothed difference of the axles' slip is remembered.
-#
-# The task's ``controller`` gives the gains. What the law remembers is its own value of the step before, so that a policy on top
-# of it needs no memory. The agents ``pid`` and ``slip_compensating`` run it on numpy (:mod:`wlr_gym.learning.controllers`).
+# The law of the agent ``slip_compensating`` (wlr_gym.policy.control), whose gains the task's ``controller`` gives. What it
+# remembers is its own value of the step before, so that the policy needs no memory.
 
 
 #: What the controller remembers: integrals of the errors of yaw rate (rad/s) and forward velocity (m/s), times their gains, and
@@ -475,8 +458,8 @@ class WantedMotion:
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
 def velocity_controller(signals: Signals) -> list[Value]:
     """Action of the controller that follows the commanded velocity, and what it remembers."""
-    turn = signals.command("yaw_rate") + steer(signals, 0.0, 0.0)
-    return feedback(signals, "velocity_controller", WantedMotion(signals.command("linear_velocity_x"), turn))
+    turn = signals.command("yaw_rate") + _steer(signals, 0.0, 0.0)
+    return _feedback(signals, "velocity_controller", WantedMotion(signals.command("linear_velocity_x"), turn))
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
@@ -484,8 +467,8 @@ def path_controller(signals: Signals) -> list[Value]:
     """Action of the controller that follows the path, and what it remembers."""
     forward = signals.command("linear_velocity_x")
     error = error_from_path(signals, estimated_pose(signals))
-    turn = error.curvature[0] * forward + steer(signals, error.lateral, error.heading)
-    return feedback(signals, "path_controller", WantedMotion(forward, turn))
+    turn = error.curvature[0] * forward + _steer(signals, error.lateral, error.heading)
+    return _feedback(signals, "path_controller", WantedMotion(forward, turn))
 
 
 @computed(*_LABELS, *LEG_MEMORY, unit=f"{_UNITS}, rad, rad, rad, rad", frame="-", limit=1.0, estimated=True)
@@ -494,28 +477,27 @@ def posture_controller(signals: Signals) -> list[Value]:
     home = signals.robot("home.leg_angle")
     legs = [(angle - home, rate) for angle, rate in leg_references(signals)]
     motion = WantedMotion(signals.command("linear_velocity_x"), _course(signals), legs, sweeping=True)
-    return feedback(signals, "posture_controller", motion)
+    return _feedback(signals, "posture_controller", motion)
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
 def slope_controller(signals: Signals) -> list[Value]:
     """Action of the controller that climbs and holds, and what it remembers."""
-    return feedback(signals, "slope_controller", WantedMotion(climb_speed(signals), _course(signals)))
+    return _feedback(signals, "slope_controller", WantedMotion(climb_speed(signals), _course(signals)))
 
 
 def _course(signals: Signals) -> Value:
     pose = estimated_pose(signals)
-    return steer(signals, pose.y, pose.yaw)
+    return _steer(signals, pose.y, pose.yaw)
 
 
-def steer(signals: Signals, lateral: Value, heading: Value) -> Value:
-    """Return the yaw rate that leads back to a line, rad/s; on a slope gravity tells which way is up."""
+def _steer(signals: Signals, lateral: Value, heading: Value) -> Value:
+    """Yaw rate that leads back to a line, rad/s; on a slope gravity tells which way is up."""
     leftward_force = signals.sensors("accelerometer")[1]
     return signals.gain("uphill") * leftward_force - signals.gain("lateral") * lateral - signals.gain("heading") * heading
 
 
-def feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
-    """Return the law's action and what it remembers, under ``name``, of the step before."""
+def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
     gain = signals.gain
     yaw_rate, velocity = signals.sensors("gyro")[2], signals.estimate("linear_velocity_in_body")[0]
     yaw_integral, velocity_integral, slip_difference = (signals.remembered(f"{name}[{label}]") for label in MEMORY)
@@ -589,10 +571,7 @@ def _integral(signals: Signals, value: Value, rate: Value) -> Value:
 
 
 def _wheel_rate(signals: Signals, rolling: Value, offset: Value, leg_rate: Value) -> Value:
-    """Rate of a wheel against its leg (rad/s) that moves the hip ahead at ``rolling``.
-
-    A turning leg carries its wheel along at -l sin(angle) * rate and turns it by its own rate (``wlr_gym/robot/slip.py``).
-    """
+    """Rate of a wheel against its leg (rad/s) that moves the hip ahead at ``rolling``; see ``Chassis.wheel_rate``."""
     angle = signals.robot("home.leg_angle") + offset
     return (rolling - signals.robot("leg.length") * ops.sin(angle) * leg_rate) / signals.robot("wheel.radius") - leg_rate
 
