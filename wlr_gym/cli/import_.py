@@ -121,7 +121,10 @@ def _suggest(options: ImportOptions, given: dict[str, Any], console: Console) ->
 def _print_missing(columns: set[str], console: Console) -> None:
     from wlr_gym.data.logs.map import GROUPS
 
-    missing = [name for name in ("vel", "eff", "gyro", "acc", "cam", "volt") if columns.isdisjoint(GROUPS.get(name, (name,)))]
+    missing = []
+    for name in ("vel", "eff", "gyro", "acc", "cam", "volt"):
+        group = GROUPS.get(name, (name,))
+        missing += [name] if columns.isdisjoint(group) else [column for column in group if column not in columns]
     if missing:
         console.print(f"missing: {', '.join(missing)}", style="yellow", markup=False)
 

@@ -17,7 +17,7 @@ from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import Count, JsonOption, ray_address, refuse_given
 from wlr_gym.cli.terminal import print_json
-from wlr_gym.learning.sweep.loop import SweepResult
+from wlr_gym.learning.sweep.book import SweepResult
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
 from wlr_gym.learning.sweep.results import PAGE_FILE, TABLE_FILE, words
 from wlr_gym.learning.sweep.running import resume_sweep, start_sweep

@@ -98,6 +98,8 @@ def check_contract(policy: Contract, environment: Contract, where: str) -> None:
         if name in ("robot.hash", "robot.servo"):
             ours, other = (contract["robot"].get("name") for contract in (policy, environment))
             hint = f" (robot '{ours}' in the policy, '{other}' in the environment)"
+            if ours == other:
+                hint = f" (both are called '{ours}'; their numbers differ, or the policy is of an older version)"
         raise InputError(
             f"{where}: made for another environment: {name} is {mine!r} in the policy, {theirs!r} in the environment{hint}"
         )

@@ -11,6 +11,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config
 from wlr_gym.cli import main, sweep
 from wlr_gym.learning.evaluation.rollout import make_core
+from wlr_gym.learning.sweep.book import Book
 from wlr_gym.learning.sweep.plan import (
     SweepPlan,
     Trial,
@@ -199,8 +200,9 @@ def test_bad_options_exit_with_2_and_leave_nothing(arguments, message, capsys, t
     assert not list(tmp_path.rglob("trials/*"))
 
 
-def test_one_is_one():
-    assert plan(seeds=1).size == "1 trial: 1 setting x 1 seed"
+def test_one_is_one(tmp_path):
+    book = Book(parse_config(SweepPlan, {"environment": ENVIRONMENT, "seeds": 1}, "sweep"), tmp_path, print)
+    assert book.size == "1 trial: 1 setting x 1 seed"
 
 
 def test_the_environment_is_the_first_argument(tmp_path):

@@ -116,6 +116,7 @@ def test_a_search_stops_early_repeats_the_best_and_resumes(hold, tmp_path):
     assert "failed" in status
     assert all("no_such_agent" in one.error for one in found.failed)
     assert len(found.ranking[0].values) == 2
+    assert not (tmp_path / "out" / ".ray_tune").exists()
     stopped = {one.trial.name: one.steps for one in found.trials if one.status == "stopped early"}
     again = wlr_gym.resume_sweep(tmp_path / "out")
     assert stopped == {one.trial.name: one.steps for one in again.trials if one.status == "stopped early"}

@@ -16,10 +16,10 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.learning.evaluation.subjects import expand
-from wlr_gym.learning.sweep import loop as loops
+from wlr_gym.learning.sweep import book as book_module
 from wlr_gym.learning.sweep import running
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, trials_of
-from wlr_gym.learning.sweep.results import TrialResult, summarise, write_results
+from wlr_gym.learning.sweep.results import TrialResult, summarise, write_page, write_table
 
 PLAN = SweepPlan(environment="WLR-Velocity-v0", space={"gamma": [0.9, 0.97]}, seeds=3)
 TRIALS = trials_of([{"gamma": 0.9}, {"gamma": 0.97}], [0, 1, 2])
@@ -36,10 +36,10 @@ def write_curve(folder, steps):
 
 
 @pytest.fixture
-def loop(tmp_path):
+def book(tmp_path):
     for name in ("trials", ".locks"):
         (tmp_path / name).mkdir()
-    return loops.SweepLoop(PLAN, tmp_path, lambda line: None)
+    return book_module.Book(PLAN, tmp_path, lambda line: None)
 
 
 @pytest.mark.parametrize(
@@ -55,10 +55,23 @@ def loop(tmp_path):
     ],
 )
 def test_every_setting_finds_room_in_the_table(values, column, tmp_path):
-    plan = SweepPlan(environment="WLR-Velocity-v0", space={"some.setting": values})
-    write_results(plan, [result({"some.setting": value}, tmp_path) for value in values], tmp_path)
+    write_table([result({"some.setting": value}, tmp_path) for value in values], tmp_path)
     written = pandas.read_parquet(tmp_path / "trials.parquet")["some.setting"]
     assert ["missing" if pandas.isna(value) else value for value in written] == column
+
+
+def test_a_trial_that_has_ended_is_read_once(book, monkeypatch):
+    """Otherwise the end of each of 1000 trials would read the folders of 1000."""
+    reads = []
+
+    def read(result):
+        reads.append(result.trial.name)
+        result.status = "done"
+
+    monkeypatch.setattr(TrialResult, "read", read)
+    book.train(TRIALS, lambda jobs: (Ended(job.name) for job in jobs))
+    assert sorted(set(reads)) == sorted(trial.name for trial in TRIALS)
+    assert len(reads) <= 2 * len(TRIALS)
 
 
 def test_all_seeds_of_the_best_are_scored_as_one_column(tmp_path):
@@ -74,11 +87,20 @@ def test_all_seeds_of_the_best_are_scored_as_one_column(tmp_path):
     assert text == str(folders[1])
 
 
-def test_what_was_stopped_early_is_read_after_its_last_checkpoint(loop, monkeypatch):
+def test_what_failed_is_read_again_when_it_was_tried_again(book):
+    write_curve(book.folder / "trials" / TRIALS[0].name, 64)
+    book.end(TRIALS[0], "no space")
+    write_curve(book.folder / "trials" / TRIALS[0].name, 128)
+    book.end(TRIALS[0], "no space again")
+    (known,) = book.results()
+    assert (known.steps, known.error) == (128, "no space again")
+
+
+def test_what_was_stopped_early_is_read_after_its_last_checkpoint(book, monkeypatch):
     """Its process ends after the search has moved on; until then it holds the trial."""
-    folder = loop.folder / "trials" / TRIALS[0].name
+    folder = book.folder / "trials" / TRIALS[0].name
     write_curve(folder, 64)
-    loop.note(TRIALS[0], "stopped early")
+    book.end(TRIALS[0], "", early=True)
 
     @contextmanager
     def lock_that_is_free_after_the_checkpoint(path, patience):
@@ -86,13 +108,13 @@ def test_what_was_stopped_early_is_read_after_its_last_checkpoint(loop, monkeypa
         write_curve(folder, 128)
         yield
 
-    monkeypatch.setattr(loops, "locked", lock_that_is_free_after_the_checkpoint)
-    loop.write()
-    assert [(one.status, one.steps) for one in loop.results()] == [("stopped early", 128)]
-    assert list(pandas.read_parquet(loop.folder / "trials.parquet")["steps"]) == [128]
+    monkeypatch.setattr(book_module, "locked", lock_that_is_free_after_the_checkpoint)
+    book.write()
+    assert [(one.status, one.steps) for one in book.results()] == [("stopped early", 128)]
+    assert list(pandas.read_parquet(book.folder / "trials.parquet")["steps"]) == [128]
 
 
-def test_jobs_are_ended_before_an_interruption_goes_on(loop):
+def test_jobs_are_ended_before_an_interruption_goes_on(book):
     """Ctrl-C may come while a line is printed."""
     ended = []
 
@@ -106,19 +128,19 @@ def test_jobs_are_ended_before_an_interruption_goes_on(loop):
     def interrupted(line):
         raise KeyboardInterrupt
 
-    loop.say = interrupted
+    book.say = interrupted
     with pytest.raises(KeyboardInterrupt) as caught:
-        loop.train(TRIALS, run)
+        book.train(TRIALS, run)
     assert (ended, caught.type) == (["in good order"], KeyboardInterrupt)
 
 
-def test_a_table_that_cannot_be_written_says_what_to_do(loop, monkeypatch):
-    def full(plan, results, folder):
+def test_a_table_that_cannot_be_written_says_what_to_do(book, monkeypatch):
+    def full(results, folder):
         raise InputError(f"{folder}/trials.parquet: cannot be written: No space left on device")
 
-    monkeypatch.setattr(loops, "write_results", full)
+    monkeypatch.setattr(book_module, "write_table", full)
     with pytest.raises(InputError, match=r"No space left.*wlr sweep --resume"):
-        loop.fill(lambda jobs: (Ended(job.name, "no space") for job in jobs))
+        book.fill(lambda jobs: (Ended(job.name, "no space") for job in jobs))
 
 
 def test_two_cannot_run_one_sweep(tmp_path, monkeypatch):
@@ -140,13 +162,10 @@ def test_two_cannot_run_one_sweep(tmp_path, monkeypatch):
 @pytest.mark.parametrize("steps", [(), (0.0,), (0.0, 10.0)])
 def test_a_page_says_what_there_is(steps, tmp_path):
     """Before the first score, with one before the first update only, and with curves."""
-    trials = [
-        TrialResult(
-            trial, tmp_path / trial.name, scores=[{"steps": step, "tracking_error": 1.0 + trial.seed} for step in steps]
-        )
-        for trial in TRIALS
-    ]
-    write_results(PLAN, trials, tmp_path)
+    trials = [TrialResult(trial, tmp_path / trial.name) for trial in TRIALS]
+    for one in trials:
+        one.scores = [{"steps": step, "tracking_error": 1.0 + one.trial.seed} for step in steps]
+    write_page(PLAN, trials, tmp_path)
     page = (tmp_path / "sweep.html").read_text()
     assert ("No trial has scores yet" in page) == (not steps)
     assert ("gamma 0.9. Tracking error 2 (1 to 3, 3 seeds)" in page) == bool(steps)

@@ -346,7 +346,7 @@ def open_own_rig(
         InputError: files that are no runs of the rig, or equations that cannot be compiled.
     """
     runs = read_rig_runs(data, rig)
-    too_few = few_runs(len(runs), len(runs))
+    too_few = few_runs(len(runs), len(runs), "record more")
     return (None, too_few) if too_few else (OwnRigProblem(runs, rig, known), [])
 
 

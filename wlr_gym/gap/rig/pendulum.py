@@ -555,6 +555,6 @@ def open_pendulum(data: str | Path, known: Patch | None = None) -> tuple[Pendulu
     good = [recording for recording in recordings if recording.name not in bad]
     if "" in bad:
         return None, found
-    if too_few := few_runs(len(good), len(recordings)):
+    if too_few := few_runs(len(good), len(recordings), "record more"):
         return None, [*found, *too_few]
     return PendulumProblem(good, known.effects if known else ()), found

@@ -17,7 +17,6 @@ from pydantic import Field, model_validator
 
 from wlr_gym.base.errors import LARGEST_SEED, InputError
 from wlr_gym.base.settings import SettingsModel, merge_changes, parse_config, read_yaml, require_keys
-from wlr_gym.base.text import counted
 from wlr_gym.learning.training import check_environment_settings, settings_of
 from wlr_gym.policy.agents import agent_function, apply_changes, load_agent
 
@@ -185,17 +184,6 @@ class SweepPlan(SettingsModel):
     def metric(self) -> str:
         """Held-out score that decides which settings are best."""
         return self.search.metric if self.search else "tracking_error"
-
-    @property
-    def size(self) -> str:
-        """What the sweep will do, in words."""
-        known, seeds = self.known_settings(), counted(len(self.seed_list), "seed")
-        count = len(known) if known is not None else self.search.trials if self.search else 0
-        steps = self.settings.get("total_steps")
-        each = f" of {steps:,} environment steps" if isinstance(steps, int) and "total_steps" not in self.space else ""
-        if self.search is None:
-            return f"{counted(count * len(self.seed_list), 'trial')}: {counted(count, 'setting')} x {seeds}{each}"
-        return f"{counted(count, 'trial')}{each}, then the best {min(self.search.repeat_best, count)} with {seeds}"
 
     def known_settings(self) -> list[dict[str, Any]] | None:
         """Return the settings that are tried, in order: of the grid, or drawn at random; None where results decide (Optuna)."""

@@ -1,22 +1,25 @@
 """Sweeps on Ray. It chooses the node; there a trial is the same process as on one machine. Ray Tune searches settings.
 
-What a search knows, Tune keeps in ``.ray_tune`` in the folder of the sweep, and goes on from there when the sweep is resumed.
+What a search knows is in the folder of the sweep alone. One that is resumed first tries the settings that it had begun: trials
+that are over say their scores again, the others go on from their checkpoints, and new ones follow.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import socket
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.jobs import Ended, Job, follow
 from wlr_gym.learning.curves import METRICS
-from wlr_gym.learning.sweep.loop import SweepLoop
-from wlr_gym.learning.sweep.plan import REDUCTION, SCORES, Trial
-from wlr_gym.learning.sweep.results import STOPPED_EARLY, UNFINISHED
+from wlr_gym.learning.sweep.book import Book
+from wlr_gym.learning.sweep.plan import REDUCTION, SCORES, SweepPlan, Trial
 from wlr_gym.learning.sweep.trial import job_of
 
 #: Address that means: start Ray on this machine.
@@ -96,106 +99,126 @@ def spread_on_ray(jobs: Iterable[Job], at_once: int | None = None) -> Generator[
 
 # ---- searches by Ray Tune --------------------------------------------------------------------------------------------
 
-#: No files of its own for each trial, no warnings, and Ctrl-C ends it. What it knows is on the disk a second later.
-_ENVIRONMENT = {
+#: No files of its own for each trial, no warnings, and Ctrl-C ends it.
+_QUIET = {
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_WARN_THRESHOLD_S": "60",
     "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_DISABLE_STRICT_METRIC_CHECKING": "1",
-    "TUNE_GLOBAL_CHECKPOINT_S": "1",
     "RAY_AIR_NEW_OUTPUT": "0",
 }
 
 
-def search_with_tune(loop: SweepLoop, at_once: int | None) -> list[Trial]:
-    """Search on the connected cluster, or go on with a search; each settings is trained with the first seed.
+def search_with_tune(book: Book, at_once: int | None) -> None:
+    """Search on the connected cluster; each settings is trained with the first seed, and told to the sweep's book.
 
     Args:
-        loop: of the sweep; it is told which trials begin, and how they ended.
+        book: of the sweep. What it has begun is tried first: all of a grid or of random settings, or what Optuna chose before
+            an interruption.
         at_once: most trials at a time; None = as many as the cluster has cores.
-
-    Returns:
-        The trials that had failed before the search was resumed, which Tune does not try again.
     """
-    os.environ.update(_ENVIRONMENT | {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ})
+    os.environ.update(_QUIET | {name: os.environ[name] for name in _QUIET if name in os.environ})
     import optuna
     from ray import tune
     from ray.tune.schedulers import ASHAScheduler
     from ray.tune.search.optuna import OptunaSearch
 
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    plan, known = loop.plan, loop.plan.known_settings()
-    search, out = plan.search, loop.folder.resolve()
+    plan, first = book.plan, book.begun()
+    search = plan.search
     assert search is not None
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    mode: dict[str, Any] = {"metric": search.metric, "mode": "min" if METRICS[search.metric] else "max"}
+    searcher = OptunaSearch(
+        space={name: _distribution(values) for name, values in plan.space.items()},
+        # a resumed search draws other numbers than those that are known already
+        sampler=optuna.samplers.TPESampler(seed=search.seed + len(first)),
+        points_to_evaluate=[_coded(plan, settings, json.dumps) for settings in first] or None,
+        **mode,
+    )
     total = plan.settings.get("total_steps", 0) if search.early_stopping else 0
     stopper = None
     if search.early_stopping:  # max_t: no rung at the end, a trial that gets there writes its policy
         rungs: dict[str, Any] = {"max_t": total - 1, "grace_period": total // SCORES, "reduction_factor": REDUCTION}
-        stopper = ASHAScheduler(time_attr="steps", stop_last_trials=False, **rungs)
-    ran: set[str] = set()
-    seen: dict[str, bool] = {}
+        stopper = ASHAScheduler(time_attr="steps", stop_last_trials=False, **rungs, **mode)
+    storage = book.folder.resolve() / ".ray_tune"
+    trainable = _trainable(plan, book.folder.resolve(), book.stopped)
+    tuner = tune.Tuner(
+        tune.with_resources(trainable, {"cpu": 1}),
+        tune_config=tune.TuneConfig(
+            search_alg=searcher,
+            scheduler=stopper,
+            num_samples=max(search.trials, len(first)) if search.method == "optuna" else len(first),
+            max_concurrent_trials=at_once,
+        ),
+        run_config=tune.RunConfig(
+            name="search",
+            storage_path=str(storage),
+            failure_config=tune.FailureConfig(max_failures=RETRIES),  # nodes that are lost; a trial's own error raises nothing
+            callbacks=[_watch(book, total)],
+            verbose=0,
+        ),
+    )
+    try:
+        tuner.fit()
+    finally:
+        shutil.rmtree(storage, ignore_errors=True)
 
-    def trial_of(config: Mapping[str, Any]) -> Trial:
-        return Trial(config["settings"], plan.seed_list[0])
 
-    def note(trials: Iterable[Any]) -> None:
-        """Note trials of Tune that have begun or ended, each once; say how those ended that ran here."""
-        for one in trials:
-            over = one.is_finished()
-            if seen.get(one.trial_id) == over:
-                continue
-            seen[one.trial_id] = over
-            last, trial = one.last_result or {}, trial_of(one.config)
-            if not over:
-                loop.note(trial)
-                continue
-            error = f"Ray: {one.get_error()}" if one.status == "ERROR" else last.get("error", "")
-            found = loop.note(trial, STOPPED_EARLY if last.get("steps", total) < total else UNFINISHED, error)
-            if one.trial_id in ran:
-                loop.tell(found, str(sum(seen.values())))
-
-    class Watch(tune.Callback):
-        def on_step_begin(self, iteration: int, trials: list[Any], **info: Any) -> None:
-            note(trials)
-
-        def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-            ran.add(trial.trial_id)
+def _trainable(plan: SweepPlan, out: Path, stopped: Container[str]) -> Callable[[Mapping[str, Any]], None]:
+    """Return what Tune runs on a node: a trial's job, whose scores it hears; of one that was stopped before, those it has."""
 
     def train(config: Mapping[str, Any]) -> None:
-        job = job_of(plan, trial_of(config), out, say=True)
+        from ray import tune
+
+        trial = _trial(plan, config)
+        job = job_of(plan, trial, out, "say" if trial.name in stopped else "train and say")
         error = follow(job, lambda scores: tune.report(dict(scores)))
         if error:
             tune.report({plan.metric: _WORST if METRICS[plan.metric] else -_WORST, "error": error})
 
-    storage = out / ".ray_tune"
-    found = tune.run(
-        train,
-        name="search",
-        storage_path=str(storage),
-        resume="AUTO+ERRORED" if any(storage.glob("search/experiment_state-*.json")) else None,
-        config={"settings": tune.grid_search(known) if known else {name: _domain(one) for name, one in plan.space.items()}},
-        search_alg=None if known else OptunaSearch(sampler=optuna.samplers.TPESampler(seed=search.seed)),
-        scheduler=stopper,
-        num_samples=1 if known else search.trials,
-        metric=plan.metric,
-        mode="min" if METRICS[plan.metric] else "max",
-        max_failures=RETRIES,  # nodes that are lost; a trial's own error raises nothing
-        max_concurrent_trials=at_once,
-        raise_on_failed_trial=False,
-        resources_per_trial={"cpu": 1},
-        callbacks=[Watch()],
-        verbose=0,
-    )
-    note(found.trials)
-    return [trial_of(one.config) for one in found.trials if one.trial_id not in ran and (one.last_result or {}).get("error")]
+    return train
 
 
-def _domain(values: Any) -> Any:
-    """Return the values of a setting, a list or a range, as Tune takes them."""
+def _watch(book: Book, total: int) -> Any:
+    """Return a callback that tells which trials begin, and how they ended: early, where that was before ``total`` steps."""
     from ray import tune
 
+    class Watch(tune.Callback):
+        book: Book
+
+        def __getstate__(self) -> dict[str, Any]:
+            return {}  # Tune keeps copies of its settings, which need not tell anybody
+
+        def on_trial_start(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+            self.book.begin(_trial(self.book.plan, trial.config))
+
+        def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+            last = trial.last_result or {}
+            self.book.end(_trial(self.book.plan, trial.config), last.get("error", ""), last.get("steps", total) < total)
+
+        def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
+            self.book.end(_trial(self.book.plan, trial.config), f"Ray: {trial.get_error()}", False)
+
+    watch = Watch()
+    watch.book = book  # here, not in the class: that is copied with all that it refers to
+    return watch
+
+
+def _distribution(values: Any) -> Any:
+    """Return the values of a setting, a list or a range, as Optuna takes them."""
+    from optuna import distributions
+
     if isinstance(values, list):
-        return tune.choice(values)
+        return distributions.CategoricalDistribution([json.dumps(value) for value in values])
     if values.whole:
-        return (tune.lograndint if values.log else tune.randint)(int(values.low), int(values.high) + 1)
-    return (tune.loguniform if values.log else tune.uniform)(values.low, values.high)
+        return distributions.IntDistribution(int(values.low), int(values.high), log=values.log)
+    return distributions.FloatDistribution(values.low, values.high, log=values.log)
+
+
+def _coded(plan: SweepPlan, settings: Mapping[str, Any], code: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return settings with those from lists, which Optuna has as JSON, coded to it or back."""
+    return {name: code(settings[name]) if isinstance(values, list) else settings[name] for name, values in plan.space.items()}
+
+
+def _trial(plan: SweepPlan, config: Mapping[str, Any]) -> Trial:
+    return Trial(_coded(plan, config, json.loads), plan.seed_list[0])

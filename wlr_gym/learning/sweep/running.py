@@ -1,7 +1,4 @@
-"""Sweeps: settings x seeds, each trial an ordinary run folder; what was stopped resumes. What ``wlr sweep`` does.
-
-Whether a trial is done, and where it goes on, its run folder says. What a search by Ray Tune knows beyond, Tune itself keeps.
-"""
+"""Sweeps: settings x seeds, each trial an ordinary run folder; what was stopped resumes. What ``wlr sweep`` does."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from wlr_gym.base.files import locked, make_output_folder, require_empty
 from wlr_gym.base.jobs import spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
-from wlr_gym.learning.sweep.loop import Say, SweepLoop, SweepResult
+from wlr_gym.learning.sweep.book import Book, Say, SweepResult
 from wlr_gym.learning.sweep.plan import SweepPlan, resolve
 from wlr_gym.learning.sweep.trial import LOCKS, LOGS, TRIALS
 
@@ -113,19 +110,19 @@ def _run(plan: SweepPlan, folder: Path, ray: str | None, workers: int | None, sa
     for name in (TRIALS, LOGS, LOCKS):
         make_output_folder(folder / name)
     with locked(folder / LOCKS / "sweep", _HANDOVER):
-        loop = SweepLoop(plan, folder, say)
+        book = Book(plan, folder, say)
         if ray is None and not plan.needs_ray:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            say(f"{plan.size}; {workers or cores} at a time, processes of this machine")
+            say(f"{book.size}; {workers or cores} at a time, processes of this machine")
             with _sigterm_interrupts():
-                return loop.fill(lambda jobs: spread(jobs, workers or cores))
+                return book.fill(lambda jobs: spread(jobs, workers or cores))
         from wlr_gym.learning.sweep.ray import LOCAL, connected, search_with_tune, spread_on_ray
 
         address = ray or LOCAL
         with connected(address, workers), _sigterm_interrupts():
-            say(f"{plan.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
-            search = (lambda: search_with_tune(loop, workers)) if plan.needs_ray else None
-            return loop.fill(lambda jobs: spread_on_ray(jobs, workers), search)
+            say(f"{book.size}; Ray {'on this machine' if address == LOCAL else f'at {address}'}")
+            search = (lambda: search_with_tune(book, workers)) if plan.needs_ray else None
+            return book.fill(lambda jobs: spread_on_ray(jobs, workers), search)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
@@ -16,7 +16,7 @@ from wlr_gym.base.files import locked
 from wlr_gym.base.jobs import PATIENCE, Job, Send, import_modules, serve
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
-from wlr_gym.learning.curves import rows_of
+from wlr_gym.learning.curves import read_curve
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial
 from wlr_gym.learning.training import can_resume, resume_training, run_training
 from wlr_gym.policy import Training, TrainingProgress
@@ -26,16 +26,29 @@ LOGS = "logs"
 LOCKS = ".locks"
 
 
-def job_of(plan: SweepPlan, trial: Trial, out: Path, say: bool = False) -> Job:
-    """Return the job of a trial: what to train, in the folder ``out`` of the sweep, and whether it says its held-out scores."""
+def job_of(plan: SweepPlan, trial: Trial, out: Path, do: Literal["train", "train and say", "say"] = "train") -> Job:
+    """Return the job of a trial.
+
+    Args:
+        plan, trial: what to train.
+        out: folder of the sweep.
+        do: train it; train it and say its held-out scores, those of before and new ones; or only say those that it has.
+    """
     out = out.resolve()
-    task = {"plan": plan.model_dump(mode="json"), "settings": dict(trial.settings), "seed": trial.seed, "out": str(out)}
-    task |= {"version": __version__, "command": sys.argv, "say": say}
+    task = {
+        "plan": plan.model_dump(mode="json"),
+        "settings": dict(trial.settings),
+        "seed": trial.seed,
+        "out": str(out),
+        "do": do,
+        "version": __version__,
+        "command": sys.argv,
+    }
     return Job(trial.name, "wlr_gym.learning.sweep.trial", task, str(out / LOGS / f"{trial.name}.txt"))
 
 
 def train_trial(task: Mapping[str, Any], send: Send) -> None:
-    """Train what a task of :func:`job_of` says, from where its run folder is.
+    """Do what a task of :func:`job_of` says, from where its run folder is.
 
     Raises:
         InputError: this machine has another version, another process trains the trial, or the training refuses its settings.
@@ -43,27 +56,27 @@ def train_trial(task: Mapping[str, Any], send: Send) -> None:
     """
     if task["version"] != __version__:
         raise InputError(f"{platform.node()} has wlr_gym {__version__}, the sweep was started with {task['version']}")
-    plan, trial = SweepPlan(**task["plan"]), Trial(task["settings"], task["seed"])
+    plan, trial, do = SweepPlan(**task["plan"]), Trial(task["settings"], task["seed"]), task["do"]
     module = plan.environment.rpartition(":")[0]  # of an id such as ``my_tasks:WLR-Climb-v0``
     import_modules([*plan.imports, *([module] if module else [])])
     sys.argv[:] = task["command"]  # the run folder says how the sweep was started, not how its processes are
     out, told = Path(task["out"]), -1.0
     folder = out / TRIALS / trial.name
 
-    def tell(*scores: Mapping[str, float]) -> None:
+    def tell(scores: Mapping[str, float]) -> None:
         """Say held-out scores, each once."""
         nonlocal told
-        for one in scores if task["say"] else ():
-            if one and one["steps"] > told:
-                told = one["steps"]
-                send(one)
+        if "say" in do and scores and scores["steps"] > told:
+            told = scores["steps"]
+            send(dict(scores))
 
     def on_update(progress: TrainingProgress) -> None:
         tell(progress.held_out)
 
     with locked(out / LOCKS / trial.name, 2 * PATIENCE):
-        tell(*rows_of(folder / "held_out.csv"))  # what a trial that is resumed has already
-        if is_complete(folder):
+        for row in scores_of(folder):  # what a trial that is resumed has already
+            tell(row)
+        if do == "say" or is_complete(folder):
             return
         if can_resume(folder):
             resume_training(folder, on_update=on_update)
@@ -72,7 +85,14 @@ def train_trial(task: Mapping[str, Any], send: Send) -> None:
             settings = plan.settings_of(trial)
             request = Training(plan.environment, folder, settings, progress=False, init=plan.init, on_update=on_update)
             run_training(plan.agent, request)
-        tell(*rows_of(folder / "held_out.csv"))  # what the end of the training added
+        for row in scores_of(folder):  # what the end of the training added
+            tell(row)
+
+
+def scores_of(folder: Path) -> list[dict[str, float]]:
+    """Return the held-out scores of a run folder, oldest first."""
+    file = folder / "held_out.csv"
+    return read_curve(file) if file.is_file() else []
 
 
 def is_complete(folder: Path) -> bool:
