@@ -204,7 +204,8 @@ def most_left(fitted: float | None, runs: Iterable[RunGap]) -> tuple[float, str]
 
     Fitted runs count together, as the fit sees them. Held-out ones count one by one: a single motion may show what is missing.
     """
-    return max([(fitted or 0.0, ""), *((one.after, one.run) for one in runs if one.heldout and math.isfinite(one.after))], key=lambda one: one[0])
+    held_out = [(one.after, one.run) for one in runs if one.heldout and math.isfinite(one.after)]
+    return max([(fitted or 0.0, ""), *held_out], key=lambda one: one[0])
 
 
 def most_in(channels: Iterable[ChannelGap]) -> str:
