@@ -193,8 +193,8 @@ class FakeViewer:
         self.shown, self.closed = [], False
         FakeViewer.made.append(self)
 
-    def show(self, truth, parameters, row, *, period, time, command):
-        assert (row, period) == (0, 0.02)
+    def show(self, truth, parameters, *, period, time, command):
+        assert period == 0.02
         self.shown.append((round(time, 6), set(command)))
         return True
 

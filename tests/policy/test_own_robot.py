@@ -82,7 +82,7 @@ def test_controllers_take_the_environments_robot():
     environment = contract(load_task("velocity", HEAVY), {})
     assert known_robot(environment, None, "pid") == load_robot(HEAVY)
     pid: Any = make_policy("pid", environment)
-    assert pid.robot == load_robot(HEAVY)
+    assert pid.chassis.robot == load_robot(HEAVY)
     with pytest.raises(InputError, match=r"agent 'pid': robot 'wlr-nominal' is not the environment's \('heavy'\)"):
         known_robot(environment, "nominal", "pid")
     old = copy.deepcopy(environment)

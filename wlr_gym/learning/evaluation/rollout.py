@@ -55,6 +55,7 @@ class Rollout:
         action: (T, N, 8) in [-1, 1].
         command: (T, N, C) what the robot had to follow in this step; SI units.
         position: (T, N, 2) body origin in the floor frame, m.
+        forward_velocity: (T, N) of the body origin along the body's x, m/s. yaw_rate: (T, N) rad/s.
         slip_velocity: (T, N, 4, 2) mean over the step, along each wheel's heading and axle, m/s.
         excess_slip: (T, N) mean slip speed of the wheels beyond what a steady skid turn needs, as the reward ``slip``, m/s.
         energy: (T, N) drawn from the supply, J; braking counts as negative.
@@ -75,6 +76,8 @@ class Rollout:
     action: Array
     command: Array
     position: Array
+    forward_velocity: Array
+    yaw_rate: Array
     slip_velocity: Array
     excess_slip: Array
     energy: Array
@@ -189,6 +192,8 @@ def _signals(core: Core) -> dict[str, NDArray]:
         "measured": core.measures.copy(),
         "action": core.action.copy(),
         "position": truth["position"][:, :2].copy(),
+        "forward_velocity": truth["linear_velocity_in_body"][:, 0].copy(),
+        "yaw_rate": truth["angular_velocity_in_body"][:, 2].copy(),
         "slip_velocity": truth["slip_displacement"].reshape(shape) / core.task.config.control_period,
         "energy": truth["electrical_energy"].copy(),
         "saturated": saturated(truth, core.task.robot),
