@@ -28,6 +28,8 @@ def rollout(ticks=TICKS, episodes=EPISODES, **changes) -> Rollout:
         "action": np.zeros((ticks, episodes, 8)),
         "command": command,
         "position": position,
+        "forward_velocity": 0.1 * one,
+        "yaw_rate": 0 * one,
         "slip_velocity": np.zeros((ticks, episodes, 4, 2)),
         "excess_slip": 0 * one,
         "energy": 1.0 * PERIOD * one,
