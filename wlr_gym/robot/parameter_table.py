@@ -46,6 +46,9 @@ XYZ = ("x", "y", "z")
 XY = ("x", "y")
 #: Areas of the floor that may have a friction of their own.
 PATCHES = ("patch_1", "patch_2", "patch_3", "patch_4")
+#: Waves that the floor may have, and pieces that may stand on it.
+WAVES = ("wave_1", "wave_2")
+PIECES = tuple(f"piece_{number}" for number in range(1, 9))
 SLOPE = ("pitch", "roll")
 ANGLES = ("roll", "pitch", "yaw")
 INERTIA_LABELS = ("xx", "yy", "zz", "xy", "xz", "yz")
@@ -193,6 +196,25 @@ TABLE: tuple[ParameterSpec, ...] = (
     fixed("patch.x_max", "m", PATCHES, low=-1e3, high=1e3, doc="no patch where x_max <= x_min"),
     fixed("patch.y_min", "m", PATCHES, low=-1e3, high=1e3, doc="area of the patch, floor frame"),
     fixed("patch.y_max", "m", PATCHES, low=-1e3, high=1e3, doc="no patch where y_max <= y_min"),
+    # Relief of the floor: height = sum of wave.height sin(2 pi distance/wave.length + phase) + bumps, and pieces on top.
+    fixed("wave.height", "m", WAVES, low=0, high=1, doc="half of crest to trough; 0 = no wave"),
+    fixed("wave.length", "m", WAVES, at=1.0, low=0.01, high=1e3, doc="crest to crest"),
+    fixed("wave.heading", "rad", WAVES, low=-10, high=10, doc="direction across the crests, from the floor's x axis"),
+    fixed("wave.phase", "rad", WAVES, low=-10, high=10, doc="at the floor's origin; 0 = rising"),
+    # A smooth surface over a square lattice of points, of which a share is raised by up to the height.
+    fixed("bumps.height", "m", low=0, high=1, doc="of the highest bump; 0 = none"),
+    fixed("bumps.spacing", "m", at=0.1, low=0.005, high=10, doc="between the lattice's points"),
+    fixed("bumps.share", "-", at=1.0, low=0.01, high=1, doc="share of the points that are raised"),
+    fixed("bumps.seed", "-", low=0, high=83520, doc="whole number: which bumps"),
+    # A piece has a flat top and two faces (pi/2: upright); its edges run across its heading without an end.
+    fixed("piece.x", "m", PIECES, low=-1e3, high=1e3, doc="foot of the front face"),
+    fixed("piece.y", "m", PIECES, low=-1e3, high=1e3, doc="foot of the front face"),
+    fixed("piece.heading", "rad", PIECES, low=-10, high=10, doc="direction up the front face, from the floor's x axis"),
+    fixed("piece.height", "m", PIECES, low=0, high=1, doc="of the top above z = 0; 0 = no piece"),
+    fixed("piece.length", "m", PIECES, at=1e3, low=0.01, high=1e3, doc="of the top along the heading"),
+    fixed("piece.front_slope", "rad", PIECES, at=math.pi / 2, low=0.01, high=math.pi / 2, doc="of the front face"),
+    fixed("piece.rear_slope", "rad", PIECES, at=math.pi / 2, low=0.01, high=math.pi / 2, doc="of the rear face"),
+    fixed("piece.edge_radius", "m", PIECES, at=0.003, low=1e-4, high=0.1, doc="of the upper edges"),
     stated("ground.normal_stiffness", "N/m", WHEELS, low=100, high=2e5, doc="tyre and chassis together"),
     stated("ground.normal_damping", "N s/m", WHEELS, low=0, high=500, doc="normal contact damping"),
     # Inclination of the floor's x and y axes, positive = uphill. The world frame is the floor frame.

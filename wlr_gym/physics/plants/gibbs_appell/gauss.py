@@ -18,17 +18,18 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     AXES,
     CORNERS,
     PLATFORM,
+    Contact,
+    axes_on,
+    contact_numbers,
     contact_place,
-    contact_row,
+    contacts_of,
     dot,
-    floor_axes,
     joints_of,
     rolling_contact,
     rotation_rows,
     slip_velocity,
     to_body,
     vector,
-    wheel_points,
 )
 from wlr_gym.robot import FIRST_WHEEL, JOINTS
 
@@ -41,7 +42,7 @@ class Corner:
         coupling: leg-rate column of the mass matrix against the six base rows.
         leg_leg, leg_wheel, wheel_wheel: its own 2x2 block.
         leg_bias, wheel_bias: velocity-dependent inertia terms.
-        hip, leg, rim: geometry in the body frame, see :func:`wheel_points`.
+        contacts: of the wheel.
         block, inverse: the 2x2 block with implicit damping as (11, 12, 22), and its inverse.
         free: free motion of the pair for a resting base.
     """
@@ -53,9 +54,7 @@ class Corner:
     leg_bias: Value
     wheel_bias: Value
     trig: tuple[Value, Value]
-    hip: Vector = field(default_factory=list)
-    leg: Vector = field(default_factory=list)
-    rim: Vector = field(default_factory=list)
+    contacts: list[Contact] = field(default_factory=list)
     block: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
     inverse: tuple[Value, Value, Value] = (0.0, 0.0, 0.0)
     free: tuple[Value, Value] = (0.0, 0.0)
@@ -64,7 +63,7 @@ class Corner:
 def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str]) -> Out:
     """Build the Gauss problem of one substep: reduced base matrix, free motion, friction rows, impulse bounds."""
     rows = rotation_rows(lanes)
-    n, heading, lateral, scale = floor_axes(rows)
+    level = axes_on(rows[2])
     gravity = to_body(rows, vector(lanes, "gravity_"))
     v, w = vector(lanes, "v"), vector(lanes, "w")
     u_base = [*(v[k] + step * gravity[k] for k in range(3)), *w]  # uniform gravity accelerates every point alike
@@ -84,10 +83,12 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
             dot(corner.coupling, u_base) + corner.leg_leg * leg_rate + corner.leg_wheel * wheel_rate - step * corner.leg_bias,
             corner.leg_wheel * leg_rate + corner.wheel_wheel * wheel_rate - step * corner.wheel_bias,
         ]
-        corner.hip, corner.leg, corner.rim = wheel_points(lanes, i, *corner.trig, n, scale)
-        _push_of_floor(lanes, i, corner, n, [*v, *w], step, momentum, own, out)
+        corner.contacts = contacts_of(lanes, i, rows, level, corner.trig, features)
+        for contact in corner.contacts:
+            _push_of_floor(lanes, contact, [*v, *w], step, momentum, own, out)
         damping = _push_of_motors(lanes, i, voltages, joints, step, features, momentum, own, out)
-        _friction_under_wheel(lanes, i, corner, rows, (n, heading, lateral, scale), [*v, *w], features, out)
+        for contact in corner.contacts:
+            _friction_under_wheel(lanes, contact, rows, [*v, *w], features, out)
         _eliminate(corner, damping, own, momentum, reduced)
 
     lower, inverse_diagonal = _cholesky(reduced)
@@ -110,7 +111,7 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         out[f"i11_{i}"], out[f"i12_{i}"] = corner.inverse[0], corner.inverse[1]
         out[f"a11_{i}"], out[f"a12_{i}"], out[f"a22_{i}"] = corner.block
         out[f"y_leg{i}"], out[f"y_wheel{i}"] = corner.free
-        _warm_start(lanes, i, step, features, out)
+        _warm_start(lanes, i, corner.contacts, step, features, out)
         # friction rows: (base part, leg entry, wheel entry, impulse)
         local = {
             f"leg{i}": (hinge, 1.0, 0.0, out[f"share{i}"] * out[f"gear_friction{i}"]),
@@ -118,12 +119,14 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         }
         if "rolling_resistance" in features:
             local[f"rolling{i}"] = ([0.0] * 6, 0.0, 1.0, out[f"rolling_friction{i}"])
-        rise, radius = rolling_contact(lanes, i, (corner.hip, corner.leg, corner.rim), n, scale, features)
-        out[f"rolling_radius{i}"] = radius
-        for e, name, wheel_entry in ((heading, "x", -radius), (lateral, "y", 0.0)):
-            base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, e, rise)
-            local[f"{name}{i}"] = (whiten(base_row), leg_entry, wheel_entry, out[f"friction_{name}{i}"])
-            out[f"leg_entry_{name}{i}"] = leg_entry
+        for contact in corner.contacts:
+            c, (_, heading, lateral, _) = contact.number, contact.axes
+            rise, radius = rolling_contact(lanes, contact, features)
+            out[f"rolling_radius{c}"] = radius
+            for e, name, wheel_entry in ((heading, "x", -radius), (lateral, "y", 0.0)):
+                base_row, leg_entry = contact.row(e, rise)
+                local[f"{name}{c}"] = (whiten(base_row), leg_entry, wheel_entry, out[f"friction_{name}{c}"])
+                out[f"leg_entry_{name}{c}"] = leg_entry
         _friction_rows(lanes, i, corner, white, local, base, out)
     for r in range(6):
         out[f"base{r}"] = base[r]
@@ -150,13 +153,12 @@ def _inertia(lanes: Lanes, w_mid: Vector) -> tuple[list[list[Value]], list[Value
     return mass, bias, corners
 
 
-def _push_of_floor(
-    lanes: Lanes, i: int, corner: Corner, n: Vector, twist: Vector, step: Value, momentum: Vector, own: Vector, out: Out
-) -> None:
-    """Add the normal impulse of wheel ``i``."""
-    base_row, leg_entry = contact_row(corner.hip, corner.leg, corner.rim, n)
-    normal, gap_rate = _normal_force(lanes, i, corner, n, dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"])
-    out[f"normal{i}"], out[f"last_gap_rate{i}"] = normal, gap_rate
+def _push_of_floor(lanes: Lanes, contact: Contact, twist: Vector, step: Value, momentum: Vector, own: Vector, out: Out) -> None:
+    """Add the normal impulse of a contact."""
+    c, i = contact.number, contact.wheel
+    base_row, leg_entry = contact.row(contact.axes[0])
+    normal, gap_rate = _normal_force(lanes, contact, dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"])
+    out[f"normal{c}"], out[f"last_gap_rate{c}"] = normal, gap_rate
     for r in range(6):
         momentum[r] = momentum[r] + (step * normal) * base_row[r]
     own[0] = own[0] + (step * normal) * leg_entry
@@ -209,26 +211,18 @@ def _push_of_motors(
 
 
 def _friction_under_wheel(
-    lanes: Lanes,
-    i: int,
-    corner: Corner,
-    rows: Sequence[Sequence[Value]],
-    axes: tuple[Vector, Vector, Vector, Value],
-    twist: Vector,
-    features: frozenset[str],
-    out: Out,
+    lanes: Lanes, contact: Contact, rows: Sequence[Sequence[Value]], twist: Vector, features: frozenset[str], out: Out
 ) -> None:
-    """Find the friction coefficients under wheel ``i``, at its place and slip at the start of the kick."""
+    """Find the friction coefficients of a contact, at its place and slip at the start of the kick."""
     place: list[Value] = [0.0, 0.0]
     speed: Value = 0.0
     if "ground" in features:
-        points = (corner.hip, corner.leg, corner.rim)
-        place = contact_place(lanes, rows, points)
-        slip = slip_velocity(lanes, i, points, axes, twist, features)
+        place = contact_place(lanes, rows, contact)
+        slip = slip_velocity(lanes, contact, twist, features)
         speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
-    found = ground.friction(lanes, i, place[0], place[1], speed, features)
-    out[f"acting_mu_x{i}"], out[f"acting_mu_y{i}"] = found.mu_x, found.mu_y
-    out[f"acting_inverse_mu_x{i}"], out[f"acting_inverse_mu_y{i}"] = found.inverse_mu_x, found.inverse_mu_y
+    found, c = ground.friction(lanes, contact.wheel, place[0], place[1], speed, features), contact.number
+    out[f"acting_mu_x{c}"], out[f"acting_mu_y{c}"] = found.mu_x, found.mu_y
+    out[f"acting_inverse_mu_x{c}"], out[f"acting_inverse_mu_y{c}"] = found.inverse_mu_x, found.inverse_mu_y
 
 
 def _eliminate(corner: Corner, damping: tuple[Value, Value], own: Vector, momentum: Vector, reduced: list[list[Value]]) -> None:
@@ -282,9 +276,24 @@ def _friction_rows(
             gain = share * share * gain + out[f"rotor_gain{joint}"]
         if name[0] not in "xy":
             out[f"inverse_gain_{name}"] = 1.0 / gain
-    cross_gain = dot([out[f"z_x{i}_{r}"] for r in range(6)], [out[f"z_y{i}_{r}"] for r in range(6)])
-    own_gain = cross_gain + out[f"leg_entry_x{i}"] * out[f"g_leg_y{i}"]
-    out[f"gain_xy{i}"] = own_gain - out[f"rolling_radius{i}"] * out[f"g_wheel_y{i}"]
+    for contact in corner.contacts:
+        c = contact.number
+        cross_gain = dot([out[f"z_x{c}_{r}"] for r in range(6)], [out[f"z_y{c}_{r}"] for r in range(6)])
+        own_gain = cross_gain + out[f"leg_entry_x{c}"] * out[f"g_leg_y{c}"]
+        out[f"gain_xy{c}"] = own_gain - out[f"rolling_radius{c}"] * out[f"g_wheel_y{c}"]
+    if len(corner.contacts) == 2:
+        _coupling_of_contacts(i, out)
+
+
+def _coupling_of_contacts(i: int, out: Out) -> None:
+    """Slip along ``a`` at the first contact of wheel ``i`` by an impulse along ``b`` at its second, and the other way round."""
+    for a in "xy":
+        for b in "xy":
+            gain = dot([out[f"z_{a}{i}_{r}"] for r in range(6)], [out[f"z_{b}{i + 4}_{r}"] for r in range(6)])
+            gain = gain + out[f"leg_entry_{a}{i}"] * out[f"g_leg_{b}{i + 4}"]
+            if a == "x":
+                gain = gain - out[f"rolling_radius{i}"] * out[f"g_wheel_{b}{i + 4}"]
+            out[f"coupling_{a}{b}{i}"] = gain
 
 
 def _accumulate(
@@ -298,30 +307,37 @@ def _accumulate(
         bias[r] = bias[r] + value
 
 
-def _normal_force(lanes: Lanes, i: int, corner: Corner, n: Vector, gap_rate: Value) -> tuple[Value, Value]:
+def _normal_force(lanes: Lanes, contact: Contact, gap_rate: Value) -> tuple[Value, Value]:
     """Spring and damper at the middle position, never pulling. Returns the force (N) and the present gap rate (m/s)."""
-    point = [corner.hip[k] + corner.leg[k] + corner.rim[k] for k in range(3)]
-    gap = lanes["pz"] + dot(n, point)
-    mid_rate = gap_rate + lanes[f"look_ahead{i}"] * (gap_rate - lanes[f"last_gap_rate{i}"])
+    c, i = contact.number, contact.wheel
+    gap = contact.gap(lanes)
+    look_ahead = lanes[f"look_ahead{i}"]
+    if contact.depth is not None:  # a place that was not touched has had no rate: the normal may be another
+        look_ahead = ops.where_positive(lanes[f"normal{c}"], look_ahead, 0.0)
+    mid_rate = gap_rate + look_ahead * (gap_rate - lanes[f"last_gap_rate{c}"])
     push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * mid_rate, 0.0)
     return ops.where_positive(-gap, push, 0.0), gap_rate
 
 
-def _warm_start(lanes: Lanes, i: int, step: Value, features: frozenset[str], out: Out) -> None:
+def _warm_start(lanes: Lanes, i: int, contacts: Sequence[Contact], step: Value, features: frozenset[str], out: Out) -> None:
     """Start from the last step's impulses, shrunk into this step's bounds: descent must begin at an admissible point."""
     for j in (i, FIRST_WHEEL + i):
         bound = out[f"friction_bound{j}"]
         out[f"gear_friction{j}"] = ops.clip(lanes[f"gear_friction{j}"], -bound, bound)
     if "rolling_resistance" in features:
-        bound = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * out[f"normal{i}"])
+        normal = out[f"normal{i}"]
+        for contact in contacts[1:]:
+            normal = normal + out[f"normal{contact.number}"]
+        bound = (step * lanes[f"rolling{i}"]) * (lanes[f"radius{i}"] * normal)
         out[f"bound_rolling{i}"] = bound
         out[f"rolling_friction{i}"] = ops.clip(lanes[f"rolling_friction{i}"], -bound, bound)
-    out[f"bound{i}"] = step * out[f"normal{i}"]
-    x, y = (lanes[f"friction_{a}{i}"] * out[f"acting_inverse_mu_{a}{i}"] for a in "xy")
-    shrink = ops.minimum(out[f"bound{i}"] / ops.sqrt(x * x + y * y + 1e-30), 1.0)
-    for a in "xy":
-        limit = out[f"acting_mu_{a}{i}"] * out[f"bound{i}"]
-        out[f"friction_{a}{i}"] = ops.clip(lanes[f"friction_{a}{i}"] * shrink, -limit, limit)
+    for c in (contact.number for contact in contacts):
+        out[f"bound{c}"] = step * out[f"normal{c}"]
+        x, y = (lanes[f"friction_{a}{c}"] * out[f"acting_inverse_mu_{a}{c}"] for a in "xy")
+        shrink = ops.minimum(out[f"bound{c}"] / ops.sqrt(x * x + y * y + 1e-30), 1.0)
+        for a in "xy":
+            limit = out[f"acting_mu_{a}{c}"] * out[f"bound{c}"]
+            out[f"friction_{a}{c}"] = ops.clip(lanes[f"friction_{a}{c}"] * shrink, -limit, limit)
 
 
 def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]]:
@@ -374,7 +390,7 @@ def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
         base = [base[r] + scale * change[r] for r in range(6)]
         for i, start, dy, impulses in moved:
             out[f"y_leg{i}"], out[f"y_wheel{i}"] = start[0] + scale * dy[0], start[1] + scale * dy[1]
-            out[f"multiplier{i}"] = impulses.pop(f"multiplier{i}")
+            out |= {f"multiplier{c}": impulses.pop(f"multiplier{c}") for c in contact_numbers(i, features)}
             out |= {name: lanes[name] + scale * (new - lanes[name]) for name, new in impulses.items()}
     for r in range(6):
         out[f"base{r}"] = base[r]
@@ -400,7 +416,10 @@ def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str]) -> 
         new = ops.clip(old - rate * lanes[f"inverse_gain_rolling{i}"], -bound, bound)
         base, y = _apply(lanes, f"rolling{i}", z, new - old, base, y)
         out[f"rolling_friction{i}"] = new
-    base, y = _contact_block(lanes, i, base, y, features, out)
+    if len(contact_numbers(i, features)) == 2:
+        base, y = _contact_pair(lanes, i, base, y, features, out)
+    else:
+        base, y = _contact_block(lanes, i, base, y, features, out)
     return base, y, out
 
 
@@ -416,12 +435,12 @@ def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str])
         change = new[f"gear_friction{j}"] - old
         slope = slope + (lanes[f"rotor_free{j}"] + gain * old) * change
         curvature = curvature + gain * (change * change)
-    if "compliance" in features:
-        multiplier = ops.where_positive(lanes[f"creep_speed{i}"], new[f"multiplier{i}"], 0.0)
+    for c in contact_numbers(i, features) if "compliance" in features else ():
+        multiplier = ops.where_positive(lanes[f"creep_speed{i}"], new[f"multiplier{c}"], 0.0)
         for a in "xy":
-            inverse = lanes[f"acting_inverse_mu_{a}{i}"]
-            old = inverse * lanes[f"friction_{a}{i}"]
-            change = inverse * new[f"friction_{a}{i}"] - old
+            inverse = lanes[f"acting_inverse_mu_{a}{c}"]
+            old = inverse * lanes[f"friction_{a}{c}"]
+            change = inverse * new[f"friction_{a}{c}"] - old
             slope = slope + multiplier * (old * change)
             curvature = curvature + multiplier * (change * change)
     return slope, curvature
@@ -434,21 +453,74 @@ def _apply(lanes: Lanes, name: str, z: Vector, change: Value, base: Vector, y: V
     )
 
 
+#: Rounds over the two contacts of a wheel in one pass. They share the wheel's light spin, so that solving them one after the
+#: other takes away a third to two thirds of what is left.
+PAIR_ROUNDS = 2
+
+
+def _slip_of(lanes: Lanes, c: int, base: Vector, y: Vector) -> Vector:
+    """Slip (m/s) of contact ``c`` along heading and axle under the present impulses."""
+    zx, zy = ([lanes[f"z_{a}{c}_{r}"] for r in range(6)] for a in "xy")
+    slip_x = dot(zx, base) + lanes[f"leg_entry_x{c}"] * y[0] - lanes[f"rolling_radius{c}"] * y[1]
+    return [slip_x, dot(zy, base) + lanes[f"leg_entry_y{c}"] * y[0]]
+
+
 def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: frozenset[str], out: Out) -> tuple[Vector, Vector]:
-    """Exact 2x2 friction block of wheel ``i``: maximum dissipation on the ellipse (mu_x N, mu_y N).
+    """Solve the one contact of wheel ``i``."""
+    slip = _slip_of(lanes, i, base, y)
+    new, out[f"multiplier{i}"] = _friction_block(lanes, i, slip, lanes[f"multiplier{i}"], features)
+    return _move_contact(lanes, i, new, base, y, out)
+
+
+def _contact_pair(lanes: Lanes, i: int, base: Vector, y: Vector, features: frozenset[str], out: Out) -> tuple[Vector, Vector]:
+    """Solve both contacts of wheel ``i`` in turn, :data:`PAIR_ROUNDS` times, each knowing what the other has changed."""
+    pair = (i, i + 4)
+    slips = {c: _slip_of(lanes, c, base, y) for c in pair}
+    new: dict[int, Vector] = {c: [lanes[f"friction_{a}{c}"] for a in "xy"] for c in pair}
+    multipliers = {c: lanes[f"multiplier{c}"] for c in pair}
+    for _ in range(PAIR_ROUNDS):
+        for c, other in (pair, pair[::-1]):
+            change = [new[other][k] - lanes[f"friction_{a}{other}"] for k, a in enumerate("xy")]
+            gains = [[lanes[f"coupling_{a}{b}{i}" if c == i else f"coupling_{b}{a}{i}"] for b in "xy"] for a in "xy"]
+            slip = [slips[c][k] + dot(gains[k], change) for k in range(2)]
+            new[c], multipliers[c] = _friction_block(lanes, c, slip, multipliers[c], features)
+    for c in pair:
+        out[f"multiplier{c}"] = multipliers[c]
+        base, y = _move_contact(lanes, c, new[c], base, y, out)
+    return base, y
+
+
+def _move_contact(lanes: Lanes, c: int, new: Vector, base: Vector, y: Vector, out: Out) -> tuple[Vector, Vector]:
+    """Put new friction impulses of contact ``c`` in the place of the old ones."""
+    zx, zy = ([lanes[f"z_{a}{c}_{r}"] for r in range(6)] for a in "xy")
+    out[f"friction_x{c}"], out[f"friction_y{c}"] = new
+    base, y = _apply(lanes, f"x{c}", zx, new[0] - lanes[f"friction_x{c}"], base, y)
+    return _apply(lanes, f"y{c}", zy, new[1] - lanes[f"friction_y{c}"], base, y)
+
+
+def _friction_block(lanes: Lanes, c: int, slip: Vector, multiplier: Value, features: frozenset[str]) -> tuple[Vector, Value]:
+    """Exact 2x2 friction block of contact ``c``: maximum dissipation on the ellipse (mu_x N, mu_y N).
 
     In impulses scaled by mu, min 1/2 p'Ap + b'p over |p| <= step N. On the circle (A + multiplier) p = -b; the
     multiplier is improved by one Newton step on 1/|p| per sweep and carried from step to step. With creep the multiplier is
     that at which |p| = step N tanh(slip speed/creep_speed).
+
+    Args:
+        lanes: of the sweep.
+        c: contact.
+        slip: under the impulses of the lanes, m/s.
+        multiplier: so far.
+        features: families that are traced.
+
+    Returns:
+        The new impulses along heading and axle (N s), and the new multiplier.
     """
-    zx, zy = ([lanes[f"z_{a}{i}_{r}"] for r in range(6)] for a in "xy")
-    slip_x = dot(zx, base) + lanes[f"leg_entry_x{i}"] * y[0] - lanes[f"rolling_radius{i}"] * y[1]
-    slip_y = dot(zy, base) + lanes[f"leg_entry_y{i}"] * y[0]
-    mu_x, mu_y, bound = lanes[f"acting_mu_x{i}"], lanes[f"acting_mu_y{i}"], lanes[f"bound{i}"]
-    old_x, old_y = lanes[f"friction_x{i}"], lanes[f"friction_y{i}"]
-    gain_x, gain_y, gain_xy = lanes[f"gain_x{i}"], lanes[f"gain_y{i}"], lanes[f"gain_xy{i}"]
-    b_x = mu_x * (slip_x - gain_x * old_x - gain_xy * old_y)
-    b_y = mu_y * (slip_y - gain_xy * old_x - gain_y * old_y)
+    i = c % len(CORNERS)
+    mu_x, mu_y, bound = lanes[f"acting_mu_x{c}"], lanes[f"acting_mu_y{c}"], lanes[f"bound{c}"]
+    old_x, old_y = lanes[f"friction_x{c}"], lanes[f"friction_y{c}"]
+    gain_x, gain_y, gain_xy = lanes[f"gain_x{c}"], lanes[f"gain_y{c}"], lanes[f"gain_xy{c}"]
+    b_x = mu_x * (slip[0] - gain_x * old_x - gain_xy * old_y)
+    b_y = mu_y * (slip[1] - gain_xy * old_x - gain_y * old_y)
     a11 = mu_x * mu_x * gain_x + 1e-9
     a22 = mu_y * mu_y * gain_y + 1e-9
     a12 = mu_x * mu_y * gain_xy
@@ -458,7 +530,6 @@ def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: froz
         inverse = 1.0 / (c11 * c22 - a12 * a12)
         return (a12 * b_y - c22 * b_x) * inverse, (a12 * b_x - c11 * b_y) * inverse, c11, c22, inverse
 
-    multiplier = lanes[f"multiplier{i}"]
     least: Value = 0.0
     if "compliance" in features:  # the slope of tanh at rest
         least = ops.minimum(lanes[f"creep_speed{i}"] * ops.minimum(mu_x, mu_y) / (bound + 1e-9), 1e6)
@@ -468,29 +539,25 @@ def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: froz
     curvature = (p_x * p_x * c22 - 2.0 * (a12 * p_x * p_y) + p_y * p_y * c11) * inverse + 1e-30
     better = multiplier + square * (ops.sqrt(square) - bound) / (curvature * (bound + 1e-9))
     if "compliance" in features:
-        creeping = _creep_multiplier(lanes, i, multiplier, (p_x, p_y), square, curvature)
+        creeping = _creep_multiplier(lanes, c, multiplier, (p_x, p_y), square, curvature)
         better = ops.where_positive(lanes[f"creep_speed{i}"], creeping, better)
     multiplier = ops.clip(better, least, 1e6)
     p_x, p_y, *_ = impulse(multiplier)
     shrink = ops.minimum(bound / ops.sqrt(p_x * p_x + p_y * p_y + 1e-30), 1.0)
-    new_x, new_y = mu_x * p_x * shrink, mu_y * p_y * shrink
-    out[f"multiplier{i}"] = multiplier
-    out[f"friction_x{i}"], out[f"friction_y{i}"] = new_x, new_y
-    base, y = _apply(lanes, f"x{i}", zx, new_x - old_x, base, y)
-    return _apply(lanes, f"y{i}", zy, new_y - old_y, base, y)
+    return [mu_x * p_x * shrink, mu_y * p_y * shrink], multiplier
 
 
 def _creep_multiplier(
-    lanes: Lanes, i: int, multiplier: Value, p: tuple[Value, Value], square: Value, curvature: Value
+    lanes: Lanes, c: int, multiplier: Value, p: tuple[Value, Value], square: Value, curvature: Value
 ) -> Value:
     """One Newton step on 1/|p| = 1/(step N tanh(slip speed/creep_speed)), where the slip is -multiplier p/mu.
 
     The slope of the slip speed is that of equal mu along both axes; unequal ones only make convergence linear.
     """
     size = ops.sqrt(square)
-    unscaled = [p[k] * lanes[f"acting_inverse_mu_{a}{i}"] for k, a in enumerate("xy")]
+    unscaled = [p[k] * lanes[f"acting_inverse_mu_{a}{c}"] for k, a in enumerate("xy")]
     reach = ops.sqrt(unscaled[0] * unscaled[0] + unscaled[1] * unscaled[1])
-    share, slope = ground.creep_share(lanes, i, multiplier * reach)
-    target = lanes[f"bound{i}"] * share + 1e-30
-    rise = lanes[f"bound{i}"] * slope * reach * ops.maximum(1.0 - multiplier * curvature / square, 0.0)
+    share, slope = ground.creep_share(lanes, c % len(CORNERS), multiplier * reach)
+    target = lanes[f"bound{c}"] * share + 1e-30
+    rise = lanes[f"bound{c}"] * slope * reach * ops.maximum(1.0 - multiplier * curvature / square, 0.0)
     return multiplier + (size - target) / (target * curvature / square + size * rise / target)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.snapshot import RowStore, Snapshot
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
-from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants import drive, ground, relief
 from wlr_gym.physics.plants.base import MEMORY, Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.gibbs_appell import kernel
 from wlr_gym.physics.plants.gibbs_appell.kinematics import STORED, TURN
@@ -164,7 +164,7 @@ class GibbsAppellPlant(Simulator):
         _scatter(self._lanes, self._width, rows, lanes)
 
     def _choose_kernel(self) -> None:
-        features = drive.families(self.parameters) | ground.families(self.parameters)
+        features = drive.families(self.parameters) | ground.families(self.parameters) | relief.families(self.parameters)
         if self._formulas:
             features.add("forces")
         if "compliance" in features:  # its line search rounds otherwise beside rotors with play: the same bits with and without

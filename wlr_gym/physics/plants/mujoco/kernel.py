@@ -26,12 +26,12 @@ from wlr_gym.physics.codegen import (
     source_of,
     straight_line_source,
 )  # fmt: skip
-from wlr_gym.physics.plants import base, drive, ground
+from wlr_gym.physics.plants import base, drive, ground, relief
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import kinematics
 from wlr_gym.physics.plants.gibbs_appell import step as engine
 from wlr_gym.physics.plants.mujoco import step as source
-from wlr_gym.physics.plants.mujoco.step import CORNERS, STATE
+from wlr_gym.physics.plants.mujoco.step import CONTACTS, CORNERS, STATE
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -50,6 +50,7 @@ PARAMETER_LANES: tuple[str, ...] = (
     *(f"joint_armature{j}" for j in range(8)),
     *drive.DRIVE_LANES,
     *ground.GROUND_LANES,
+    *relief.RELIEF_LANES,
 )
 
 
@@ -77,6 +78,7 @@ def pack(parameters: Parameters, robot: Robot, step: float) -> Array:
         | ground.by_column("joint_armature", range(8), drive.joint_armature(parameters))
         | drive.pack(parameters, robot, step, moved_inertia(parameters))
         | ground.pack(parameters)
+        | relief.pack(parameters, robot)
     )
     lanes |= {f"{name}{i}": corners[name][:, i] for name in _CORNER_LANES for i in range(4)}
     return np.stack([lanes[name] for name in PARAMETER_LANES], axis=1)
@@ -115,19 +117,19 @@ Array = NDArray[np.float64]
 #: forces and contact sensors; own state; parameter lanes; the tick's inputs; formula forces; what a step reads.
 _FLAT = (
     "qpos", "qvel", "constraint", "contact", "state", "parameters", "setpoints", "old_setpoints", "switch_time", "on",
-    "generalised", "applied", "armature", "gear_bound", "pair_margin",
+    "generalised", "applied", "armature", "gear_bound",
 )  # fmt: skip
-#: These have four rows per robot, one per wheel.
-_PER_WHEEL = ("pair_friction", "geom_size", "geom_pos", "geom_quat")
+#: These have a row per contact of a robot; the last two only on relief.
+_PER_CONTACT = ("pair_friction", "pair_margin", "geom_size", "geom_pos", "geom_quat", "plane_pos", "plane_quat")
 
 
-def addresses(flat: Sequence[Array], per_wheel: Sequence[Array]) -> NDArray[np.intp]:
-    """Return where every robot's rows lie in memory, (N, rows per robot).
+def addresses(flat: Sequence[Array], per_contact: Sequence[Array]) -> NDArray[np.intp]:
+    """Return where every robot's rows lie in memory, (N, rows per robot); ``per_contact``: arrays (N, contacts, ...).
 
     Unpacking twenty array arguments takes numba longer than computing a robot's step, so the kernels get this one table. It
     holds for as long as the arrays live.
     """
-    return np.hstack([_row_addresses(array).reshape(len(array), -1) for array in (*flat, *per_wheel)])
+    return np.hstack([_row_addresses(array).reshape(len(array), -1) for array in (*flat, *per_contact)])
 
 
 def _row_addresses(array: Array) -> NDArray[np.intp]:
@@ -135,58 +137,66 @@ def _row_addresses(array: Array) -> NDArray[np.intp]:
     return array.ctypes.data + offsets
 
 
-def _columns(array: str, names: Sequence[str]) -> dict[str, str]:
-    return {name: f"{array}[{k}]" for k, name in enumerate(names)}
-
-
-_PLACES: dict[str, str] = (
-    _columns("qpos", source.POSITION)
-    | _columns("qvel", source.VELOCITY)
-    | _columns("constraint", source.CONSTRAINT)
-    | _columns("contact", source.CONTACT)
-    | _columns("state", STATE)
-    | _columns("parameters", PARAMETER_LANES)
-    | _columns("setpoints", [f"goal{j}" for j in range(8)])
-    | _columns("old_setpoints", [f"old_goal{j}" for j in range(8)])
-    | _columns("switch_time", [f"switch_time{j}" for j in range(8)])
-    | _columns("on", [f"on{j}" for j in range(8)])
-    | {name: f"generalised[{k} * count]" for k, name in enumerate(source.FORMULA)}  # the formulas' kernel has robots in columns
-    | _columns("applied", [f"applied_{name}" for name in source.VELOCITY])
-    | _columns("armature", [f"armature_{name}" for name in source.VELOCITY])
-    | _columns("gear_bound", [f"gear_bound_{name}" for name in source.VELOCITY])
-    | _columns("pair_margin", [f"margin{i}" for i in CORNERS])
-    # a capsule's first tangent runs along its axis: the axle
-    | {f"friction_{a}{i}": f"pair_friction{i}[{k}]" for i in CORNERS for k, a in enumerate("yx")}
-    | {f"geom_radius{i}": f"geom_size{i}[0]" for i in CORNERS}
-    | {f"geom_{a}{i}": f"geom_pos{i}[{k}]" for i in CORNERS for k, a in enumerate("xyz")}
-    | {f"geom_q{a}{i}": f"geom_quat{i}[{k}]" for i in CORNERS for k, a in enumerate("wxy")}
-)
-_ROWS = (*_FLAT, *(f"{name}{i}" for name in _PER_WHEEL for i in CORNERS))
+_LABELS = {
+    "qpos": source.POSITION,
+    "qvel": source.VELOCITY,
+    "constraint": source.CONSTRAINT,
+    "contact": source.CONTACT,
+    "state": STATE,
+    "parameters": PARAMETER_LANES,
+    "setpoints": [f"goal{j}" for j in range(8)],
+    "old_setpoints": [f"old_goal{j}" for j in range(8)],
+    "switch_time": [f"switch_time{j}" for j in range(8)],
+    "on": [f"on{j}" for j in range(8)],
+    "applied": [f"applied_{name}" for name in source.VELOCITY],
+    "armature": [f"armature_{name}" for name in source.VELOCITY],
+    "gear_bound": [f"gear_bound_{name}" for name in source.VELOCITY],
+}
+_PLACES: dict[str, str] = {name: f"{array}[{k}]" for array, names in _LABELS.items() for k, name in enumerate(names)} | {
+    name: f"generalised[{k} * count]" for k, name in enumerate(source.FORMULA)
+}  # the formulas' kernel has robots in columns
+_PLACES |= {
+    name: place
+    for c in CONTACTS
+    for name, place in (
+        # a capsule's first tangent runs along its axis: the axle
+        *((f"friction_{a}{c}", f"pair_friction{c}[{k}]") for k, a in enumerate("yx")),
+        (f"margin{c}", f"pair_margin{c}[0]"),
+        (f"geom_radius{c}", f"geom_size{c}[0]"),
+        *((f"geom_{a}{c}", f"geom_pos{c}[{k}]") for k, a in enumerate("xyz")),
+        *((f"geom_q{a}{c}", f"geom_quat{c}[{k}]") for k, a in enumerate("wxy")),
+        *((f"plane_{a}{c}", f"plane_pos{c}[{k}]") for k, a in enumerate("xyz")),
+        *((f"plane_q{a}{c}", f"plane_quat{c}[{k}]") for k, a in enumerate("wxyz")),
+    )
+}
 _SCALARS = ("step", "time", "duration")
 
 
-def trace() -> dict[str, dict[str, Any]]:
+def trace(features: frozenset[str]) -> dict[str, dict[str, Any]]:
     """Trace all blocks: name -> outputs."""
     owner = Graph()
     lanes = Inputs(owner)
     step = owner.input("step")
     return {
         "drift": source.drift(lanes, owner.input("duration")),
-        "before": source.before(lanes, owner.input("time"), step),
-        "after": source.after(lanes, step),
-        "features": source.formula_inputs(lanes),
-        "observe": source.observe(lanes),
+        "before": source.before(lanes, owner.input("time"), step, features),
+        "after": source.after(lanes, step, features),
+        "features": source.formula_inputs(lanes, features),
+        "observe": source.observe(lanes, features),
     }
 
 
-def kernel_source() -> str:
+def kernel_source(features: frozenset[str]) -> str:
     """Return the kernel module's source."""
-    blocks = trace()
+    blocks = trace(features)
+    contacts = CONTACTS if "relief" in features else CORNERS
+    per_contact = _PER_CONTACT if "relief" in features else _PER_CONTACT[:5]
+    names = (*_FLAT, *(f"{name}{c}" for name in per_contact for c in contacts))
     observed = {name: f"truth[{k}]" for k, name in enumerate(blocks["observe"])}
     for k, name in enumerate(list(observed)[TRUTH_LAYOUT.width :]):
         observed[name] = f"raw[{k}]" if k < RAW_LAYOUT.width - 1 else name
     named = {name: f"inputs[{k} * count + i]" for k, name in enumerate(base.INPUTS)}
-    rows = [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(_ROWS)]
+    rows = [f"        {name} = array_at(table[i, {k}])" for k, name in enumerate(names)]
     lines = []
     for block, outputs in blocks.items():
         used = inputs_of(outputs.values())
@@ -203,14 +213,14 @@ def kernel_source() -> str:
         signature = "" if block == "features" else _signature(len(own), len(scalars))
         pointers = [f"numbers_of({name})" if block == "features" else f"numbers_of({name}[i])" for name in own]
         lines += [
-            *straight_line_source(f"{block}_of_robot", [*_ROWS, *own, "i", "count", *scalars], body),
+            *straight_line_source(f"{block}_of_robot", [*names, *own, "i", "count", *scalars], body),
             "",
             f"@njit({signature}cache=True, nogil=True, error_model='numpy')",
             f"def {block}({', '.join(['table', 'rows', *own, *scalars])}):",
             "    count = len(table)",
             "    for i in rows:",
             *rows,
-            f"        {block}_of_robot({', '.join([*_ROWS, *pointers, 'i', 'count', *scalars])})",
+            f"        {block}_of_robot({', '.join([*names, *pointers, 'i', 'count', *scalars])})",
             "",
         ]
     return "\n".join(["from numba import types", "", *lines])
@@ -222,14 +232,15 @@ def _signature(own: int, scalars: int) -> str:
     return f"types.void({', '.join(kinds)}), "
 
 
-def load_kernel() -> ModuleType:
-    """Load (first use: generate and compile) the kernel module."""
+def load_kernel(features: frozenset[str]) -> ModuleType:
+    """Load (first use: generate and compile) the kernel module for level floors, or for relief."""
     message = "wlr_gym: compiling the MuJoCo plant's kernel; some seconds, once on this machine"
-    return load_module("mujoco_plant", kernel_source, message, _SOURCE_KEY)
+    tag = "mujoco_plant_relief" if "relief" in features else "mujoco_plant"
+    return load_module(tag, lambda: kernel_source(features), message, _SOURCE_KEY)
 
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    source, engine, kinematics, base, servo, drive, ground, ops, compilation, sys.modules[__name__]
+    source, engine, kinematics, base, servo, drive, ground, relief, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join([source_of(*TRACED), *PARAMETER_LANES, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"])

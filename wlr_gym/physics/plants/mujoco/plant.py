@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
+from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import COORDINATES, INPUTS, MEMORY, Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import Force, compile_forces
 from wlr_gym.physics.plants.mujoco.kernel import PARAMETER_LANES, addresses, load_kernel, pack
 from wlr_gym.physics.plants.mujoco.mjcf import build_model, principal_inertia
-from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH, STATE, TICK_SUMS
+from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH, FEATURES, ON_RELIEF, STATE, TICK_SUMS
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameter_table import SPECS
@@ -55,7 +56,6 @@ class MujocoPlant(Simulator):
                 "(in an agent's settings: environment.precision=float64)"
             )
         self._step = self.options.physics_step
-        self._batch = RobotBatch(robot, count, self._step, self.options.threads)
         self._state = np.zeros((count, len(STATE)))
         self._lanes = np.zeros((count, len(PARAMETER_LANES)))
         self._inputs = [np.zeros((count, 8)) for _ in range(4)]
@@ -64,14 +64,26 @@ class MujocoPlant(Simulator):
         self.set_force_values(np.tile(self._formulas.values if self._formulas else np.zeros(0), (count, 1)))
         self._generalised = np.zeros((len(COORDINATES), count))
         self._memory = np.zeros((len(MEMORY), count))
-        self._kernel = load_kernel()
-        batch = self._batch
+        self._use_model(on_relief=False)
+        self._start()
+
+    def _use_model(self, on_relief: bool) -> None:
+        """Make the batch for level floors or for relief, and load the kernel that goes with it."""
+        self._on_relief = on_relief
+        batch = self._batch = RobotBatch(self.robot, self._count, self._step, self.options.threads, on_relief)
+        self._kernel = load_kernel(ON_RELIEF if on_relief else FEATURES)
         flat = (
             batch.qpos, batch.qvel, batch.constraint, batch.contact, self._state, self._lanes, *self._inputs,
-            self._generalised.T, batch.applied, batch.armature, batch.gear_bound, batch.pair_margin,
+            self._generalised.T, batch.applied, batch.armature, batch.gear_bound,
         )  # fmt: skip
-        self._table = addresses(flat, (batch.pair_friction, batch.geom_size, batch.geom_pos, batch.geom_quat))
-        self._start()
+        self._table = addresses(flat, batch.per_contact)
+
+    def _move_to_relief(self) -> None:
+        """The first piece, wave or bump of any robot: every robot goes on in the model that knows of them."""
+        old, parameters = self._batch, self.parameters
+        self._use_model(on_relief=True)
+        self._batch.set_parameters(self._all, parameters)
+        self._batch.qpos[:], self._batch.qvel[:] = old.qpos, old.qvel
 
     @property
     def model(self) -> object:
@@ -82,6 +94,8 @@ class MujocoPlant(Simulator):
 
     def _use_parameters(self, rows: NDArray[np.intp], chosen: Parameters) -> None:
         self._lanes[rows] = pack(chosen, self.robot, self._step)
+        if not self._on_relief and relief.families(chosen):
+            self._move_to_relief()
         self._batch.set_parameters(rows, chosen)
 
     def _look(self, rows: NDArray[np.intp]) -> None:
@@ -191,18 +205,27 @@ _GEOMETRY = ("body", "payload", "leg", "wheel", "hip")
 _INERTIAL = (*(name for name in SPECS if name.partition(".")[0] in _GEOMETRY and name != "wheel.grip"), "servo.armature")
 
 
-def build_batch_model(robot: Robot, physics_step: float) -> mujoco.MjModel:
-    """Return the model that all robots of a batch share."""
+def build_batch_model(robot: Robot, physics_step: float, on_relief: bool = False) -> mujoco.MjModel:
+    """Return the model that all robots of a batch share.
+
+    On relief each of a wheel's two contacts has a geom and a plane of its own, which are placed before every step. (MuJoCo's
+    height field would not do: each of its prisms is a contact with a spring of its own, on which wheels shake.)
+    """
 
     def extend(spec: mujoco.MjSpec) -> None:
         option = spec.option
         option.integrator = mujoco.mjtIntegrator.mjINT_EULER
         option.impratio = (1.0 - CONTACT_IMPEDANCE) / CONTACT_IMPEDANCE / FRICTION_SOFTNESS
         option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET) | int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
-        for name in WHEELS:
-            _add_force_sensor(spec, name)
+        if on_relief:
+            _add_planes(spec)
+        for geom, floor in zip(SECOND_GEOMS if on_relief else WHEELS, PLANES if on_relief else ["floor"] * 4, strict=True):
+            _add_force_sensor(spec, geom, floor)
 
-    model = build_model(robot, Parameters.nominal(robot), physics_step=physics_step, wheel_shape="capsule", extend=extend)
+    parameters = Parameters.nominal(robot)
+    model = build_model(
+        robot, parameters, contacts=not on_relief, physics_step=physics_step, wheel_shape="capsule", extend=extend
+    )
     model.dof_damping[:] = 0.0
     model.dof_solref[:] = -1.0, -GEAR_IMPEDANCE / physics_step
     model.dof_solimp[:, :2] = GEAR_IMPEDANCE
@@ -212,11 +235,28 @@ def build_batch_model(robot: Robot, physics_step: float) -> mujoco.MjModel:
     return model
 
 
-def _add_force_sensor(spec: mujoco.MjSpec, wheel: str) -> None:
+#: Geoms that touch on relief, and the planes that they touch, contact by contact.
+SECOND_GEOMS = (*WHEELS, *(f"{wheel}_second" for wheel in WHEELS))
+PLANES = tuple(f"floor_of_{name}" for name in SECOND_GEOMS)
+
+
+def _add_planes(spec: mujoco.MjSpec) -> None:
+    for contact, (name, plane) in enumerate(zip(SECOND_GEOMS, PLANES, strict=True)):
+        if contact >= len(WHEELS):
+            first = spec.geom(WHEELS[contact % len(WHEELS)])
+            spec.body(WHEELS[contact % len(WHEELS)]).add_geom(
+                name=name, type=first.type, size=first.size, quat=first.quat, contype=0, conaffinity=0, group=3
+            )
+        body = spec.worldbody.add_body(name=plane, mocap=True)
+        body.add_geom(name=plane, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], contype=0, conaffinity=0, group=3)
+        spec.add_pair(geomname1=plane, geomname2=name, condim=3)
+
+
+def _add_force_sensor(spec: mujoco.MjSpec, wheel: str, floor: str) -> None:
     """Total force of the floor on a wheel, in the floor frame."""
     geom = mujoco.mjtObj.mjOBJ_GEOM
     sensor = spec.add_sensor(
-        name=wheel, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom, objname="floor", reftype=geom, refname=wheel
+        name=wheel, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=geom, objname=floor, reftype=geom, refname=wheel
     )
     net_force = 3
     sensor.intprm = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), net_force, 1]
@@ -227,22 +267,22 @@ class RobotBatch:
 
     Attributes:
         qpos, qvel, applied, warmstart, constraint, contact: live arrays (N, ...) of MuJoCo's state, inputs and results.
-        armature, gear_bound, pair_friction, pair_margin, geom_size, geom_pos, geom_quat: live model fields (N, ...); the last
-            three of the four geoms that touch.
+        armature, gear_bound: live model fields (N, ...).
+        per_contact: live arrays (N, contacts, ...): friction and margin of the pair, size, position and attitude of the geom
+            that touches, and, on relief, position and attitude of the plane; of the wheels' first and of their second contacts.
     """
 
-    def __init__(self, robot: Robot, count: int, physics_step: float, threads: int) -> None:
-        self.model = model = build_batch_model(robot, physics_step)
+    def __init__(self, robot: Robot, count: int, physics_step: float, threads: int, on_relief: bool = False) -> None:
+        self.model = model = build_batch_model(robot, physics_step, on_relief)
         self._batch = batch = Batch(model, count, threads)
         self._body = {name: model.body(name).id for name in ("body", "payload", *LEGS, *WHEELS)}
-        self.geoms = [model.geom(name).id for name in WHEELS]
-        start, stride = self.geoms[0], self.geoms[1] - self.geoms[0]
-        touching = slice(start, start + 3 * stride + 1, stride)
+        self.geoms = [model.geom(name).id for name in (SECOND_GEOMS if on_relief else WHEELS)]
+        self._wheels = [self._body[name] for name in WHEELS] * (len(self.geoms) // len(WHEELS))
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
         self.applied, self.warmstart = batch.bind("qfrc_applied"), batch.bind("qacc_warmstart")
         self.constraint, self.contact = batch.bind("qfrc_constraint"), batch.bind("sensordata")
         self.armature, self.gear_bound = batch.expand("dof_armature"), batch.expand("dof_frictionloss")
-        self.pair_friction, self.pair_margin = batch.expand("pair_friction"), batch.expand("pair_margin")
+        friction, margin = batch.expand("pair_friction"), batch.expand("pair_margin")[:, :, None]
         self._solref = batch.expand("pair_solref")
         self._gravity = batch.expand("opt.gravity")
         self._mass, self._inertia = batch.expand("body_mass"), batch.expand("body_inertia")
@@ -253,8 +293,12 @@ class RobotBatch:
         self._inverse_weight = batch.expand("body_invweight0")
         for derived in ("dof_invweight0", "body_subtreemass", "dof_M0"):
             batch.expand(derived)
-        self.geom_size, self.geom_pos, self.geom_quat = (field[:, touching] for field in (self._size, self._pos, self._quat))
-        self.geom_size[:, :, 1] = CAPSULE_HALF_LENGTH
+        self._size[:, self.geoms, 1] = CAPSULE_HALF_LENGTH
+        pairs = [int(np.flatnonzero((model.pair_geom1 == geom) | (model.pair_geom2 == geom))[0]) for geom in self.geoms]
+        self.per_contact = [view for field in (friction, margin) for view in _in_steps(field, pairs)]
+        self.per_contact += [view for field in (self._size, self._pos, self._quat) for view in _in_steps(field, self.geoms)]
+        if on_relief:
+            self.per_contact += [batch.bind("mocap_pos"), batch.bind("mocap_quat")]
         self._known: Array | None = None
 
     def set_parameters(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
@@ -297,21 +341,22 @@ class RobotBatch:
     def _derive_constants(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
         """Run mj_setConst with the rotors' own inertia and the touching geoms anywhere but in their wheels' frame."""
         self.armature[rows[:, None], 6 + np.array([0, 2, 4, 6, 1, 3, 5, 7])] = parameters["servo.armature"]
-        self.geom_pos[rows] = 0.0, CAPSULE_HALF_LENGTH, 0.0
-        self.geom_quat[rows] = np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0
+        touching = rows[:, None], self.geoms
+        self._pos[touching] = 0.0, CAPSULE_HALF_LENGTH, 0.0
+        self._quat[touching] = np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0
         self._batch.set_const(rows)
-        self._bound[rows[:, None], self.geoms] = BOUND
-        self.geom_quat[rows, :, 3] = 0.0
+        self._bound[touching] = BOUND
+        self._quat[(*touching, 3)] = 0.0
 
     def _set_contact_springs(self, rows: NDArray[np.intp], parameters: Parameters) -> None:
         """Set ``solref`` to the parameters' spring and damper: MuJoCo scales it by the contact's apparent mass at home.
 
         MuJoCo: force = (K d pos + B vel)/R with K = solref0/d^2, B = solref1/d, R = (1 - d)/d/apparent mass.
         """
-        wheels = [self._body[name] for name in WHEELS]
-        scale = (1.0 - CONTACT_IMPEDANCE) * self._inverse_weight[rows[:, None], wheels, 0]
-        self._solref[rows, :, 0] = -scale * parameters["ground.normal_stiffness"]
-        self._solref[rows, :, 1] = -scale * parameters["ground.normal_damping"]
+        scale = (1.0 - CONTACT_IMPEDANCE) * self._inverse_weight[rows[:, None], self._wheels, 0]
+        each = np.arange(len(self.geoms)) % len(WHEELS)
+        self._solref[rows, :, 0] = -scale * parameters["ground.normal_stiffness"][:, each]
+        self._solref[rows, :, 1] = -scale * parameters["ground.normal_damping"][:, each]
 
     def divide_virtual_mass(self, divisor: float) -> None:
         """Make the mass that the impedance adds to contacts, and its push on sliding wheels, ``divisor`` times smaller.
@@ -325,8 +370,8 @@ class RobotBatch:
     def stores(self) -> dict[str, RowStore]:
         """Return what a step takes from the one before it."""
         names = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")
-        moving = ("pair_friction", "pair_margin", "geom_size", "geom_pos", "geom_quat")
-        return {name: getattr(self, name) for name in (*names, *moving)}
+        contacts = {f"contact{number}": values for number, values in enumerate(self.per_contact)}
+        return {name: getattr(self, name) for name in names} | contacts
 
     def model_of(self, robot: int) -> mujoco.MjModel:
         """Return a copy of the model with the numbers of one robot."""
@@ -335,3 +380,9 @@ class RobotBatch:
     def step(self) -> None:
         """One MuJoCo step of every robot."""
         self._batch.step()
+
+
+def _in_steps(field: Array, numbers: Sequence[int]) -> list[Array]:
+    """Return views (N, 4, ...) of rows of a model field (N, K, ...): of each four, which follow each other in equal steps."""
+    stride = numbers[1] - numbers[0]
+    return [field[:, start : start + 3 * stride + 1 : stride] for start in numbers[:: len(WHEELS)]]

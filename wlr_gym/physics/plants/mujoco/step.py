@@ -22,6 +22,8 @@ from __future__ import annotations
 
 import math
 from collections import ChainMap
+from functools import reduce
+from operator import add
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
@@ -30,22 +32,27 @@ from wlr_gym.physics.plants.base import COORDINATES
 from wlr_gym.physics.plants.gibbs_appell import step as engine
 from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     AXES,
+    CONTACTS,
     CORNERS,
     INPUTS_OF_FORMULAS,
+    Contact,
+    axes_on,
+    contact_numbers,
+    contacts_of,
     cross,
     dot,
-    floor_axes,
     rolling_contact,
     rotation_rows,
     slip_velocity,
     to_body,
     vector,
-    wheel_points,
 )
 from wlr_gym.robot import FIRST_WHEEL
 
-#: Families of effects: always all, so that no robot's bits can depend on what its neighbours have.
+#: Families of effects: always all, so that no robot's bits can depend on what its neighbours have. On a floor with relief,
+#: :data:`ON_RELIEF`: MuJoCo's model is then another one.
 FEATURES = frozenset({"drive", "backlash", "ground", "compliance"})
+ON_RELIEF = FEATURES | {"relief", "waves", "bumps", "piece", "pieces"}
 
 #: MuJoCo's state by lane: ``qpos`` and ``qvel``. Joints along the tree: leg, wheel, leg, wheel, ...
 POSITION: tuple[str, ...] = (
@@ -60,7 +67,7 @@ VELOCITY: tuple[str, ...] = (
 )
 #: MuJoCo's results by lane: ``qfrc_constraint`` and the contact sensors (force on the wheel, floor frame).
 CONSTRAINT: tuple[str, ...] = tuple(f"constraint_{name}" for name in VELOCITY)
-CONTACT: tuple[str, ...] = tuple(f"floor_{a}{i}" for i in CORNERS for a in AXES)
+CONTACT: tuple[str, ...] = tuple(f"floor_{a}{c}" for c in CONTACTS for a in AXES)
 #: Generalised forces of formulas.
 FORMULA: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
 
@@ -70,16 +77,17 @@ STATE: tuple[str, ...] = (
     *drive.STATE,
     *(f"gyro_{a}" for a in AXES),
     *(f"acceleration_{a}" for a in AXES),
-    *(f"own_force_{a}{i}" for i in CORNERS for a in "xy"),
+    *(f"own_force_{a}{c}" for c in CONTACTS for a in "xy"),
     *(f"rolling_torque{i}" for i in CORNERS),
     *(f"old_spin{i}" for i in CORNERS),
     *(f"old_{v}{a}" for v in "uw" for a in AXES),
     *(f"old_rate{j}" for j in range(8)),
     *(f"{name}{j}" for j in range(8) for name in _KEPT),
-    *(f"heading_{a}{i}" for i in CORNERS for a in "xy"),
-    *(f"leg_arm_{a}{i}" for i in CORNERS for a in AXES),
-    *(f"rolling_radius{i}" for i in CORNERS),
-    *(f"force_{a}{i}" for i in CORNERS for a in AXES),
+    *(f"heading_{a}{c}" for c in CONTACTS for a in AXES),
+    *(f"normal_{a}{c}" for c in CONTACTS for a in AXES),
+    *(f"leg_arm_{a}{c}" for c in CONTACTS for a in AXES),
+    *(f"rolling_radius{c}" for c in CONTACTS),
+    *(f"force_{a}{c}" for c in CONTACTS for a in AXES),
     *(f"{name}{j}" for j in range(8) for name in ("motor_torque", "current_torque", "gear_torque")),
     *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
     "mechanical_energy",
@@ -128,11 +136,11 @@ def _drift_of_rotors(lanes: Lanes, duration: Value) -> Out:
 # ---- before a step ---------------------------------------------------------------------------------------------------
 
 
-def before(lanes: Lanes, time: Value, step: Value) -> Out:
+def before(lanes: Lanes, time: Value, step: Value, features: frozenset[str] = FEATURES) -> Out:
     """Servos, loads, and this step's model fields."""
     lanes = with_engine_rates(lanes)
     rows = rotation_rows(lanes)
-    axes = floor_axes(rows)
+    level = axes_on(rows[2])
     out: Out = {f"old_{v}{a}": lanes[f"{v}{a}"] for v in "uw" for a in AXES}
     applied = _loads(lanes, rows)
     joints = [_joint(lanes, j) for j in range(8)]
@@ -142,7 +150,9 @@ def before(lanes: Lanes, time: Value, step: Value) -> Out:
         pushed = drive.push(lanes, j, voltages[j], joint, step, 0.5 * step, FEATURES)
         _push_joint(lanes, j, voltages[j], joint, pushed, step, applied, out)
     for i in CORNERS:
-        _push_wheel(lanes, i, rows, axes, step, applied, out)
+        contacts = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
+        pushed = [_push_contact(lanes, contact, rows, step, applied, out) for contact in contacts]
+        _turn_wheel(lanes, i, *(reduce(add, each) for each in zip(*pushed, strict=True)), step, applied, out)
     out |= {f"applied_{name}": value for name, value in applied.items()}
     return out
 
@@ -185,26 +195,32 @@ def _push_joint(
     out |= drive.kept_for_finish(pushed, j)
 
 
-def _push_wheel(
-    lanes: Lanes, i: int, rows: list[Vector], axes: tuple[Vector, Vector, Vector, Value], step: Value, applied: Out, out: Out
-) -> None:
-    """Everything between wheel ``i`` and the floor."""
-    n, heading, lateral, scale = axes
-    hip, leg, rim = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
-    point = [hip[k] + leg[k] + rim[k] for k in range(3)]
+def _push_contact(lanes: Lanes, contact: Contact, rows: list[Vector], step: Value, applied: Out, out: Out) -> Vector:
+    """Everything between a wheel and the floor at one contact but rolling resistance.
+
+    Returns:
+        The normal force (N), and the torque (N m) of the creep force about hip and axle.
+    """
+    c, i, (n, heading, lateral, _) = contact.number, contact.wheel, contact.axes
+    leg, rim, point = contact.leg, contact.rim, contact.point
     arm = [leg[k] + rim[k] for k in range(3)]
     velocity = _point_velocity(lanes, i, point, arm, rim)
-    gap = lanes["pz"] + dot(n, point)
-    rise, out[f"rolling_radius{i}"] = rolling_contact(lanes, i, (hip, leg, rim), n, scale, FEATURES)
+    gap = contact.gap(lanes)
+    rise, out[f"rolling_radius{c}"] = rolling_contact(lanes, contact, FEATURES)
     assert rise is not None  # FEATURES know of tyres that flatten
-    _place_sphere(lanes, i, n, scale, gap, dot(n, rise), out)
+    _place_sphere(lanes, contact, gap, dot(n, rise), out)
+    if contact.depth is not None:
+        _place_plane(lanes, contact, rows, out)
     approach = dot(n, velocity)
     point, arm, rim = ([x + y for x, y in zip(whole, rise, strict=True)] for whole in (point, arm, rim))
     velocity = _point_velocity(lanes, i, point, arm, rim)
 
-    out[f"heading_x{i}"], out[f"heading_y{i}"] = dot(rows[0], heading), dot(rows[1], heading)
+    for k, a in enumerate(AXES):
+        out[f"heading_{a}{c}"] = dot(rows[k], heading)
+        if contact.depth is not None:
+            out[f"normal_{a}{c}"] = dot(rows[k], n)
     for a, e in zip(AXES, (heading, lateral, n), strict=True):
-        out[f"leg_arm_{a}{i}"] = arm[2] * e[0] - arm[0] * e[2]
+        out[f"leg_arm_{a}{c}"] = arm[2] * e[0] - arm[0] * e[2]
 
     slip = [dot(heading, velocity), dot(lateral, velocity)]
     speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
@@ -212,25 +228,28 @@ def _push_wheel(
     mu = ground.friction(lanes, i, place[0], place[1], speed, FEATURES)
     creeps = lanes[f"creep_speed{i}"]
     for a, value in (("x", mu.mu_x), ("y", mu.mu_y)):
-        out[f"friction_{a}{i}"] = ops.where_positive(creeps, LEAST_MU, ops.maximum(value, LEAST_MU))
+        out[f"friction_{a}{c}"] = ops.where_positive(creeps, LEAST_MU, ops.maximum(value, LEAST_MU))
 
     push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * approach, 0.0)
     normal = ops.where_positive(-gap, push, 0.0)
     spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{FIRST_WHEEL + i}"]
-    rolling = rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{FIRST_WHEEL + i}"], step)
-    out[f"rolling_torque{i}"], out[f"old_spin{i}"] = rolling, lanes[f"wheel_rate{i}"]
-    creep = creep_force(lanes, i, mu, normal, slip, speed, spin_inertia, step)
+    creep = creep_force(lanes, contact, mu, normal, slip, speed, spin_inertia, step)
     for k, a in enumerate("xy"):
-        out[f"own_force_{a}{i}"] = creep[k] = ops.where_positive(creeps, creep[k], 0.0)
+        out[f"own_force_{a}{c}"] = creep[k] = ops.where_positive(creeps, creep[k], 0.0)
     force = [creep[0] * heading[k] + creep[1] * lateral[k] for k in range(3)]
     for k, a in enumerate(AXES):
         applied[f"u{a}"] = applied[f"u{a}"] + dot(rows[k], force)
     for name, value in zip(("wx", "wy", "wz"), cross(point, force), strict=True):
         applied[name] = applied[name] + value
+    return [normal, arm[2] * force[0] - arm[0] * force[2], rim[2] * force[0] - rim[0] * force[2]]
+
+
+def _turn_wheel(lanes: Lanes, i: int, normal: Value, swing: Value, spin: Value, step: Value, applied: Out, out: Out) -> None:
+    """Torques about hip and axle of wheel ``i``, which carries ``normal`` (N): of creep, and of rolling resistance."""
+    rolling = rolling_torque(lanes, i, normal, lanes[f"wheel_spin{i}"] + lanes[f"joint_armature{FIRST_WHEEL + i}"], step)
+    out[f"rolling_torque{i}"], out[f"old_spin{i}"] = rolling, lanes[f"wheel_rate{i}"]
     applied["wy"] = applied["wy"] + rolling
-    swing = arm[2] * force[0] - arm[0] * force[2]
     applied[f"joint_rate{i}"] = applied[f"joint_rate{i}"] + (swing + rolling)
-    spin = rim[2] * force[0] - rim[0] * force[2]
     applied[f"joint_rate{FIRST_WHEEL + i}"] = applied[f"joint_rate{FIRST_WHEEL + i}"] + (spin + rolling)
 
 
@@ -242,28 +261,44 @@ def _point_velocity(lanes: Lanes, i: int, point: Vector, arm: Vector, rim: Vecto
     return [lanes[f"v{a}"] + turned[k] + swing[k] for k, a in enumerate(AXES)]
 
 
-def _place_sphere(lanes: Lanes, i: int, n: Vector, scale: Value, gap: Value, rise: Value, out: Out) -> None:
-    """Place the capsule whose lower end stands for the disc of wheel ``i``, in the wheel's frame.
+def _place_sphere(lanes: Lanes, contact: Contact, gap: Value, rise: Value, out: Out) -> None:
+    """Place the capsule whose lower end stands for the wheel at a contact, in the wheel's frame.
 
-    The disc's lowest point lies a/cos(tilt) straight below a point of the axle that is a tan(tilt) off the wheel's plane. A
-    sphere around it with radius a/cos(tilt) - gap overlaps the floor by twice -gap, halfway of which lies the disc's lowest
-    point; the margin takes one -gap off again. Smaller by twice ``rise``, it is touched that much higher. High above the floor
-    the gap is cut short, which keeps the radius positive.
+    On a level floor the disc's lowest point lies a/cos(tilt) straight below a point of the axle that is a tan(tilt) off the
+    wheel's plane. A sphere around it with radius a/cos(tilt) - gap overlaps the floor by twice -gap, halfway of which lies the
+    disc's lowest point; the margin takes one -gap off again. Smaller by twice ``rise``, it is touched that much higher. High
+    above the floor the gap is cut short, which keeps the radius positive. On relief the sphere is as large, and stands along
+    the contact's normal over the point that is deepest.
     """
+    c, i, (n, _, _, scale) = contact.number, contact.wheel, contact.axes
     sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"] + lanes[f"wheel_angle{i}"])
     reach = lanes[f"radius{i}"] * scale  # scale = 1/cos(tilt)
     level = [scale * ((1.0 if k == 1 else 0.0) - n[1] * n[k]) for k in range(3)]  # the axle's direction, laid on the floor
     axis = [math.cos(CAPSULE_LEAN) * level[k] + math.sin(CAPSULE_LEAN) * n[k] for k in range(3)]
     centre = [CAPSULE_HALF_LENGTH * x for x in axis]
-    centre[1] = centre[1] + reach * n[1]
+    if contact.depth is None:
+        centre[1] = centre[1] + reach * n[1]
+    else:
+        centre = [centre[k] + (contact.rim[k] + reach * n[k]) for k in range(3)]
     near = ops.minimum(gap, 0.5 * reach)
-    out[f"geom_radius{i}"], out[f"margin{i}"] = reach - near - 2.0 * rise, near + 2.0 * rise
+    out[f"geom_radius{c}"], out[f"margin{c}"] = reach - near - 2.0 * rise, near + 2.0 * rise
     for a, value in zip(AXES, _to_wheel(centre, sine, cosine), strict=True):
-        out[f"geom_{a}{i}"] = value
+        out[f"geom_{a}{c}"] = value
     x, y, z = _to_wheel(axis, sine, cosine)
     w = ops.sqrt(0.5 + 0.5 * z)  # the shortest turn from z to the axis, whose y component keeps it away from -z
     half = 0.5 / w
-    out |= {f"geom_qw{i}": w, f"geom_qx{i}": -(y * half), f"geom_qy{i}": x * half}
+    out |= {f"geom_qw{c}": w, f"geom_qx{c}": -(y * half), f"geom_qy{c}": x * half}
+
+
+def _place_plane(lanes: Lanes, contact: Contact, rows: list[Vector], out: Out) -> None:
+    """Lay the plane that stands for the floor at a contact."""
+    c, n, point = contact.number, contact.axes[0], contact.point
+    normal = [dot(row, n) for row in rows]
+    for k, a in enumerate(AXES):
+        out[f"plane_{a}{c}"] = lanes[f"p{a}"] + dot(rows[k], point) + contact.depth * normal[k]
+    w = ops.sqrt(0.5 + 0.5 * normal[2])
+    half = 0.5 / w
+    out |= {f"plane_qw{c}": w, f"plane_qx{c}": -(normal[1] * half), f"plane_qy{c}": normal[0] * half, f"plane_qz{c}": 0.0}
 
 
 def _to_wheel(a: Vector, sine: Value, cosine: Value) -> Vector:
@@ -274,13 +309,13 @@ def _to_wheel(a: Vector, sine: Value, cosine: Value) -> Vector:
 # ---- after a step ----------------------------------------------------------------------------------------------------
 
 
-def after(lanes: Lanes, step: Value) -> Out:
+def after(lanes: Lanes, step: Value, features: frozenset[str] = FEATURES) -> Out:
     """Forces, torques, energies, slip and the inertial sensors' low-pass of the step that was just made."""
     lanes = with_engine_rates(lanes)
     out: Out = {}
     for i in CORNERS:
-        _read_wheel(lanes, i, out)
-    _add_slip(lanes, step, out)
+        _read_wheel(lanes, i, features, out)
+    _add_slip(lanes, step, features, out)
     mechanical, electrical = lanes["mechanical_energy"], lanes["electrical_energy"]
     for j in range(8):
         rates = lanes[f"old_rate{j}"], lanes[f"joint_rate{j}"]
@@ -302,27 +337,38 @@ def after(lanes: Lanes, step: Value) -> Out:
     return out
 
 
-def _read_wheel(lanes: Lanes, i: int, out: Out) -> None:
-    """Contact force on wheel ``i``; gear friction is what the constraints do to a joint beyond it."""
-    floor = [lanes[f"floor_{a}{i}"] for a in AXES]
-    c, s = lanes[f"heading_x{i}"], lanes[f"heading_y{i}"]
-    along, across, normal = c * floor[0] + s * floor[1], c * floor[1] - s * floor[0], floor[2]
-    moment = lanes[f"leg_arm_x{i}"] * along + lanes[f"leg_arm_y{i}"] * across + lanes[f"leg_arm_z{i}"] * normal
-    out[f"gear_torque{i}"] = lanes[f"constraint_joint_rate{i}"] - moment
-    out[f"gear_torque{FIRST_WHEEL + i}"] = (
-        lanes[f"constraint_joint_rate{FIRST_WHEEL + i}"] + lanes[f"rolling_radius{i}"] * along
-    )
-    out[f"force_x{i}"], out[f"force_y{i}"] = along + lanes[f"own_force_x{i}"], across + lanes[f"own_force_y{i}"]
-    out[f"force_z{i}"] = normal
+def _read_wheel(lanes: Lanes, i: int, features: frozenset[str], out: Out) -> None:
+    """Contact forces on wheel ``i``; gear friction is what the constraints do to a joint beyond them."""
+    leg, wheel = lanes[f"constraint_joint_rate{i}"], lanes[f"constraint_joint_rate{FIRST_WHEEL + i}"]
+    for c in contact_numbers(i, features):
+        along, across, normal = _force_along_axes(lanes, c, features)
+        moment = lanes[f"leg_arm_x{c}"] * along + lanes[f"leg_arm_y{c}"] * across + lanes[f"leg_arm_z{c}"] * normal
+        leg, wheel = leg - moment, wheel + lanes[f"rolling_radius{c}"] * along
+        out[f"force_x{c}"], out[f"force_y{c}"] = along + lanes[f"own_force_x{c}"], across + lanes[f"own_force_y{c}"]
+        out[f"force_z{c}"] = normal
+    out[f"gear_torque{i}"], out[f"gear_torque{FIRST_WHEEL + i}"] = leg, wheel
 
 
-def _add_slip(lanes: Lanes, step: Value, out: Out) -> None:
-    axes = floor_axes(rotation_rows(lanes))
-    n, _, _, scale = axes
+def _force_along_axes(lanes: Lanes, c: int, features: frozenset[str]) -> Vector:
+    """MuJoCo's force at contact ``c`` along heading, axle and normal, N."""
+    floor = [lanes[f"floor_{a}{c}"] for a in AXES]
+    if "relief" not in features:
+        cosine, sine = lanes[f"heading_x{c}"], lanes[f"heading_y{c}"]
+        return [cosine * floor[0] + sine * floor[1], cosine * floor[1] - sine * floor[0], floor[2]]
+    heading, normal = ([lanes[f"{name}_{a}{c}"] for a in AXES] for name in ("heading", "normal"))
+    return [dot(floor, heading), dot(floor, cross(normal, heading)), dot(floor, normal)]
+
+
+def _add_slip(lanes: Lanes, step: Value, features: frozenset[str], out: Out) -> None:
+    rows = rotation_rows(lanes)
+    level = axes_on(rows[2])
     twist = [*vector(lanes, "v"), *vector(lanes, "w")]
     for i in CORNERS:
-        points = wheel_points(lanes, i, *ops.sin_cos(lanes[f"leg_angle{i}"]), n, scale)
-        slip = slip_velocity(lanes, i, points, axes, twist, FEATURES)
+        contacts = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
+        slips = [slip_velocity(lanes, contact, twist, FEATURES) for contact in contacts]
+        slip = slips[0]
+        if len(slips) == 2:
+            slip = engine.more_loaded({f"normal{c}": out[f"force_z{c}"] for c in (i, i + 4)}, i, *slips)
         for a, speed in zip("xy", slip, strict=True):
             out[f"slip_displacement_{a}{i}"] = lanes[f"slip_displacement_{a}{i}"] + step * speed
 
@@ -330,22 +376,23 @@ def _add_slip(lanes: Lanes, step: Value, out: Out) -> None:
 # ---- observation at the end of a control tick ------------------------------------------------------------------------
 
 
-def observe(lanes: Lanes) -> Out:
+def observe(lanes: Lanes, features: frozenset[str] = FEATURES) -> Out:
     """Columns of the truth matrix, then the raw sensor channels: the engine's observation of the same state."""
     lanes = with_engine_rates(lanes)
-    renamed: Out = {f"friction_{a}{i}": lanes[f"force_{a}{i}"] for i in CORNERS for a in "xy"}
-    renamed |= {f"normal{i}": lanes[f"force_z{i}"] for i in CORNERS}
+    contacts = [c for i in CORNERS for c in contact_numbers(i, features)]
+    renamed: Out = {f"friction_{a}{c}": lanes[f"force_{a}{c}"] for c in contacts for a in "xy"}
+    renamed |= {f"normal{c}": lanes[f"force_z{c}"] for c in contacts}
     renamed |= {f"gear_friction{j}": lanes[f"gear_torque{j}"] for j in range(8)}
     renamed |= {f"rolling_friction{i}": lanes[f"rolling_torque{i}"] for i in CORNERS}
-    out = engine.observe(over(renamed, lanes), 1.0, FEATURES)  # impulses over a step of 1 are forces
+    out = engine.observe(over(renamed, lanes), 1.0, features)  # impulses over a step of 1 are forces
     for j in range(8):
         out[f"joint_velocity_{j}"] = out[f"raw_velocity_{j}"] = lanes[f"joint_rate{j}"]
     return out
 
 
-def formula_inputs(lanes: Lanes) -> Out:
+def formula_inputs(lanes: Lanes, features: frozenset[str] = FEATURES) -> Out:
     """What formula forces may depend on, at the start of a step (``plants.forces.INPUTS``)."""
-    seen = observe(lanes)
+    seen = observe(lanes, features)
     seen["supply_voltage"] = seen["raw_supply"]
     return {name: seen[name] for name in INPUTS_OF_FORMULAS}
 
@@ -388,9 +435,17 @@ def rolling_torque(lanes: Lanes, i: int, normal: Value, inertia: Value, step: Va
 
 
 def creep_force(
-    lanes: Lanes, i: int, mu: ground.Friction, normal: Value, slip: Vector, speed: Value, spin_inertia: Value, step: Value
+    lanes: Lanes,
+    contact: Contact,
+    mu: ground.Friction,
+    normal: Value,
+    slip: Vector,
+    speed: Value,
+    spin_inertia: Value,
+    step: Value,
 ) -> Vector:
     """Tyre creep: N tanh(speed/creep_speed) along (mu_x^2 s_x, mu_y^2 s_y), against the slip."""
+    c, i = contact.number, contact.wheel
     share, _ = ground.creep_share(lanes, i, speed)
     ease = ops.sqrt(mu.mu_x * mu.mu_x * (slip[0] * slip[0]) + mu.mu_y * mu.mu_y * (slip[1] * slip[1])) + LEAST_SLIP * mu.mu_x
     inverse_spin = lanes[f"radius{i}"] * lanes[f"radius{i}"] * (1.0 / spin_inertia)
@@ -399,7 +454,7 @@ def creep_force(
     force: Vector = []
     for k, (a, m) in enumerate((("x", mu.mu_x), ("y", mu.mu_y))):
         own = m * m * slope
-        force.append(_relaxed(lanes[f"own_force_{a}{i}"], -(own * slip[k]), step * (own * lightness[k])))
+        force.append(_relaxed(lanes[f"own_force_{a}{c}"], -(own * slip[k]), step * (own * lightness[k])))
     x, y = force[0] * mu.inverse_mu_x, force[1] * mu.inverse_mu_y
     shrink = ops.minimum(normal / ops.sqrt(x * x + y * y + 1e-30), 1.0)
     return [shrink * f for f in force]

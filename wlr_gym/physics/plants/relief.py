@@ -1,0 +1,494 @@
+"""Where a wheel touches a floor that is not flat, defined once for every simulator: waves, bumps, and convex pieces.
+
+A wheel is a disc with a rounded tread: a core disc of radius ``rho`` and half width ``b``, grown by ``rc`` on every side, so
+that its radius is ``rho + rc`` and its width ``2 (b + rc)``. The floor is a smooth base z = h(x, y), on which pieces stand:
+profiles with a flat top, extruded along a horizontal line without an end (kerb, ramp, plank, one step of stairs).
+
+A wheel touches at two places at most. The first is the base, or the second nearest piece where that is nearer (the foot of a
+step of stairs); the other is the nearest piece. Riser, edge and top of a piece are one contact, whose normal turns from one to
+the other without a jump. Everything is scalar source over lanes (see :mod:`wlr_gym.physics.plants.drive`) in the floor frame,
+without branches.
+
+Families that change what is traced: ``relief`` (any of the following), ``waves``, ``bumps``, ``piece`` (the first piece),
+``pieces`` (all of them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wlr_gym.physics.codegen import ops
+from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
+from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEELS, Robot
+from wlr_gym.robot.parameter_table import PIECES, WAVES
+from wlr_gym.robot.parameters import Parameters
+
+if TYPE_CHECKING:
+    from wlr_gym.physics.plants.base import PlantState
+
+Array = NDArray[np.float64]
+
+#: How often the normal on a smooth base, and the angle of the normal on a piece's edge, are improved.
+REFINEMENTS = 2
+#: Crown of the tread: about so many radians wide is the flip of the contact from one edge to the other (see :func:`support`).
+CROWN = 0.05
+#: Where pieces are that are not there: far below (m).
+NOWHERE = -10.0
+#: Modulus of the permutation that draws bumps: (34 k + 1) k mod 289 visits every number once, and is exact in single precision.
+PERMUTED = 289
+#: How often the pose of a standing robot is improved.
+SETTLING = 30
+#: Stiffness of a spring that does not touch, over its own, in those steps; and the longest of them (m, rad).
+LOOSE = 0.02
+LARGEST_RISE = 0.02
+#: Largest product of the base's curvature and a wheel's radius: up to here the contact is exact to 30 um.
+LARGEST_CURVATURE = 0.25
+
+_WAVE_FIELDS = ("height", "slope_x", "slope_y", "phase", "steepness_x", "steepness_y")
+_BUMP_FIELDS = ("height", "inverse_spacing", "seed_x", "seed_y", "least", "inverse_share")
+_PIECE_FIELDS = ("x", "y", "z", "across_x", "across_y", "span", "front_u", "front_v", "rear_u", "rear_v", "edge_radius")
+_WHEEL_FIELDS = ("core_radius", "core_half_width", "rounding")
+#: Parameter lanes of the relief.
+RELIEF_LANES: tuple[str, ...] = (
+    *(f"{name}{i}" for name in _WHEEL_FIELDS for i in range(4)),
+    *(f"wave_{name}{k}" for name in _WAVE_FIELDS for k in range(len(WAVES))),
+    *(f"bump_{name}" for name in _BUMP_FIELDS),
+    *(f"piece_{name}{k}" for name in _PIECE_FIELDS for k in range(len(PIECES))),
+)
+
+
+def families(parameters: Parameters) -> set[str]:
+    """Return which families of relief some robot of the batch stands on."""
+    pieces = (parameters["piece.height"] > 0.0).any(axis=0)
+    present = {
+        "waves": parameters["wave.height"].any(),
+        "bumps": parameters["bumps.height"].any(),
+        "piece": pieces.any(),
+        "pieces": pieces[1:].any(),
+    }
+    found = {name for name, is_present in present.items() if is_present}
+    return found | {"relief"} if found else found
+
+
+def wheel_profile(parameters: Parameters, robot: Robot) -> tuple[Array, float, float]:
+    """Return the radius of every wheel's core disc (N, 4), and its half width and rounding, m."""
+    half = 0.25 * robot.wheel.width
+    return parameters["wheel.radius"] - half, half, half
+
+
+def pack(parameters: Parameters, robot: Robot) -> dict[str, Array]:
+    """Return the lanes RELIEF_LANES, each (N,)."""
+    core, half_width, rounding = wheel_profile(parameters, robot)
+    lanes: dict[str, Array] = {f"core_radius{i}": core[:, i] for i in range(4)}
+    everyone = np.ones(len(parameters))
+    lanes |= {f"core_half_width{i}": half_width * everyone for i in range(4)}
+    lanes |= {f"rounding{i}": rounding * everyone for i in range(4)}
+    return lanes | _pack_waves(parameters) | _pack_bumps(parameters) | _pack_pieces(parameters)
+
+
+def _pack_waves(parameters: Parameters) -> dict[str, Array]:
+    height, heading = parameters["wave.height"], parameters["wave.heading"]
+    number = 2.0 * np.pi / parameters["wave.length"]
+    fields = {
+        "height": height,
+        "slope_x": number * np.cos(heading),
+        "slope_y": number * np.sin(heading),
+        "phase": parameters["wave.phase"],
+        "steepness_x": height * number * np.cos(heading),
+        "steepness_y": height * number * np.sin(heading),
+    }
+    return {f"wave_{name}{k}": fields[name][:, k] for name in _WAVE_FIELDS for k in range(len(WAVES))}
+
+
+def _pack_bumps(parameters: Parameters) -> dict[str, Array]:
+    seed = np.floor(parameters["bumps.seed"])
+    share = parameters["bumps.share"]
+    return {
+        "bump_height": parameters["bumps.height"],
+        "bump_inverse_spacing": 1.0 / parameters["bumps.spacing"],
+        "bump_seed_x": np.mod(seed, PERMUTED),
+        "bump_seed_y": np.floor(seed / PERMUTED),
+        "bump_least": 1.0 - share,
+        "bump_inverse_share": 1.0 / share,
+    }
+
+
+def _pack_pieces(parameters: Parameters) -> dict[str, Array]:
+    height, heading, radius = (parameters[f"piece.{name}"] for name in ("height", "heading", "edge_radius"))
+    front, rear = parameters["piece.front_slope"], parameters["piece.rear_slope"]
+    # The edge is a cylinder about the inner corner, which lies a radius below the top and behind the face.
+    inset = {name: radius * np.tan(0.5 * slope) for name, slope in (("front", front), ("rear", rear))}
+    along = np.stack([np.cos(heading), np.sin(heading)])
+    there = height > 0.0
+    # A face begins at the foot, (x, y); its sharp corner is height/tan(slope) further on.
+    start = height / np.tan(front) + inset["front"]
+    fields = {
+        "x": parameters["piece.x"] + start * along[0],
+        "y": parameters["piece.y"] + start * along[1],
+        "z": np.where(there, height - radius, NOWHERE),
+        "across_x": -along[0],
+        "across_y": -along[1],
+        "span": np.maximum(parameters["piece.length"] - inset["front"] - inset["rear"], 0.0),
+        "front_u": np.sin(front),
+        "front_v": np.cos(front),
+        "rear_u": np.sin(rear),
+        "rear_v": np.cos(rear),
+        "edge_radius": radius,
+    }
+    return {f"piece_{name}{k}": fields[name][:, k] for name in _PIECE_FIELDS for k in range(len(PIECES))}
+
+
+# ---- the wheel -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Cross-section of a wheel: radius of its core disc, half its width, and the rounding of its edges, m."""
+
+    radius: Value
+    half_width: Value
+    rounding: Value
+
+
+@dataclass(frozen=True)
+class Touch:
+    """Where a wheel is nearest to the floor.
+
+    Attributes:
+        depth: how far it is in the floor, m; negative: how far away.
+        normal: of the floor there, upwards; floor frame.
+        reach: from the wheel's centre to its point that is deepest, m; floor frame.
+    """
+
+    depth: Value
+    normal: Vector
+    reach: Vector
+
+
+def profile_of(lanes: Lanes, i: int) -> Profile:
+    """Return the cross-section of wheel ``i``."""
+    return Profile(lanes[f"core_radius{i}"], lanes[f"core_half_width{i}"], lanes[f"rounding{i}"])
+
+
+def _dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def support(profile: Profile, axle: Vector, normal: Vector) -> tuple[Value, Vector]:
+    """Return how far a wheel reaches against ``normal`` (m), and the vector from its centre to the point that does.
+
+    S(n) = rho sqrt(1 - x^2) + b (sqrt(x^2 + e^2) - e) + rc with x = n . axle, and the point is -dS/dn. The crown e lets the
+    point move across the tread over a small angle where a cylinder's would jump from one edge to the other.
+    """
+    x = _dot(normal, axle)
+    in_plane = [normal[k] - x * axle[k] for k in range(3)]
+    square = _dot(in_plane, in_plane) + 1e-18
+    inverse = 1.0 / ops.sqrt(square)
+    root = ops.sqrt(x * x + CROWN * CROWN)
+    along_axle = profile.half_width * x / root
+    along_normal = profile.rounding + profile.half_width * (CROWN * CROWN / root - CROWN)
+    reach = [-(profile.radius * inverse) * in_plane[k] - along_axle * axle[k] - along_normal * normal[k] for k in range(3)]
+    distance = profile.radius * (square * inverse) + profile.half_width * (root - CROWN) + profile.rounding
+    return distance, reach
+
+
+# ---- the base --------------------------------------------------------------------------------------------------------
+
+
+def base_height(lanes: Lanes, x: Value, y: Value, features: frozenset[str]) -> tuple[Value, Value, Value]:
+    """Return height (m) and slope along x and y of the base at a place (m, floor frame)."""
+    height: Value = 0.0
+    slope_x: Value = 0.0
+    slope_y: Value = 0.0
+    if "waves" in features:
+        for k in range(len(WAVES)):
+            angle = lanes[f"wave_slope_x{k}"] * x + lanes[f"wave_slope_y{k}"] * y + lanes[f"wave_phase{k}"]
+            sine, cosine = ops.sin_cos(angle)
+            height = height + lanes[f"wave_height{k}"] * sine
+            slope_x = slope_x + lanes[f"wave_steepness_x{k}"] * cosine
+            slope_y = slope_y + lanes[f"wave_steepness_y{k}"] * cosine
+    if "bumps" in features:
+        bump, rise_x, rise_y = _bumps(lanes, x, y)
+        height, slope_x, slope_y = height + bump, slope_x + rise_x, slope_y + rise_y
+    return height, slope_x, slope_y
+
+
+def _permuted(k: Value) -> Value:
+    """(34 k + 1) k modulo :data:`PERMUTED`, of a whole number below that; exact in either precision."""
+    value = (34.0 * k + 1.0) * k
+    return value - PERMUTED * ops.floor((value + 0.5) * (1.0 / PERMUTED))
+
+
+def _below_modulus(k: Value) -> Value:
+    return k - PERMUTED * ops.floor((k + 0.5) * (1.0 / PERMUTED))
+
+
+def _bumps(lanes: Lanes, x: Value, y: Value) -> tuple[Value, Value, Value]:
+    """Biquadratic B-spline over a square lattice whose heights are drawn from the lattice point's number and the seed."""
+    scale = lanes["bump_inverse_spacing"]
+    column, row = x * scale, y * scale
+    first_column, first_row = ops.floor(column), ops.floor(row)
+    weights_x, slopes_x = _quadratic(column - first_column)
+    weights_y, slopes_y = _quadratic(row - first_row)
+    total: Value = 0.0
+    slope_x: Value = 0.0
+    slope_y: Value = 0.0
+    for j in range(3):
+        in_column = _permuted(_below_modulus(first_column + (float(j) + lanes["bump_seed_x"])))
+        line: Value = 0.0
+        line_slope: Value = 0.0
+        for k in range(3):
+            number = _below_modulus(in_column + (first_row + (float(k) + lanes["bump_seed_y"])))
+            drawn = _permuted(_permuted(number)) * (1.0 / (PERMUTED - 1))
+            height = ops.maximum(drawn - lanes["bump_least"], 0.0)
+            line = line + weights_y[k] * height
+            line_slope = line_slope + slopes_y[k] * height
+        total = total + weights_x[j] * line
+        slope_x = slope_x + slopes_x[j] * line
+        slope_y = slope_y + weights_x[j] * line_slope
+    size = lanes["bump_height"] * lanes["bump_inverse_share"]
+    return size * total, (size * scale) * slope_x, (size * scale) * slope_y
+
+
+def _quadratic(t: Value) -> tuple[Vector, Vector]:
+    """Weights of three neighbours in a quadratic B-spline at a fraction ``t`` of a cell, and their slopes."""
+    rest = 1.0 - t
+    return [0.5 * rest * rest, 0.5 + t * rest, 0.5 * t * t], [-rest, rest - t, t]
+
+
+def touch_of_base(lanes: Lanes, centre: Vector, axle: Vector, profile: Profile, features: frozenset[str]) -> Touch:
+    """Return where a wheel is nearest to the base: the normal under its centre, improved at the point that it finds."""
+    if not features & {"waves", "bumps"}:
+        distance, reach = support(profile, axle, [0.0, 0.0, 1.0])
+        return Touch(distance - centre[2], [0.0, 0.0, 1.0], reach)
+    height, normal, reach = 0.0, _normal(*base_height(lanes, centre[0], centre[1], features)[1:]), [0.0] * 3
+    for _ in range(REFINEMENTS):
+        _, reach = support(profile, axle, normal)
+        height, *slopes = base_height(lanes, centre[0] + reach[0], centre[1] + reach[1], features)
+        normal = _normal(*slopes)
+    return Touch((height - (centre[2] + reach[2])) * normal[2], normal, reach)
+
+
+def _normal(slope_x: Value, slope_y: Value) -> Vector:
+    up = 1.0 / ops.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+    return [-(slope_x * up), -(slope_y * up), up]
+
+
+# ---- pieces ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """One upper edge of a piece as a wheel sees it, in the plane across the edge (u: outwards, v: up).
+
+    Attributes:
+        gap: distance of the wheel's centre from the edge's surface, m.
+        centre: of the wheel, from the inner corner, m.
+        across: unit vector outwards, horizontal (x, y).
+        steepest: normal (u, v) of the face below the edge; the other limit is straight up.
+        normal: direction (u, v) from the inner corner to the centre, within those limits.
+        radius: of the edge, m.
+    """
+
+    gap: Value
+    centre: tuple[Value, Value]
+    across: tuple[Value, Value]
+    steepest: tuple[Value, Value]
+    normal: tuple[Value, Value]
+    radius: Value
+
+
+def _choose(condition: Value, a: _Edge, b: _Edge) -> _Edge:
+    """Return ``a`` where the condition is positive, else ``b``."""
+
+    def pick(x: tuple[Value, Value], y: tuple[Value, Value]) -> tuple[Value, Value]:
+        return ops.where_positive(condition, x[0], y[0]), ops.where_positive(condition, x[1], y[1])
+
+    return _Edge(
+        ops.where_positive(condition, a.gap, b.gap),
+        pick(a.centre, b.centre),
+        pick(a.across, b.across),
+        pick(a.steepest, b.steepest),
+        pick(a.normal, b.normal),
+        ops.where_positive(condition, a.radius, b.radius),
+    )
+
+
+def _nearer(a: _Edge, b: _Edge) -> _Edge:
+    return _choose(b.gap - a.gap, a, b)
+
+
+def _further(a: _Edge, b: _Edge) -> _Edge:
+    return _choose(b.gap - a.gap, b, a)
+
+
+def _edge_of(lanes: Lanes, k: int, centre: Vector) -> _Edge:
+    """Return the edge of piece ``k`` on whose side a wheel's centre stands."""
+    across = (lanes[f"piece_across_x{k}"], lanes[f"piece_across_y{k}"])
+    dx, dy = centre[0] - lanes[f"piece_x{k}"], centre[1] - lanes[f"piece_y{k}"]
+    u = dx * across[0] + dy * across[1]
+    behind = -(u + 0.5 * lanes[f"piece_span{k}"])  # beyond the middle of the top: the far edge
+    turned = ops.where_positive(behind, -1.0, 1.0)
+    u = ops.where_positive(behind, -(u + lanes[f"piece_span{k}"]), u)
+    v = centre[2] - lanes[f"piece_z{k}"]
+    steepest = tuple(ops.where_positive(behind, lanes[f"piece_rear_{a}{k}"], lanes[f"piece_front_{a}{k}"]) for a in "uv")
+    inverse = 1.0 / ops.sqrt(u * u + v * v + 1e-18)
+    normal = _within(u * inverse, v * inverse, steepest)
+    radius = lanes[f"piece_edge_radius{k}"]
+    gap = u * normal[0] + v * normal[1] - radius
+    return _Edge(gap, (u, v), (turned * across[0], turned * across[1]), (steepest[0], steepest[1]), normal, radius)
+
+
+def _within(u: Value, v: Value, steepest: tuple[Value, ...]) -> tuple[Value, Value]:
+    """Limit a direction to the normals between a face and the top."""
+    below = steepest[1] * u - steepest[0] * v  # positive: below the face's normal
+    u, v = ops.where_positive(below, steepest[0], u), ops.where_positive(below, steepest[1], v)
+    beyond = -u  # positive: beyond straight up
+    return ops.where_positive(beyond, 0.0, u), ops.where_positive(beyond, 1.0, v)
+
+
+def _touch_of_edge(edge: _Edge, axle: Vector, profile: Profile) -> Touch:
+    """Return where a wheel is nearest to an edge: the normal between face and top along which they are furthest apart.
+
+    f(angle) = C . n - S(n) - r is concave there; Newton's steps start at the direction of the wheel's centre.
+    """
+    cu, cv = edge.centre
+    axle_u = axle[0] * edge.across[0] + axle[1] * edge.across[1]
+    axle_v = axle[2]
+    rho, b = profile.radius, profile.half_width
+    u, v = edge.normal
+    for _ in range(REFINEMENTS):
+        x = axle_u * u + axle_v * v
+        y = axle_v * u - axle_u * v  # change of x with the angle
+        square = ops.maximum(1.0 - x * x, 1e-6)
+        inverse_g = 1.0 / ops.sqrt(square)
+        inverse_r = 1.0 / ops.sqrt(x * x + CROWN * CROWN)
+        product, difference = x * y, y * y - x * x
+        first = cv * u - cu * v + product * (rho * inverse_g - b * inverse_r)
+        second = rho * inverse_g * (difference + product * product * (inverse_g * inverse_g))
+        second = second - b * inverse_r * (difference - product * product * (inverse_r * inverse_r))
+        curvature = cu * u + cv * v - second
+        turn = ops.clip(first / ops.maximum(curvature, 0.1 * rho), -0.5, 0.5)
+        u, v = u - turn * v, v + turn * u
+        inverse = 1.0 / ops.sqrt(u * u + v * v)
+        u, v = _within(u * inverse, v * inverse, edge.steepest)
+    normal = [u * edge.across[0], u * edge.across[1], v]
+    distance, reach = support(profile, axle, normal)
+    return Touch(distance + edge.radius - (cu * u + cv * v), normal, reach)
+
+
+# ---- both ------------------------------------------------------------------------------------------------------------
+
+
+def touches(lanes: Lanes, i: int, centre: Vector, axle: Vector, features: frozenset[str]) -> list[Touch]:
+    """Return where wheel ``i`` is nearest to the floor: one place, or two where there are pieces.
+
+    Args:
+        lanes: RELIEF_LANES.
+        i: wheel.
+        centre: of the wheel, floor frame, m.
+        axle: its direction, floor frame.
+        features: families that are traced.
+    """
+    profile = profile_of(lanes, i)
+    base = touch_of_base(lanes, centre, axle, profile, features)
+    if "piece" not in features:
+        return [base]
+    edges = [_edge_of(lanes, k, centre) for k in piece_numbers(features)]
+    nearest = reduce(_nearer, edges)
+    on_piece = _touch_of_edge(nearest, axle, profile)
+    if "pieces" not in features:
+        return [base, on_piece]
+    second = _second_nearest(edges)
+    other = _touch_of_edge(second, axle, profile)
+    deeper = other.depth - base.depth
+
+    def choose(a: Vector, b: Vector) -> Vector:
+        return [ops.where_positive(deeper, x, y) for x, y in zip(a, b, strict=True)]
+
+    first = Touch(ops.maximum(other.depth, base.depth), choose(other.normal, base.normal), choose(other.reach, base.reach))
+    return [first, on_piece]
+
+
+def _second_nearest(edges: Sequence[_Edge]) -> _Edge:
+    """Return the edge that is second nearest: of each next one and the nearest so far, the further is a candidate."""
+    nearest, second = _nearer(*edges[:2]), _further(*edges[:2])
+    for edge in edges[2:]:
+        second = _nearer(second, _further(nearest, edge))
+        nearest = _nearer(nearest, edge)
+    return second
+
+
+def floor_height(lanes: Lanes, x: Value, y: Value, features: frozenset[str]) -> Value:
+    """Return the height (m) of base and pieces at a place (m, floor frame); edges are taken as sharp."""
+    height, *_ = base_height(lanes, x, y, features)
+    for k in piece_numbers(features):
+        edge = _edge_of(lanes, k, [x, y, lanes[f"piece_z{k}"]])
+        (u, _), (steep, level) = edge.centre, edge.steepest
+        level = ops.maximum(level, 1e-3)
+        outside = ops.maximum(u * steep - edge.radius * (1.0 - level), 0.0)  # times the face's sine: 0 at the sharp corner
+        height = ops.maximum(height, lanes[f"piece_z{k}"] + edge.radius - outside / level)
+    return height
+
+
+def piece_numbers(features: frozenset[str]) -> range:
+    """Return which pieces are traced."""
+    return range(len(PIECES) if "pieces" in features else int("piece" in features))
+
+
+# ---- standing on it --------------------------------------------------------------------------------------------------
+
+
+def settle(robot: Robot, parameters: Parameters, state: PlantState) -> None:
+    """Put standing robots on their wheels where the floor is not flat: height, pitch and roll; place and heading stay.
+
+    They then rest: the contact springs, which only push, carry the weight. Newton's steps on their energy.
+    """
+    features = frozenset(families(parameters))
+    if not features:
+        return
+    from scipy.spatial.transform import Rotation
+
+    lanes, stiffness = pack(parameters, robot), parameters["ground.normal_stiffness"]
+    hips = parameters["hip.position"][:, None, :] * np.array([[x, y, 1.0] for x, y in CORNER_SIGNS])
+    angle = state.joint_position[:, LEG_SLICE]
+    along = np.stack([np.cos(angle), np.zeros_like(angle), -np.sin(angle)], axis=2)
+    axles = hips + parameters["leg.length"][:, :, None] * along
+    legs = hips + parameters["leg.com_along_leg"][:, :, None] * along
+    bodies = [
+        (parameters["body.mass"], parameters["body.com_offset"]),
+        (parameters["payload.mass"], parameters["payload.position"]),
+    ]
+    bodies += [(parameters["leg.mass"][:, i], legs[:, i]) for i in range(len(WHEELS))]
+    bodies += [(parameters["wheel.mass"][:, i], axles[:, i]) for i in range(len(WHEELS))]
+    weight = parameters["gravity"] * np.sum([mass for mass, _ in bodies], axis=0)
+    moment = parameters["gravity"][:, None] * np.sum([mass[:, None] * place for mass, place in bodies], axis=0)
+    yaw, pitch, roll = Rotation.from_quat(state.quaternion, scalar_first=True).as_euler("ZYX").T
+    for _ in range(SETTLING):
+        turn = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
+        reach = np.einsum("nij,nkj->nki", turn, axles)
+        centres = state.position[:, None, :] + reach
+        axle = list(turn[:, :, 1].T)
+        found = [touches(lanes, i, list(centres[:, i].T), axle, features) for i in range(len(WHEELS))]
+        depth = np.stack([np.max([touch.depth for touch in places], axis=0) for places in found], axis=1)
+        pull = np.einsum("nij,nj->ni", turn, moment)
+        ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
+        aside = np.stack([-np.sin(yaw), np.cos(yaw), np.zeros_like(yaw)], axis=1)
+        lever = np.stack(
+            [np.ones_like(angle), -np.einsum("nki,ni->nk", reach, ahead), np.einsum("nki,ni->nk", reach, aside)], 2
+        )
+        load = np.stack([weight, -(pull * ahead).sum(axis=1), (pull * aside).sum(axis=1)], axis=1)
+        springs = np.where(depth > 0.0, stiffness, LOOSE * stiffness)
+        force = np.einsum("nki,nk->ni", lever, np.maximum(depth, 0.0) * stiffness) - load
+        rise = np.linalg.solve(np.einsum("nki,nk,nkj->nij", lever, springs, lever), force[:, :, None])[:, :, 0]
+        rise *= np.minimum(1.0, LARGEST_RISE / np.abs(rise).max(axis=1, keepdims=True).clip(1e-12))
+        state.position[:, 2] += rise[:, 0]
+        pitch, roll = pitch + rise[:, 1], roll + rise[:, 2]
+    attitude = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
+    state.quaternion[:] = attitude.as_quat(scalar_first=True, canonical=True)
