@@ -4,10 +4,9 @@ A wheel is a disc with a rounded tread: a core disc of radius ``rho`` and half w
 that its radius is ``rho + rc`` and its width ``2 (b + rc)``. The floor is a smooth base z = h(x, y), on which pieces stand:
 profiles with a flat top, extruded along a horizontal line without an end (kerb, ramp, plank, one step of stairs).
 
-A wheel touches at two places at most. The first is the base, or the second nearest piece where that is nearer (the foot of a
-step of stairs); the other is the nearest piece. Riser, edge and top of a piece are one contact, whose normal turns from one to
-the other without a jump. Everything is scalar source over lanes (see :mod:`wlr_gym.physics.plants.drive`) in the floor frame,
-without branches.
+A wheel touches at two places at most: those of the base and of the two nearest pieces where it is deepest. Riser, edge and
+top of a piece are one place, whose normal turns from one to the other without a jump. Everything is scalar source over lanes
+(see :mod:`wlr_gym.physics.plants.drive`) in the floor frame, without branches.
 
 Families that change what is traced: ``relief`` (any of the following), ``waves``, ``bumps``, ``piece`` (the first piece),
 ``pieces`` (all of them).
@@ -18,19 +17,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
-from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEELS, Robot
+from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import PIECES, WAVES
 from wlr_gym.robot.parameters import Parameters
-
-if TYPE_CHECKING:
-    from wlr_gym.physics.plants.base import PlantState
 
 Array = NDArray[np.float64]
 
@@ -42,11 +37,6 @@ CROWN = 0.05
 NOWHERE = -10.0
 #: Modulus of the permutation that draws bumps: (34 k + 1) k mod 289 visits every number once, and is exact in single precision.
 PERMUTED = 289
-#: How often the pose of a standing robot is improved.
-SETTLING = 30
-#: Stiffness of a spring that does not touch, over its own, in those steps; and the longest of them (m, rad).
-LOOSE = 0.02
-LARGEST_RISE = 0.02
 #: Largest product of the base's curvature and a wheel's radius: up to here the contact is exact to 30 um.
 LARGEST_CURVATURE = 0.25
 
@@ -387,7 +377,7 @@ def _touch_of_edge(edge: _Edge, axle: Vector, profile: Profile) -> Touch:
 
 
 def touches(lanes: Lanes, i: int, centre: Vector, axle: Vector, features: frozenset[str]) -> list[Touch]:
-    """Return where wheel ``i`` is nearest to the floor: one place, or two where there are pieces.
+    """Return where wheel ``i`` is nearest to the floor: one place, or two where there are pieces, the deeper one first.
 
     Args:
         lanes: RELIEF_LANES.
@@ -403,17 +393,27 @@ def touches(lanes: Lanes, i: int, centre: Vector, axle: Vector, features: frozen
     edges = [_edge_of(lanes, k, centre) for k in piece_numbers(features)]
     nearest = reduce(_nearer, edges)
     on_piece = _touch_of_edge(nearest, axle, profile)
-    if "pieces" not in features:
-        return [base, on_piece]
-    second = _second_nearest(edges)
-    other = _touch_of_edge(second, axle, profile)
-    deeper = other.depth - base.depth
+    first, second = _deeper(base, on_piece), _shallower(base, on_piece)
+    if "pieces" in features:
+        second = _deeper(second, _touch_of_edge(_second_nearest(edges), axle, profile))
+    return [first, second]
 
-    def choose(a: Vector, b: Vector) -> Vector:
-        return [ops.where_positive(deeper, x, y) for x, y in zip(a, b, strict=True)]
 
-    first = Touch(ops.maximum(other.depth, base.depth), choose(other.normal, base.normal), choose(other.reach, base.reach))
-    return [first, on_piece]
+def _deeper(a: Touch, b: Touch) -> Touch:
+    return _choose_touch(b.depth - a.depth, b, a)
+
+
+def _shallower(a: Touch, b: Touch) -> Touch:
+    return _choose_touch(b.depth - a.depth, a, b)
+
+
+def _choose_touch(condition: Value, a: Touch, b: Touch) -> Touch:
+    """Return ``a`` where the condition is positive, else ``b``."""
+    normal, reach = (
+        [ops.where_positive(condition, x, y) for x, y in zip(one, other, strict=True)]
+        for one, other in ((a.normal, b.normal), (a.reach, b.reach))
+    )
+    return Touch(ops.where_positive(condition, a.depth, b.depth), normal, reach)
 
 
 def _second_nearest(edges: Sequence[_Edge]) -> _Edge:
@@ -440,55 +440,3 @@ def floor_height(lanes: Lanes, x: Value, y: Value, features: frozenset[str]) -> 
 def piece_numbers(features: frozenset[str]) -> range:
     """Return which pieces are traced."""
     return range(len(PIECES) if "pieces" in features else int("piece" in features))
-
-
-# ---- standing on it --------------------------------------------------------------------------------------------------
-
-
-def settle(robot: Robot, parameters: Parameters, state: PlantState) -> None:
-    """Put standing robots on their wheels where the floor is not flat: height, pitch and roll; place and heading stay.
-
-    They then rest: the contact springs, which only push, carry the weight. Newton's steps on their energy.
-    """
-    features = frozenset(families(parameters))
-    if not features:
-        return
-    from scipy.spatial.transform import Rotation
-
-    lanes, stiffness = pack(parameters, robot), parameters["ground.normal_stiffness"]
-    hips = parameters["hip.position"][:, None, :] * np.array([[x, y, 1.0] for x, y in CORNER_SIGNS])
-    angle = state.joint_position[:, LEG_SLICE]
-    along = np.stack([np.cos(angle), np.zeros_like(angle), -np.sin(angle)], axis=2)
-    axles = hips + parameters["leg.length"][:, :, None] * along
-    legs = hips + parameters["leg.com_along_leg"][:, :, None] * along
-    bodies = [
-        (parameters["body.mass"], parameters["body.com_offset"]),
-        (parameters["payload.mass"], parameters["payload.position"]),
-    ]
-    bodies += [(parameters["leg.mass"][:, i], legs[:, i]) for i in range(len(WHEELS))]
-    bodies += [(parameters["wheel.mass"][:, i], axles[:, i]) for i in range(len(WHEELS))]
-    weight = parameters["gravity"] * np.sum([mass for mass, _ in bodies], axis=0)
-    moment = parameters["gravity"][:, None] * np.sum([mass[:, None] * place for mass, place in bodies], axis=0)
-    yaw, pitch, roll = Rotation.from_quat(state.quaternion, scalar_first=True).as_euler("ZYX").T
-    for _ in range(SETTLING):
-        turn = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
-        reach = np.einsum("nij,nkj->nki", turn, axles)
-        centres = state.position[:, None, :] + reach
-        axle = list(turn[:, :, 1].T)
-        found = [touches(lanes, i, list(centres[:, i].T), axle, features) for i in range(len(WHEELS))]
-        depth = np.stack([np.max([touch.depth for touch in places], axis=0) for places in found], axis=1)
-        pull = np.einsum("nij,nj->ni", turn, moment)
-        ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
-        aside = np.stack([-np.sin(yaw), np.cos(yaw), np.zeros_like(yaw)], axis=1)
-        lever = np.stack(
-            [np.ones_like(angle), -np.einsum("nki,ni->nk", reach, ahead), np.einsum("nki,ni->nk", reach, aside)], 2
-        )
-        load = np.stack([weight, -(pull * ahead).sum(axis=1), (pull * aside).sum(axis=1)], axis=1)
-        springs = np.where(depth > 0.0, stiffness, LOOSE * stiffness)
-        force = np.einsum("nki,nk->ni", lever, np.maximum(depth, 0.0) * stiffness) - load
-        rise = np.linalg.solve(np.einsum("nki,nk,nkj->nij", lever, springs, lever), force[:, :, None])[:, :, 0]
-        rise *= np.minimum(1.0, LARGEST_RISE / np.abs(rise).max(axis=1, keepdims=True).clip(1e-12))
-        state.position[:, 2] += rise[:, 0]
-        pitch, roll = pitch + rise[:, 1], roll + rise[:, 2]
-    attitude = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
-    state.quaternion[:] = attitude.as_quat(scalar_first=True, canonical=True)

@@ -20,7 +20,6 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     PLATFORM,
     Contact,
     axes_on,
-    contact_numbers,
     contact_place,
     contacts_of,
     dot,
@@ -333,6 +332,8 @@ def _warm_start(lanes: Lanes, i: int, contacts: Sequence[Contact], step: Value, 
         out[f"rolling_friction{i}"] = ops.clip(lanes[f"rolling_friction{i}"], -bound, bound)
     for c in (contact.number for contact in contacts):
         out[f"bound{c}"] = step * out[f"normal{c}"]
+        if c >= len(CORNERS):  # what it has become while nothing touched there depends on the robots beside
+            out[f"multiplier{c}"] = ops.where_positive(lanes[f"normal{c}"], lanes[f"multiplier{c}"], 0.0)
         x, y = (lanes[f"friction_{a}{c}"] * out[f"acting_inverse_mu_{a}{c}"] for a in "xy")
         shrink = ops.minimum(out[f"bound{c}"] / ops.sqrt(x * x + y * y + 1e-30), 1.0)
         for a in "xy":
@@ -360,17 +361,22 @@ def _cholesky(matrix: list[list[Value]]) -> tuple[list[list[Value]], list[Value]
 # ---- friction: one pass of exact block coordinate descent over contacts, gears and rolling resistance ----------------
 
 
-def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
+def kick_sweep(lanes: Lanes, features: frozenset[str], pairs: bool = False) -> Out:
     """One pass of block coordinate descent over all friction impulses, front axle then rear axle.
 
     Left and right wheel of an axle are solved from the same starting point and the joint step is scaled to the minimum of
     the objective along it. The objective is convex, so every pass descends; and a mirrored robot gets mirrored impulses,
     which solving left before right would not give.
+
+    Args:
+        lanes: of the step.
+        features: families that are traced.
+        pairs: wheels have two contacts. Where no wheel touches at its second, the impulses are those without, to the bit.
     """
     base: Vector = [lanes[f"base{r}"] for r in range(6)]
     out: Out = {}
     for left, right in ((0, 1), (2, 3)):
-        sides = [_leg_block(lanes, i, base, features) for i in (left, right)]
+        sides = [_leg_block(lanes, i, base, features, pairs) for i in (left, right)]
         change = [(sides[0][0][r] - base[r]) + (sides[1][0][r] - base[r]) for r in range(6)]
         slope, curvature = dot(base, change), dot(change, change)
         moved = []
@@ -383,21 +389,25 @@ def kick_sweep(lanes: Lanes, features: frozenset[str]) -> Out:
             ]
             slope = slope + dot(start, pull)
             curvature = curvature + dot(dy, pull)
-            more_slope, more_curvature = _beside_the_bodies(lanes, i, impulses, features)
+            more_slope, more_curvature = _beside_the_bodies(lanes, i, impulses, features, pairs)
             slope, curvature = slope + more_slope, curvature + more_curvature
             moved.append((i, start, dy, impulses))
         scale = ops.clip(-slope / (curvature + 1e-30), 0.0, 1.0)
         base = [base[r] + scale * change[r] for r in range(6)]
         for i, start, dy, impulses in moved:
             out[f"y_leg{i}"], out[f"y_wheel{i}"] = start[0] + scale * dy[0], start[1] + scale * dy[1]
-            out |= {f"multiplier{c}": impulses.pop(f"multiplier{c}") for c in contact_numbers(i, features)}
+            out |= {f"multiplier{c}": impulses.pop(f"multiplier{c}") for c in _numbers(i, pairs)}
             out |= {name: lanes[name] + scale * (new - lanes[name]) for name, new in impulses.items()}
     for r in range(6):
         out[f"base{r}"] = base[r]
     return out
 
 
-def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str]) -> tuple[Vector, Vector, Out]:
+def _numbers(i: int, pairs: bool) -> list[int]:
+    return [i, i + 4] if pairs else [i]
+
+
+def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str], pairs: bool) -> tuple[Vector, Vector, Out]:
     """Solve the friction rows of one leg in turn: gear of the leg, gear of the wheel, rolling resistance, contact."""
     out: Out = {}
     y = [lanes[f"y_leg{i}"], lanes[f"y_wheel{i}"]]
@@ -416,14 +426,14 @@ def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str]) -> 
         new = ops.clip(old - rate * lanes[f"inverse_gain_rolling{i}"], -bound, bound)
         base, y = _apply(lanes, f"rolling{i}", z, new - old, base, y)
         out[f"rolling_friction{i}"] = new
-    if len(contact_numbers(i, features)) == 2:
+    if pairs:
         base, y = _contact_pair(lanes, i, base, y, features, out)
     else:
         base, y = _contact_block(lanes, i, base, y, features, out)
     return base, y, out
 
 
-def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str]) -> tuple[Value, Value]:
+def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str], pairs: bool) -> tuple[Value, Value]:
     """Slope and curvature of the objective along a joint step that the bodies' motion does not show.
 
     Rotors with play turn on their own; a creeping tyre's dissipation, taken at its present multiplier, is |p|^2/2 times that.
@@ -435,7 +445,7 @@ def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str])
         change = new[f"gear_friction{j}"] - old
         slope = slope + (lanes[f"rotor_free{j}"] + gain * old) * change
         curvature = curvature + gain * (change * change)
-    for c in contact_numbers(i, features) if "compliance" in features else ():
+    for c in _numbers(i, pairs) if "compliance" in features else ():
         multiplier = ops.where_positive(lanes[f"creep_speed{i}"], new[f"multiplier{c}"], 0.0)
         for a in "xy":
             inverse = lanes[f"acting_inverse_mu_{a}{c}"]
@@ -469,6 +479,8 @@ def _contact_block(lanes: Lanes, i: int, base: Vector, y: Vector, features: froz
     """Solve the one contact of wheel ``i``."""
     slip = _slip_of(lanes, i, base, y)
     new, out[f"multiplier{i}"] = _friction_block(lanes, i, slip, lanes[f"multiplier{i}"], features)
+    if "relief" in features:  # as where there are pairs, among which it is chosen
+        new = [ops.rounded(value) for value in new]
     return _move_contact(lanes, i, new, base, y, out)
 
 
@@ -478,12 +490,17 @@ def _contact_pair(lanes: Lanes, i: int, base: Vector, y: Vector, features: froze
     slips = {c: _slip_of(lanes, c, base, y) for c in pair}
     new: dict[int, Vector] = {c: [lanes[f"friction_{a}{c}"] for a in "xy"] for c in pair}
     multipliers = {c: lanes[f"multiplier{c}"] for c in pair}
-    for _ in range(PAIR_ROUNDS):
+    for turn in range(PAIR_ROUNDS):
         for c, other in (pair, pair[::-1]):
             change = [new[other][k] - lanes[f"friction_{a}{other}"] for k, a in enumerate("xy")]
             gains = [[lanes[f"coupling_{a}{b}{i}" if c == i else f"coupling_{b}{a}{i}"] for b in "xy"] for a in "xy"]
             slip = [slips[c][k] + dot(gains[k], change) for k in range(2)]
-            new[c], multipliers[c] = _friction_block(lanes, c, slip, multipliers[c], features)
+            better, multiplier = _friction_block(lanes, c, slip, multipliers[c], features)
+            if turn:  # alone, a contact is solved once
+                touches = lanes[f"bound{other}"]
+                better = [ops.where_positive(touches, better[k], new[c][k]) for k in range(2)]
+                multiplier = ops.where_positive(touches, multiplier, multipliers[c])
+            new[c], multipliers[c] = better, multiplier
     for c in pair:
         out[f"multiplier{c}"] = multipliers[c]
         base, y = _move_contact(lanes, c, new[c], base, y, out)

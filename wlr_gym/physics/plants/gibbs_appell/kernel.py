@@ -133,13 +133,14 @@ def trace(features: frozenset[str], precision: str) -> dict[str, dict[str, Any]]
     blocks = {
         "setup": {name: value for name, value in setup.items() if name not in known},
         "sweep": gauss.kick_sweep(inner, features),
+        **({"sweep_pairs": gauss.kick_sweep(inner, features, pairs=True)} if "piece" in features else {}),
         "finish": substep.kick_finish(inner, step, features),
     }
     prepare: dict[str, Any] = {}
     for name in blocks:
         blocks[name], hoisted = hoist(blocks[name], _FIXED.__contains__, f"{name}_constant")
         prepare |= hoisted
-    blocks["setup"] = _without_unread(blocks["setup"], blocks["sweep"], blocks["finish"])
+    blocks["setup"] = _without_unread(blocks["setup"], *(blocks[name] for name in blocks if name != "setup"))
     if "forces" in features:
         blocks["sense"] = substep.sense(lanes, step, features)
     return {
@@ -199,14 +200,14 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
             f"        {block}_of_robot({', '.join(['w', 'k', *scalars])})",
             "",
         ]
-    return "\n".join(lines) + ("" if "forces" in features else _driver(start, width, precision))
+    return "\n".join(lines) + ("" if "forces" in features else _driver(start, width, precision, "piece" in features))
 
 
 def driver_source(features: frozenset[str], precision: str, width: int, blocks: str, formulas: str) -> str:
     """Return the driver module that steps the blocks of module ``blocks`` under the formula forces of module ``formulas``."""
     traced = trace(features, precision)
     imports = f"from {blocks} import {', '.join(traced)}\nfrom {formulas} import evaluate\nF = np.{precision}\n"
-    return imports + _driver(_places(traced, width), width, precision, _APPLY_FORMULAS)
+    return imports + _driver(_places(traced, width), width, precision, "piece" in features, _APPLY_FORMULAS)
 
 
 def _places(blocks: Mapping[str, Mapping[str, Any]], width: int) -> dict[str, int]:
@@ -216,7 +217,7 @@ def _places(blocks: Mapping[str, Mapping[str, Any]], width: int) -> dict[str, in
     return {name: index * width for index, name in enumerate(names)}
 
 
-def _driver(start: Mapping[str, int], width: int, precision: str, apply_formulas: str = "") -> str:
+def _driver(start: Mapping[str, int], width: int, precision: str, has_pairs: bool, apply_formulas: str = "") -> str:
     values = {
         "width": width,
         "scratch": len(start) * width,
@@ -247,11 +248,13 @@ def _driver(start: Mapping[str, int], width: int, precision: str, apply_formulas
         "raw_wheel_column": RAW_LAYOUT.slices["joint_position"].start + FIRST_WHEEL,
         "raw_pose": RAW_LAYOUT.slices["pose"].start,
         "turn": TURN,
+        "second_normal": start["normal4"],
     }
     single = precision == "float32"
     parts = {
         "apply_formulas": apply_formulas.format(**values),
         "unwrap": _UNWRAP.format(**values) if single else "",
+        "sweeping": (_SWEEP_PAIRS if has_pairs else _SWEEP).format(**values),
         "count_anew": _COUNT_ANEW.format(**values) if single else "",
     }
     return _DRIVER.format(**values, **parts)
@@ -264,6 +267,19 @@ _APPLY_FORMULAS = """
             seen = W[{sensed} : {sensed} + {sensed_count} * {width}].reshape({sensed_count}, {width})
             pushes = W[{formula} : {formula} + {formula_count} * {width}].reshape({formula_count}, {width})
             evaluate(seen, formula_values[tile], memory[tile], pushes, step)"""
+_SWEEP = """
+            for _ in range(sweeps):
+                sweep(W)"""
+#: Where no robot of the tile touches at a second contact of any wheel, the passes leave these out.
+_SWEEP_PAIRS = """
+            touched = F(0.0)
+            for at in range(4 * {width}):
+                touched = max(touched, W[{second_normal} + at])
+            for _ in range(sweeps):
+                if touched > F(0.0):
+                    sweep_pairs(W)
+                else:
+                    sweep(W)"""
 #: Single precision: the shown wheel angles and place, put together in double precision.
 _UNWRAP = """
         for i in range(4):
@@ -332,9 +348,7 @@ def tick(
         prepare(W, step)
         drift(W, half)
         for s in range(substeps):{apply_formulas}
-            setup(W, step, (F(s) + F(0.5)) * step)
-            for _ in range(sweeps):
-                sweep(W)
+            setup(W, step, (F(s) + F(0.5)) * step){sweeping}
             finish(W, step)
             drift(W, step if s + 1 < substeps else half){count_anew}
         observe(W, step)

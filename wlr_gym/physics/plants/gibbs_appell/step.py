@@ -23,7 +23,7 @@ solved in ``gauss.py``; ``kinematics.py`` has the geometry and the names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
@@ -34,9 +34,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     INPUTS_OF_FORMULAS,
     SINGLE,
     TURN,
-    Contact,
     axes_on,
-    contact_numbers,
     contact_place,
     contacts_of,
     cross,
@@ -110,11 +108,12 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
         new_rates[i], new_rates[FIRST_WHEEL + i] = leg_rate - u[4], wheel_rate - leg_rate
         old_rates[i] = lanes[f"leg_rate{i}"] - lanes["wy"]
         old_rates[FIRST_WHEEL + i] = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
-        slips = [_slip_after(lanes, c) for c in contact_numbers(i, features)]
-        slip = more_loaded(lanes, i, *slips) if len(slips) == 2 else slips[0]
-        for k, a in enumerate("xy"):
+        for a, wheel_entry in (("x", -lanes[f"rolling_radius{i}"]), ("y", 0.0)):
+            z = [lanes[f"z_{a}{i}_{r}"] for r in range(6)]
+            slip = dot(z, [lanes[f"base{r}"] for r in range(6)]) + lanes[f"leg_entry_{a}{i}"] * lanes[f"y_leg{i}"]
+            slip = slip + wheel_entry * lanes[f"y_wheel{i}"]
             name = f"slip_displacement_{a}{i}"
-            out[name] = lanes[name] + step * slip[k]
+            out[name] = lanes[name] + step * slip
     mechanical, electrical = lanes["mechanical_energy"], lanes["electrical_energy"]
     for j in range(8):
         friction = lanes[f"gear_friction{j}"]
@@ -136,22 +135,6 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
     return out
 
 
-def _slip_after(lanes: Lanes, c: int) -> list[Value]:
-    """Slip (m/s) of contact ``c`` under the final impulses."""
-    i, slips = c % len(CORNERS), []
-    for a, wheel_entry in (("x", -lanes[f"rolling_radius{c}"]), ("y", 0.0)):
-        z = [lanes[f"z_{a}{c}_{r}"] for r in range(6)]
-        slip = dot(z, [lanes[f"base{r}"] for r in range(6)]) + lanes[f"leg_entry_{a}{c}"] * lanes[f"y_leg{i}"]
-        slips.append(slip + wheel_entry * lanes[f"y_wheel{i}"])
-    return slips
-
-
-def more_loaded(lanes: Lanes, i: int, first: Sequence[Value], second: Sequence[Value]) -> list[Value]:
-    """Return values of that contact of wheel ``i`` which carries more; of the first where both carry the same."""
-    more = lanes[f"normal{i + 4}"] - lanes[f"normal{i}"]
-    return [ops.where_positive(more, b, a) for a, b in zip(first, second, strict=True)]
-
-
 def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -> Out:
     """Columns of the truth matrix, in the order of TRUTH_LAYOUT, then the raw sensor channels."""
     rows = rotation_rows(lanes)
@@ -170,20 +153,21 @@ def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -
     out |= {f"motor_torque_{j}": lanes[f"motor_torque{j}"] for j in range(8)}
     out |= {f"friction_torque_{j}": lanes[f"gear_friction{j}"] * (1.0 / step) for j in range(8)}
     out |= {f"rolling_torque_{i}": lanes[f"rolling_friction{i}"] * (1.0 / step) for i in CORNERS}
-    forces: dict[int, list[Value]] = {}
-    slips: dict[int, list[Value]] = {}
-    frictions: dict[int, list[Value]] = {}
+    frictions: list[ground.Friction] = []
     for i in CORNERS:
-        contacts = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
-        seen = [_seen_contact(lanes, contact, rows, [*v, *w], step, features) for contact in contacts]
-        force, slip, friction = (list(group) for group in seen[0])
-        if len(seen) == 2:
-            force, slip, friction = (more_loaded(lanes, i, a, b) for a, b in zip(*seen, strict=True))
-        forces[i], slips[i], frictions[i] = force, slip, friction
-    out |= {f"contact_force_{i}_{a}": forces[i][k] for i in CORNERS for k, a in enumerate(AXES)}
-    out |= {f"slip_velocity_{i}_{a}": slips[i][k] for i in CORNERS for k, a in enumerate("xy")}
+        for a in "xy":
+            out[f"contact_force_{i}_{a}"] = lanes[f"friction_{a}{i}"] * (1.0 / step)
+        out[f"contact_force_{i}_z"] = lanes[f"normal{i}"]
+    for i in CORNERS:  # where there are two contacts: at the deeper one
+        contact = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)[0]
+        slip = slip_velocity(lanes, contact, [*v, *w], features)
+        out[f"slip_velocity_{i}_x"], out[f"slip_velocity_{i}_y"] = slip
+        place = contact_place(lanes, rows, contact)
+        speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
+        frictions.append(ground.friction(lanes, i, place[0], place[1], speed, features))
     out |= {f"slip_displacement_{i}_{a}": lanes[f"slip_displacement_{a}{i}"] for i in CORNERS for a in "xy"}
-    out |= {f"effective_friction_{i}_{a}": frictions[i][k] for i in CORNERS for k, a in enumerate("xy")}
+    for i, found in enumerate(frictions):
+        out[f"effective_friction_{i}_x"], out[f"effective_friction_{i}_y"] = found.mu_x, found.mu_y
     # own names: outputs lie side by side, apart from the stored sums they show
     out["shown_mechanical_energy"], out["shown_electrical_energy"] = lanes["mechanical_energy"], lanes["electrical_energy"]
     out["body_clearance"] = _clearance(lanes, rows, features)
@@ -201,19 +185,6 @@ def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -
     out |= {"raw_height": height} | {f"raw_quaternion_{a}": lanes[f"q{a}"] for a in "wxyz"}
     out |= {"raw_x": lanes["px"], "raw_y": lanes["py"], "heading_cosine": rows[0][0], "heading_sine": rows[1][0]}
     return out
-
-
-def _seen_contact(
-    lanes: Lanes, contact: Contact, rows: list[Vector], twist: Vector, step: Value, features: frozenset[str]
-) -> tuple[list[Value], list[Value], list[Value]]:
-    """Force (N), slip velocity (m/s) and friction coefficients of a contact, along its axes."""
-    c = contact.number
-    force = [lanes[f"friction_{a}{c}"] * (1.0 / step) for a in "xy"]
-    slip = slip_velocity(lanes, contact, twist, features)
-    place = contact_place(lanes, rows, contact)
-    speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
-    friction = ground.friction(lanes, contact.wheel, place[0], place[1], speed, features)
-    return [*force, lanes[f"normal{c}"]], slip, [friction.mu_x, friction.mu_y]
 
 
 def _clearance(lanes: Lanes, rows: list[Vector], features: frozenset[str]) -> Value:

@@ -364,11 +364,8 @@ def _add_slip(lanes: Lanes, step: Value, features: frozenset[str], out: Out) -> 
     level = axes_on(rows[2])
     twist = [*vector(lanes, "v"), *vector(lanes, "w")]
     for i in CORNERS:
-        contacts = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
-        slips = [slip_velocity(lanes, contact, twist, FEATURES) for contact in contacts]
-        slip = slips[0]
-        if len(slips) == 2:
-            slip = engine.more_loaded({f"normal{c}": out[f"force_z{c}"] for c in (i, i + 4)}, i, *slips)
+        contact = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)[0]
+        slip = slip_velocity(lanes, contact, twist, FEATURES)
         for a, speed in zip("xy", slip, strict=True):
             out[f"slip_displacement_{a}{i}"] = lanes[f"slip_displacement_{a}{i}"] + step * speed
 
@@ -379,9 +376,8 @@ def _add_slip(lanes: Lanes, step: Value, features: frozenset[str], out: Out) -> 
 def observe(lanes: Lanes, features: frozenset[str] = FEATURES) -> Out:
     """Columns of the truth matrix, then the raw sensor channels: the engine's observation of the same state."""
     lanes = with_engine_rates(lanes)
-    contacts = [c for i in CORNERS for c in contact_numbers(i, features)]
-    renamed: Out = {f"friction_{a}{c}": lanes[f"force_{a}{c}"] for c in contacts for a in "xy"}
-    renamed |= {f"normal{c}": lanes[f"force_z{c}"] for c in contacts}
+    renamed: Out = {f"friction_{a}{i}": lanes[f"force_{a}{i}"] for i in CORNERS for a in "xy"}
+    renamed |= {f"normal{i}": lanes[f"force_z{i}"] for i in CORNERS}
     renamed |= {f"gear_friction{j}": lanes[f"gear_torque{j}"] for j in range(8)}
     renamed |= {f"rolling_friction{i}": lanes[f"rolling_torque{i}"] for i in CORNERS}
     out = engine.observe(over(renamed, lanes), 1.0, features)  # impulses over a step of 1 are forces
