@@ -236,6 +236,8 @@ _EXPECTED = {
     "list_type": "a list",
     "tuple_type": "a list",
     "too_short": "at least {min_length}",
+    "union_tag_invalid": "{discriminator} one of {expected_tags}",
+    "union_tag_not_found": "a key {discriminator}",
 }
 #: Letters of a value that a message shows; a longer one is cut.
 _LONGEST = 60
@@ -325,8 +327,8 @@ def _either(problems: Sequence[Any]) -> str:
 
 def _fields_at(model: Any, path: Iterable[str]) -> list[str]:
     for part in path:
-        if get_origin(model) is dict:
-            model = _chosen(get_args(model)[1])
+        if get_origin(model) in (dict, list):
+            model = _chosen(get_args(model)[-1])
             continue
         field = getattr(model, "model_fields", {}).get(part)
         if field is None:
@@ -337,6 +339,6 @@ def _fields_at(model: Any, path: Iterable[str]) -> list[str]:
 
 def _chosen(annotation: Any) -> Any:
     """Return the model among the types that a value may have, such as X of X | None."""
-    if get_origin(annotation) is dict:
+    if get_origin(annotation) in (dict, list):
         return annotation
     return next((one for one in get_args(annotation) if hasattr(one, "model_fields")), annotation)

@@ -1,0 +1,353 @@
+"""The floor as data: a base, pieces that stand on it, its friction, and what of it is drawn anew for every episode.
+
+A floor writes parameters (``wave.*``, ``bumps.*``, ``piece.*``, ``patch.*``, ``ground.mu_*``), as randomisation and effects do:
+both simulators, snapshots, logs and pictures know of no other. What they mean: :mod:`wlr_gym.physics.plants.relief`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.random import stream_numbers, uniforms
+from wlr_gym.base.settings import ORDERED, SettingsModel, parse_config, read_config
+from wlr_gym.physics.plants.relief import LARGEST_CURVATURE
+from wlr_gym.robot import Robot
+from wlr_gym.robot.parameter_table import PATCHES, PIECES, SPECS, WAVES
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
+Number = float | Array
+#: Draws of a seed: a whole number from 0 on, below.
+SEEDS = int(SPECS["bumps.seed"].high) + 1
+EACH_EPISODE = "each_episode"
+
+Length = Annotated[float, Field(gt=0.0)]
+Place = tuple[float, float]
+
+
+class Plane(SettingsModel):
+    """A plane, z = 0."""
+
+    kind: Literal["plane"] = "plane"
+
+
+class Wave(SettingsModel):
+    """One sine: half of crest to trough (m), crest to crest (m), direction across the crests and phase at the origin (rad)."""
+
+    height: float = Field(ge=0.0)
+    length: float = Field(gt=0.0)
+    heading: float = 0.0
+    phase: float = 0.0
+
+
+class Waves(SettingsModel):
+    """The sum of sines."""
+
+    kind: Literal["waves"]
+    waves: list[Wave] = Field(min_length=1, max_length=len(WAVES))
+
+
+class Bumps(SettingsModel):
+    """A smooth surface over a square lattice, of whose points a share is raised by a random part of the height.
+
+    Attributes:
+        height: of the highest bump, m.
+        spacing: of the lattice, m.
+        share: of its points that are raised; the others are level.
+        seed: which ones.
+    """
+
+    kind: Literal["bumps"]
+    height: float = Field(ge=0.0)
+    spacing: Length
+    share: float = Field(default=1.0, gt=0.0, le=1.0)
+    seed: int = Field(default=0, ge=0, lt=SEEDS)
+
+
+class Kerb(SettingsModel):
+    """A piece with upright faces: a kerb or step where it has no end, a plank where it has a depth along its heading (m)."""
+
+    kind: Literal["kerb", "step", "plank"]
+    at: Place
+    heading: float = 0.0
+    height: Length
+    depth: Length = math.inf
+    edge_radius: Length = 0.003
+
+    model_config = SettingsModel.model_config | {"allow_inf_nan": True}
+
+
+class Ramp(SettingsModel):
+    """A way up of a slope (rad), a level top (m; default: no end), and a way down of a slope (default: the same)."""
+
+    kind: Literal["ramp"]
+    at: Place
+    heading: float = 0.0
+    slope: float = Field(gt=0.0, lt=math.pi / 2)
+    height: Length
+    depth: Length = math.inf
+    down_slope: float | None = Field(default=None, gt=0.0, le=math.pi / 2)
+    edge_radius: Length = 0.003
+
+    model_config = SettingsModel.model_config | {"allow_inf_nan": True}
+
+
+class Stairs(SettingsModel):
+    """Steps of a rise and a run (m); the last has no end."""
+
+    kind: Literal["stairs"]
+    at: Place
+    heading: float = 0.0
+    rise: Length
+    run: Length
+    count: int = Field(ge=1, le=len(PIECES))
+    edge_radius: Length = 0.003
+
+
+class Patch(SettingsModel):
+    """A rectangle of another friction; x and y: [from, to] in m, without them the floor has no end there."""
+
+    mu: float = Field(ge=0.0)
+    x: Annotated[tuple[float, float], ORDERED] = (-1e3, 1e3)
+    y: Annotated[tuple[float, float], ORDERED] = (-1e3, 1e3)
+
+
+class FloorFriction(SettingsModel):
+    """Friction of the floor (None: the robot's), and patches of another; later ones win."""
+
+    mu: float | None = Field(default=None, ge=0.0)
+    patches: list[Patch] = Field(default=[], max_length=len(PATCHES))
+
+
+Base = Annotated[Plane | Waves | Bumps, Field(discriminator="kind")]
+Piece = Annotated[Kerb | Ramp | Stairs, Field(discriminator="kind")]
+
+
+class Floor(SettingsModel):
+    """Contents of ``configs/floor/*.yaml``.
+
+    Attributes:
+        name: of it. summary: in words.
+        base: on which pieces stand; a piece's height counts from z = 0.
+        pieces: kerbs, planks, ramps and stairs; each step of stairs counts as one of eight.
+        friction: of the floor.
+        randomise: dotted place of a number (``pieces.0.height``) -> [low, high], or ``each_episode`` for a seed: drawn evenly
+            from the seed of the episode.
+    """
+
+    name: str = Field(default="floor", pattern=r"^[a-z][a-z0-9_]*$")
+    summary: str = ""
+    base: Base = Plane()
+    pieces: list[Piece] = Field(default=[])
+    friction: FloorFriction = FloorFriction()
+    randomise: dict[str, Annotated[tuple[float, float], ORDERED] | Literal["each_episode"]] = Field(default={})
+
+    @model_validator(mode="after")
+    def _possible(self) -> Floor:
+        count = sum(piece.count if isinstance(piece, Stairs) else 1 for piece in self.pieces)
+        if count > len(PIECES):
+            raise InputError(f"pieces: {count} pieces and steps, expected at most {len(PIECES)}")
+        for place, drawn in self.randomise.items():
+            self._check_draw(place, drawn)
+        return self
+
+    def _check_draw(self, place: str, drawn: Any) -> None:
+        numbers = dict(_numbers(self.model_dump(exclude={"name", "summary", "randomise"})))
+        if place not in numbers:
+            raise InputError(
+                f"randomise: '{place}': no number of this floor{nearest(place, numbers)}; it has {', '.join(numbers)}"
+            )
+        if (drawn == EACH_EPISODE) != place.endswith(".seed"):
+            wanted = f"'{EACH_EPISODE}'" if place.endswith(".seed") else "[low, high]"
+            raise InputError(f"randomise: {place} = {drawn!r}: expected {wanted}")
+        if place.endswith(".count"):
+            raise InputError(f"randomise: '{place}': how many steps there are cannot be drawn")
+
+    def content(self) -> dict[str, Any]:
+        """Return what a file says of it: all but what was not given."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether it is a plane with the robot's friction, so that it changes no parameter."""
+        return isinstance(self.base, Plane) and not self.pieces and self.friction == FloorFriction()
+
+    # ---- as parameters ----
+
+    def write(self, parameters: Parameters, seeds: NDArray[np.uint64]) -> None:
+        """Lay robots' parameters (N) on this floor, drawn by the seeds (N) of their episodes."""
+        if self.is_flat:
+            return
+        drawn = {}
+        if self.randomise:
+            draws = uniforms(seeds, stream_numbers(*(f"floor.{place}" for place in self.randomise)))
+            drawn = {place: self._between(place, draws[:, column]) for column, place in enumerate(self.randomise)}
+        self._write(parameters, drawn)
+
+    def _between(self, place: str, share: Array) -> Array:
+        """Return a number that is drawn, at a share (N) of its range."""
+        limits = self.randomise[place]
+        if isinstance(limits, str):
+            return np.floor(share * SEEDS)
+        return limits[0] + (limits[1] - limits[0]) * share
+
+    def _write(self, parameters: Parameters, drawn: Mapping[str, Array]) -> None:
+        def of(place: str, value: float) -> Number:
+            return drawn.get(place, value)
+
+        self._write_base(parameters, of)
+        slots = iter(range(len(PIECES)))
+        for number, piece in enumerate(self.pieces):
+            for shape in _shapes(piece, f"pieces.{number}", of):
+                slot = next(slots)
+                for name, value in shape.items():
+                    parameters[f"piece.{name}"][:, slot] = value
+        self._write_friction(parameters, of)
+
+    def _write_friction(self, parameters: Parameters, of: Drawn) -> None:
+        if self.friction.mu is not None:
+            for name in ("ground.mu_x", "ground.mu_y"):
+                parameters[name].T[:] = of("friction.mu", self.friction.mu)
+        for number, patch in enumerate(self.friction.patches):
+            where = f"friction.patches.{number}"
+            parameters["patch.mu"][:, number] = of(f"{where}.mu", patch.mu)
+            for axis, limits in (("x", patch.x), ("y", patch.y)):
+                for end, name in enumerate(("min", "max")):
+                    parameters[f"patch.{axis}_{name}"][:, number] = of(f"{where}.{axis}.{end}", limits[end])
+
+    def _write_base(self, parameters: Parameters, of: Drawn) -> None:
+        match self.base:
+            case Waves(waves=waves):
+                for number, wave in enumerate(waves):
+                    for field in ("height", "length", "heading", "phase"):
+                        place = f"base.waves.{number}.{field}"
+                        parameters[f"wave.{field}"][:, number] = of(place, getattr(wave, field))
+            case Bumps() as bumps:
+                for field in ("height", "spacing", "share", "seed"):
+                    parameters[f"bumps.{field}"][:] = of(f"base.{field}", getattr(bumps, field))
+
+    # ---- what cannot be ----
+
+    def check(self, robot: Robot) -> None:
+        """Refuse a floor on which a robot cannot be simulated, or whose start is inside a piece, at all ends of what is drawn.
+
+        Raises:
+            InputError: with the number, and what was expected.
+        """
+        for share in (np.zeros(1), np.full(1, 1.0 - 1e-9)):
+            parameters = Parameters.nominal(robot, 1)
+            self._write(parameters, {place: self._between(place, share) for place in self.randomise})
+            parameters.validate()
+            self._check_curvature(parameters, robot)
+            self._check_pieces(parameters, robot)
+
+    def _check_curvature(self, parameters: Parameters, robot: Robot) -> None:
+        number = 2.0 * np.pi / parameters["wave.length"][0]
+        curvature = float((parameters["wave.height"][0] * number**2).sum())
+        curvature += float(2.0 * parameters["bumps.height"][0] / parameters["bumps.spacing"][0] ** 2)
+        product = curvature * robot.wheel.radius
+        if product > LARGEST_CURVATURE:
+            raise InputError(
+                f"floor '{self.name}': base: its curvature reaches {curvature:.3g} 1/m, times the wheels' radius of "
+                f"{robot.wheel.radius:g} m {product:.2g}: expected at most {LARGEST_CURVATURE:g}, since a wheel touches a sharper "
+                "base at several places at once; lower it, stretch it, or make it a piece"
+            )
+
+    def _check_pieces(self, parameters: Parameters, robot: Robot) -> None:
+        there = np.flatnonzero(parameters["piece.height"][0] > 0.0)
+        pieces = [{name: float(parameters[f"piece.{name}"][0, k]) for name in _SHAPE} for k in there]
+        reach = math.hypot(robot.hip_position.x, robot.hip_position.y) + robot.wheel.radius
+        for number, piece in enumerate(pieces, 1):
+            foot, end = _along(piece, piece)
+            if foot < reach and end > -reach and not (foot <= -reach and end >= reach):
+                raise InputError(
+                    f"floor '{self.name}': piece {number}: it lies from {foot:.3g} to {end:.3g} m ahead of the robot's start, "
+                    f"(0, 0): expected {reach:.3g} m between the start and a face"
+                )
+        for (first, low), (second, high) in itertools.combinations(enumerate(pieces, 1), 2):
+            if math.cos(low["heading"] - high["heading"]) < 1.0 - 1e-9:
+                continue  # they cross somewhere; a wheel touches the two that are deepest
+            (foot, end), (other_foot, other_end) = _along(low, low), _along(high, low)
+            stacked = high["height"] > low["height"] and other_foot >= foot
+            if other_foot < end and foot < other_end and not stacked:
+                raise InputError(
+                    f"floor '{self.name}': pieces {first} and {second} overlap, from {max(foot, other_foot):.3g} to "
+                    f"{min(end, other_end):.3g} m along their heading: expected the later one higher and on top of the earlier"
+                )
+
+
+#: Returns the number at a dotted place of a floor: what was drawn for it (N), else what the file says.
+Drawn = Callable[[str, float], Number]
+_SHAPE = ("x", "y", "heading", "height", "length", "front_slope", "rear_slope", "edge_radius")
+
+
+def _shapes(piece: Kerb | Ramp | Stairs, where: str, of: Drawn) -> Iterator[dict[str, Number]]:
+    """Yield the parameters of a piece's profile; of stairs step by step."""
+
+    def number(field: str) -> Number:
+        return of(f"{where}.{field}", getattr(piece, field))
+
+    x, y = (of(f"{where}.at.{axis}", piece.at[axis]) for axis in range(2))
+    heading, upright = number("heading"), math.pi / 2
+    shape = {"x": x, "y": y, "heading": heading, "front_slope": upright, "rear_slope": upright}
+    shape |= {"edge_radius": number("edge_radius"), "length": SPECS["piece.length"].high}
+    if isinstance(piece, Stairs):
+        for step in range(piece.count):
+            ahead = step * number("run")
+            place = {"x": x + ahead * np.cos(heading), "y": y + ahead * np.sin(heading)}
+            yield shape | place | {"height": (step + 1) * number("rise")}
+        return
+    shape |= {"height": number("height"), "length": np.minimum(number("depth"), SPECS["piece.length"].high)}
+    if isinstance(piece, Ramp):
+        slope = number("slope")
+        shape |= {"front_slope": slope, "rear_slope": slope if piece.down_slope is None else number("down_slope")}
+    yield shape
+
+
+def _along(piece: Mapping[str, float], other: Mapping[str, float]) -> tuple[float, float]:
+    """Return where a piece begins and ends along the heading of another, from the floor's origin, m."""
+    foot = piece["x"] * math.cos(other["heading"]) + piece["y"] * math.sin(other["heading"])
+    faces = sum(piece["height"] / math.tan(piece[slope]) for slope in ("front_slope", "rear_slope"))
+    return foot, foot + piece["length"] + faces
+
+
+def _numbers(content: Any, place: str = "") -> Iterator[tuple[str, float]]:
+    """Yield every number of a floor with its dotted place."""
+    if isinstance(content, Mapping | list | tuple):
+        for key, value in content.items() if isinstance(content, Mapping) else enumerate(content):
+            yield from _numbers(value, f"{place}.{key}" if place else str(key))
+    elif isinstance(content, int | float):
+        yield place, content
+
+
+#: What ``floor=`` and ``--floor`` take; see :func:`load_floor`.
+FloorSource = str | Path | Mapping[str, Any] | Floor | None
+
+
+def load_floor(source: FloorSource, robot: Robot | None = None) -> Floor:
+    """Return a floor.
+
+    Args:
+        source: name in ``configs/floor/``, path of a YAML file, its content, or a floor; None = ``flat``.
+        robot: that shall drive on it; None = nothing is checked against one.
+
+    Raises:
+        InputError: naming file, field, value, what was expected and the nearest valid name.
+    """
+    if isinstance(source, Floor):
+        floor = source
+    else:
+        data, where = (source, "floor") if isinstance(source, Mapping) else read_config("floor", source or "flat")
+        floor = parse_config(Floor, data, where)
+    if robot is not None:
+        floor.check(robot)
+    return floor
