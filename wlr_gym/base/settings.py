@@ -326,19 +326,22 @@ def _either(problems: Sequence[Any]) -> str:
 
 
 def _fields_at(model: Any, path: Iterable[str]) -> list[str]:
+    """Return the keys that may stand at a place; where it may hold one model or another, those of all."""
+    models = [model]
     for part in path:
-        if get_origin(model) in (dict, list):
-            model = _chosen(get_args(model)[-1])
-            continue
-        field = getattr(model, "model_fields", {}).get(part)
-        if field is None:
-            return []
-        model = _chosen(field.annotation)
-    return list(getattr(model, "model_fields", {}))
+        models = [found for one in models for found in _models_in(_annotation_at(one, part))]
+    return list(dict.fromkeys(name for one in models for name in getattr(one, "model_fields", {})))
 
 
-def _chosen(annotation: Any) -> Any:
-    """Return the model among the types that a value may have, such as X of X | None."""
-    if get_origin(annotation) in (dict, list):
-        return annotation
-    return next((one for one in get_args(annotation) if hasattr(one, "model_fields")), annotation)
+def _annotation_at(model: Any, part: str) -> Any:
+    if get_origin(model) in (dict, list):
+        return get_args(model)[-1]
+    field = getattr(model, "model_fields", {}).get(part)
+    return None if field is None else field.annotation
+
+
+def _models_in(annotation: Any) -> list[Any]:
+    """Return the models, mappings and lists among the types that a value may have, such as X of X | None."""
+    if get_origin(annotation) in (dict, list) or hasattr(annotation, "model_fields"):
+        return [annotation]
+    return [found for one in get_args(annotation) for found in _models_in(one)]

@@ -29,6 +29,7 @@ from wlr_gym.envs.tasks.terms import COMPUTED, SCALARS
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics import plants
 from wlr_gym.physics.effects import load_patch
+from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, Sensors
 from wlr_gym.policy.agents import FED_AS
 
@@ -59,7 +60,7 @@ class Core:
     """N robots on a task.
 
     Attributes:
-        task, plant, randomization, patch: what it is made of. count: N.
+        task, plant, floor, randomization, patch: what it is made of. count: N.
         unmeasured: rewards and terminations of the task that are left out because a real robot cannot measure them.
         limit: control steps until an episode is truncated.
         episodes: seeds, steps so far and end flags. robots: parameters and where the episodes started.
@@ -87,6 +88,8 @@ class Core:
         config, robot = self.task.config, self.task.robot
         chosen = config.randomization if settings.randomization is None else settings.randomization
         self.randomization = load_randomization("none" if settings.is_real else chosen, robot)
+        on = config.floor if settings.floor is None else settings.floor
+        self.floor = load_floor("flat" if settings.is_real else on, robot)
         self.patch = load_patch(settings.effects)
         options = PlantOptions(
             control_period=config.control_period,
@@ -121,7 +124,9 @@ class Core:
         task, count, real = self.task, self.count, self.settings.is_real
         period = task.config.control_period
         self.episodes = Episodes(count)
-        self.robots = RandomizedRobots(task.robot, self.randomization, self.patch, period, count, task.config.sensors)
+        self.robots = RandomizedRobots(
+            task.robot, self.floor, self.randomization, self.patch, period, count, task.config.sensors
+        )
         self.actions = Actions(task.actions, count, self.settings.free_wheels)
         self.commands = Commands(task.config, task.robot, count)
         self.pipeline = ObservationPipeline(
@@ -311,7 +316,8 @@ class Core:
 
     def contract(self) -> dict[str, Any]:
         """Return what a policy must be fed and what its output means (see :func:`wlr_gym.envs.tasks.describe.contract`)."""
-        return contract(self.task, self.randomization.config.model_dump(mode="json", exclude_none=True))
+        randomization = self.randomization.config.model_dump(mode="json", exclude_none=True)
+        return contract(self.task, randomization, None if self.floor.is_flat else self.floor.content())
 
     def shorten(self, max_episode_steps: int | None) -> None:
         """Truncate episodes after ``max_episode_steps``, if that is before the task's own limit; None and -1 keep the limit."""
@@ -368,6 +374,7 @@ class Snapshots:
         self._fits = {
             "task": core.task.config.model_dump(mode="json"),
             "randomization": core.randomization.config.model_dump(mode="json"),
+            "floor": core.floor.content(),
             "effects": core.patch.content(),
             "free_wheels": core.settings.free_wheels,
             "observation": core.settings.observation,

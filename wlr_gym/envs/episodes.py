@@ -18,6 +18,7 @@ from wlr_gym.envs.tasks.randomization import DRIFT_PERIOD, Randomization
 from wlr_gym.envs.tasks.task import SensorsConfig, TaskConfig
 from wlr_gym.envs.tasks.terms import COMMANDS
 from wlr_gym.physics.effects import Patch, apply_patch
+from wlr_gym.physics.floor import Floor
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
@@ -274,7 +275,7 @@ class Commands:
 
 # ---- parameters and initial states -----------------------------------------------------------------------------------
 
-# What randomisation draws, then the effects, then which sensors the task gives the robots, then what the user sets.
+# What randomisation draws, then the floor, the effects, which sensors the task gives the robots, and what the user sets.
 
 
 Array = NDArray[np.float64]
@@ -285,6 +286,7 @@ class RandomizedRobots:
 
     Args:
         robot: the nominal one.
+        floor: that they drive on.
         randomization: what is drawn.
         patch: effects that are added to it.
         control_period: s.
@@ -301,12 +303,14 @@ class RandomizedRobots:
     def __init__(
         self,
         robot: Robot,
+        floor: Floor,
         randomization: Randomization,
         patch: Patch,
         control_period: float,
         count: int,
         sensors: SensorsConfig,
     ) -> None:
+        self._floor = floor
         self._randomization = randomization
         self._patch = patch
         self._presence = [(f"{name}.present", share) for name, share in sensors if share is not None]
@@ -314,7 +318,9 @@ class RandomizedRobots:
         self._period = control_period
         self.share: float = 1.0
         self._shares = np.ones(count)  # that the present episodes were drawn with
-        self.parameters: Parameters = apply_patch(patch, Parameters.nominal(robot, count))
+        self.parameters: Parameters = Parameters.nominal(robot, count)
+        floor.write(self.parameters, np.zeros(count, np.uint64))
+        self.parameters = apply_patch(patch, self.parameters)
         self.state: PlantState = randomization.state(self.parameters, np.zeros(count, np.uint64))
         self.changed = np.zeros(count, bool)
         self._overrides = np.full(count, None, dtype=object)  # {parameter: value} that users set for the present episodes
@@ -406,8 +412,9 @@ class RandomizedRobots:
     def _draw(
         self, robot_seeds: Seeds, seeds: Seeds, share: Array, occurrences: Counts | None = None, time: Array | None = None
     ) -> Parameters:
-        """Randomisation of some robots, then the effects, then the sensors."""
+        """Randomisation of some robots, then the floor, then the effects, then the sensors."""
         robots = self._randomization.parameters(robot_seeds, seeds, occurrences, time, share)
+        self._floor.write(robots, seeds)
         robots = apply_patch(self._patch, robots) if self._patch else robots
         for (name, share), drawn in zip(self._presence, uniforms(seeds, self._presence_streams).T, strict=True):
             robots[name] = drawn < share

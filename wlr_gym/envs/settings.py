@@ -13,6 +13,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 from wlr_gym.base.errors import InputError, check_name, nearest
 from wlr_gym.envs.tasks.randomization import RandomizationConfig
 from wlr_gym.physics.effects import Source
+from wlr_gym.physics.floor import FloorSource
 from wlr_gym.physics.plants import REAL
 from wlr_gym.physics.plants.base import RobotOptions, read_robot_options
 from wlr_gym.render.view import View, read_view
@@ -35,6 +36,8 @@ class EnvironmentOptions:
             (``.json``), or mapping; None = the task's.
         task: mapping laid over the task's file (``{"rewards": {"slip": {"weight": -2.0}}}``), or another task file. Its key
             ``fed_as`` names a task file of which only what a policy is fed holds.
+        floor: name in ``configs/floor/``, path of such a file, or mapping (``docs/floors.md``); None = the task's. What it
+            states, randomisation does not change.
         effects: what is added after randomisation: path of a patch file or name of one in ``configs/effects/``, an effect as a
             mapping (``{"name": "friction_level", "parameters": {"mu": 0.4}}``), or a list of any of these; None = nothing.
             See ``docs/effects.md``.
@@ -56,6 +59,7 @@ class EnvironmentOptions:
     robot: Annotated[RobotSource | None, "a name, a path, a mapping or a Robot"] = None
     randomization: Annotated[str | Path | Mapping[str, Any] | RandomizationConfig | None, "a name, a path or a mapping"] = None
     task: Annotated[str | Path | Mapping[str, Any] | None, "a name, a path or a mapping"] = None
+    floor: Annotated[FloorSource, "a name, a path, a mapping or a Floor"] = None
     effects: Annotated[Source, "a name, a path, a mapping or a list of these"] = None
     episode_length: Annotated[float | None, "a time above 0 s"] = None
     observation: Annotated[str, "a name"] = "policy"
@@ -106,6 +110,7 @@ class EnvironmentOptions:
             raise InputError("observation = 'dict': a real robot has no privileged observation")
         for keyword, harmful in (
             ("randomization", self.randomization not in (None, "none")),
+            ("floor", self.floor not in (None, "flat")),
             ("effects", self.effects),
             ("truth_info", self.truth_info),
         ):

@@ -257,9 +257,9 @@ class Floor(SettingsModel):
         product = curvature * robot.wheel.radius
         if product > LARGEST_CURVATURE:
             raise InputError(
-                f"floor '{self.name}': base: its curvature reaches {curvature:.3g} 1/m, times the wheels' radius of "
-                f"{robot.wheel.radius:g} m {product:.2g}: expected at most {LARGEST_CURVATURE:g}, since a wheel touches a sharper "
-                "base at several places at once; lower it, stretch it, or make it a piece"
+                f"floor '{self.name}': base: its curvature reaches {curvature:.3g} 1/m, {product:.2g} over the wheels' radius: "
+                f"expected at most {LARGEST_CURVATURE:g} over {robot.wheel.radius:g} m; a sharper base touches a wheel at "
+                "several places at once: lower it, stretch it, or make it a piece"
             )
 
     def _check_pieces(self, parameters: Parameters, robot: Robot) -> None:

@@ -266,7 +266,7 @@ def _numbers(value: Any) -> str:
     return f"[{', '.join(f'{number:g}' for number in value)}]" if isinstance(value, list) else f"{value:g}"
 
 
-def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
+def contract(task: Task, randomization: dict[str, Any], floor: dict[str, Any] | None = None) -> dict[str, Any]:
     """Return what a policy must be fed and what its output means, as plain JSON types.
 
     Keys: task, robot (name, hashes of its servos and of all its numbers; of another robot than ``nominal`` also its
@@ -274,7 +274,7 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
     source, element, unit, frame, offset, scale, limit, lag, device), observer (settings of the slip observer; None where the
     policy is not fed its estimate), controller (gains of the hand-written one, where the task names them), sensors (how often
     they are present; only where the task says it), latency, action (one entry per number: joint, quantity, unit, centre, scale,
-    low, high), commands and randomization.
+    low, high), commands, randomization and, where it is not flat, floor.
     """
     config = task.config
     return {
@@ -292,6 +292,7 @@ def contract(task: Task, randomization: dict[str, Any]) -> dict[str, Any]:
             name: {"unit": COMMANDS[name].unit, "range": list(limits)} for name, limits in config.commands.terms.items()
         },
         "randomization": randomization,
+        **({} if floor is None else {"floor": floor}),
     }
 
 

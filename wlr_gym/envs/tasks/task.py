@@ -164,6 +164,7 @@ class TaskConfig(SettingsModel):
     history: dict[Annotated[str, Field(pattern=r"^v\d+$")], str] = Field(default={"v0": "first version"}, min_length=1)
     robot: str = "nominal"
     randomization: str = "nominal"
+    floor: str = "flat"
     control_period: float = Field(gt=0, le=0.5)
     episode_length: float = Field(gt=0)
     action: ActionConfig
