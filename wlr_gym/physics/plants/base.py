@@ -185,6 +185,27 @@ class Truth(_Signals):
     __slots__ = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Where the wheels touch the floor, or are nearest to it; contacts i and i + 4 are those of wheel i, the deeper one first.
+
+    A wheel has a second contact only where pieces stand on the floor; without one its depth is -inf, all else is 0.
+
+    Attributes:
+        point: (N, 8, 3) of the wheel that is deepest, floor frame, m.
+        depth: (N, 8) how far it is in the floor, m; negative = how far away.
+        normal, heading, lateral: (N, 8, 3) of the floor upwards, of the wheel along it, of its axle along it; floor frame.
+        force: (N, 8, 3) on the wheel along heading, lateral and normal, last substep, N.
+    """
+
+    point: Array
+    depth: Array
+    normal: Array
+    heading: Array
+    lateral: Array
+    force: Array
+
+
 @dataclass(frozen=True)
 class Capabilities:
     """What a plant can do.

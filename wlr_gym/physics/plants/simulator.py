@@ -16,6 +16,7 @@ from wlr_gym.physics.plants.base import (
     SENSOR_LAYOUT,
     TRUTH_LAYOUT,
     Capabilities,
+    Contacts,
     PlantOptions,
     PlantState,
     Sensors,
@@ -239,6 +240,16 @@ class Simulator(ABC):
         present = np.zeros((self._count, 8))
         present[:, LEG_SLICE] = self._truth.joint_position[:, LEG_SLICE] + self.parameters["joint.zero_offset"]
         return present
+
+    @abstractmethod
+    def _contact_forces(self) -> Array:
+        """Return the forces (N, 8, 3) on the wheels at their contacts, along the contacts' axes, N."""
+
+    def contacts(self) -> Contacts:
+        """Return where the wheels touch the floor now, and the forces of the last step there."""
+        from wlr_gym.physics.plants.contacts import contacts_at
+
+        return contacts_at(self.robot, self.parameters, self._truth, self._contact_forces())
 
     def truth(self) -> Truth:
         """Return the true state after the last step or reset; overwritten by the next step."""

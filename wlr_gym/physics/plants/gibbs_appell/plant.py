@@ -16,7 +16,7 @@ from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground, relief
 from wlr_gym.physics.plants.base import MEMORY, Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.gibbs_appell import kernel
-from wlr_gym.physics.plants.gibbs_appell.kinematics import STORED, TURN
+from wlr_gym.physics.plants.gibbs_appell.kinematics import CONTACTS, STORED, TURN
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -46,6 +46,10 @@ _PLACE = {
     )
     for pattern in patterns
 }
+
+
+_FRICTION = np.array([STORED.index(f"friction_{a}{c}") for c in CONTACTS for a in "xy"])
+_NORMAL = np.array([STORED.index(f"normal{c}") for c in CONTACTS])
 
 
 class CompiledTick(NamedTuple):
@@ -239,6 +243,11 @@ class GibbsAppellPlant(Simulator):
             position[:, WHEEL_SLICE] += self._truth.joint_position[:, WHEEL_SLICE] - values[:, _PLACE["wheel_angle{}"]]
         wind_up = _gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64)
         return position, velocity, lead, rate, drop[:, 0], wind_up
+
+    def _contact_forces(self) -> Array:
+        values = _gather(self._lanes, self._width, self._all).astype(np.float64)
+        friction = values[:, _FRICTION].reshape(self._count, -1, 2) / self.options.physics_step
+        return np.concatenate([friction, values[:, _NORMAL][:, :, None]], axis=2)
 
     def _fits(self) -> dict[str, Any]:
         return super()._fits() | {"sweeps": self.sweeps}

@@ -15,6 +15,7 @@ from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import COORDINATES, INPUTS, MEMORY, Capabilities, PlantOptions, PlantState, Sensors
 from wlr_gym.physics.plants.forces import Force, compile_forces
+from wlr_gym.physics.plants.gibbs_appell.kinematics import CONTACTS
 from wlr_gym.physics.plants.mujoco.kernel import PARAMETER_LANES, addresses, load_kernel, pack
 from wlr_gym.physics.plants.mujoco.mjcf import build_model, principal_inertia
 from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH, FEATURES, ON_RELIEF, STATE, TICK_SUMS
@@ -30,6 +31,7 @@ _JOINT = np.array([0, 2, 4, 6, 1, 3, 5, 7])
 _LANE = {name: index for index, name in enumerate(STATE)}
 _ROTOR_LEAD = np.array([_LANE[f"rotor_lead{j}"] for j in range(8)])
 _ROTOR_RATE = np.array([_LANE[f"rotor_rate{j}"] for j in range(8)])
+_FORCES = np.array([_LANE[f"force_{a}{c}"] for c in CONTACTS for a in "xyz"])
 _SUMS = slice(_LANE[TICK_SUMS[0]], _LANE[TICK_SUMS[-1]] + 1)
 
 
@@ -144,6 +146,9 @@ class MujocoPlant(Simulator):
         names = ("reference_position", "reference_velocity", "rotor_lead", "rotor_rate")
         joints = (self._state[:, [_LANE[f"{name}{j}"] for j in range(8)]] for name in names)
         return *joints, self._state[:, _LANE["supply_drop"]].copy(), self._memory[1:].T.copy()
+
+    def _contact_forces(self) -> Array:
+        return self._state[:, _FORCES].reshape(self._count, -1, 3).copy()
 
     def _engine_stores(self) -> dict[str, RowStore]:
         inputs = {f"input{number}": values for number, values in enumerate(self._inputs)}
