@@ -407,6 +407,20 @@ GROUND_EFFECTS: tuple[Effect, ...] = (
         search=Search(CONTACT, "straight", WHEEL_SETS, steps("creep_speed", 0.02), least={"creep_speed": 0.003}),
     ),
     Effect(
+        "tyre_brush",
+        "an elastic tread: friction builds up with the way that the wheel rolls, and holds a parked robot",
+        "u' = s - |V|/sigma u, F = -c u - d s up to mu N; c = load/(slip_compliance sigma)",
+        WHEELS,
+        {
+            "slip_compliance": EffectParameter("-", "slip per friction over load", 0, 5, 0.0, (0, 0.5), 0.06),
+            "relaxation_length": EffectParameter(
+                "m", "way over which it builds up", 5e-4, 0.1, 0.005, (0.002, 0.02), 0.005, optional=True, is_size=False
+            ),
+        },
+        together(put("ground.slip_compliance", "slip_compliance"), put("ground.relaxation_length", "relaxation_length")),
+        "level",
+    ),
+    Effect(
         "wheel_radius_error",
         "a wheel larger or smaller than nominal",
         "radius = scale x nominal",

@@ -2,8 +2,8 @@
 
 Scalar source over lanes (see :mod:`wlr_gym.physics.plants.drive`), traced by each simulator into its own kernel. :func:`pack`
 fills the parameter lanes from the table, :func:`pack_body` those of what else acts on a robot from without. Families of
-effects that change what is traced: ``ground`` (patches, weakening), ``creep`` and ``rolling_resistance``; without the first two
-friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
+effects that change what is traced: ``ground`` (patches, weakening), ``compliance``, ``rolling_resistance`` and ``brush``;
+without the first friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 WHEEL_LANES = (
     "mu_x", "mu_y", "inverse_mu_x", "inverse_mu_y", "grip", "anisotropy", "kinetic_drop", "inverse_weakening_speed",
     "creep_speed", "inverse_creep_speed", "flattening", "rest_depth",
+    "tread_stiffness", "relaxation_length", "tread_damping", "inverse_rest_load",
 )  # fmt: skip
 _PATCH_FIELDS = ("mu", "x_min", "x_max", "y_min", "y_max")
 _PATCH_NUMBERS = range(len(PATCHES))
@@ -57,9 +58,20 @@ def pack(parameters: Parameters) -> dict[str, Array]:
         "inverse_creep_speed": 1.0 / np.where(creep_speed > 0.0, creep_speed, 1.0),
         "flattening": parameters["ground.flattening"],
         "rest_depth": load[:, None] / parameters["ground.normal_stiffness"],
+        "tread_stiffness": load[:, None]
+        * _inverse(parameters["ground.slip_compliance"])
+        / parameters["ground.relaxation_length"],
+        "relaxation_length": parameters["ground.relaxation_length"],
+        "tread_damping": parameters["ground.tread_damping"],
+        "inverse_rest_load": np.repeat(1.0 / np.maximum(load, 1e-3)[:, None], 4, axis=1),
     }
     lanes = {f"{name}{i}": wheel[name][:, i] for name in WHEEL_LANES for i in range(4)}
     return lanes | {f"patch_{name}{k}": parameters[f"patch.{name}"][:, k] for name in _PATCH_FIELDS for k in _PATCH_NUMBERS}
+
+
+def _inverse(values: Array) -> Array:
+    """Return 1/values, 0 where they are 0."""
+    return np.where(values > 0.0, 1.0 / np.where(values > 0.0, values, 1.0), 0.0)
 
 
 #: Parameter lanes of the body: gravity, pulls, the inertial sensors' low-pass, and half the body's size.
@@ -95,6 +107,7 @@ def families(parameters: Parameters) -> set[str]:
         "ground": has_patch.any() or (parameters["ground.kinetic_ratio"] != 1.0).any(),
         "compliance": parameters["ground.creep_speed"].any() or parameters["ground.flattening"].any(),
         "rolling_resistance": parameters["ground.rolling_resistance"].any(),
+        "brush": parameters["ground.slip_compliance"].any(),
     }
     return {name for name, is_present in present.items() if is_present}
 
@@ -143,3 +156,32 @@ def creep_share(lanes: Lanes, i: int, slip_speed: Value) -> tuple[Value, Value]:
     """
     share = ops.saturation(slip_speed * lanes[f"inverse_creep_speed{i}"])
     return share, (1.0 - share * share) * lanes[f"inverse_creep_speed{i}"]
+
+
+@dataclass(frozen=True)
+class Tread:
+    """The elastic tread of one wheel under its present load.
+
+    Attributes:
+        stiffness: along the floor, N/m.
+        held: what of it a step of rolling leaves: bristles leave the contact at its rear, unstrained ones enter at its front.
+        softness: slip that an impulse takes away within the step, m/s per N s; 0 where the tread is rigid.
+    """
+
+    stiffness: Value
+    held: Value
+    softness: Value
+
+
+def tread(lanes: Lanes, i: int, normal: Value, rolling_speed: Value, step: Value) -> Tread:
+    """Return the tread of wheel ``i`` under a normal force (N), rolling at a speed (m/s, 0 or more).
+
+    A brush with relaxation: shear u' = s - |V|/sigma u for the slip velocity s, force F = -c u - d s, at most mu N. Stiffness
+    c = C/sigma and relaxation length sigma both grow with the square root of the load, so that the slip stiffness C grows with
+    the load. Within a step of length h, implicitly: F = -c'(u + h s) - d s with c' = c/(1 + h |V|/sigma).
+    """
+    growth = ops.sqrt(ops.maximum(normal * lanes[f"inverse_rest_load{i}"], 1e-4))
+    stiffness = lanes[f"tread_stiffness{i}"] * growth
+    held = stiffness / (1.0 + step * rolling_speed / (lanes[f"relaxation_length{i}"] * growth))
+    softness = 1.0 / (step * step * held + step * lanes[f"tread_damping{i}"] + 1e-12)
+    return Tread(stiffness, held, ops.where_positive(stiffness, softness, 0.0))

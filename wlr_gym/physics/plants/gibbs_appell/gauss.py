@@ -88,6 +88,8 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
         damping = _push_of_motors(lanes, i, voltages, joints, step, features, momentum, own, out)
         for contact in corner.contacts:
             _friction_under_wheel(lanes, contact, rows, [*v, *w], features, out)
+            if "brush" in features:
+                _tread_under_wheel(lanes, contact, step, features, out)
         _eliminate(corner, damping, own, momentum, reduced)
 
     lower, inverse_diagonal = _cholesky(reduced)
@@ -222,6 +224,16 @@ def _friction_under_wheel(
     found, c = ground.friction(lanes, contact.wheel, place[0], place[1], speed, features), contact.number
     out[f"acting_mu_x{c}"], out[f"acting_mu_y{c}"] = found.mu_x, found.mu_y
     out[f"acting_inverse_mu_x{c}"], out[f"acting_inverse_mu_y{c}"] = found.inverse_mu_x, found.inverse_mu_y
+
+
+def _tread_under_wheel(lanes: Lanes, contact: Contact, step: Value, features: frozenset[str], out: Out) -> None:
+    """Stiffness of the tread at a contact, and the slip that its present shear stands for."""
+    c, i = contact.number, contact.wheel
+    _, radius = rolling_contact(lanes, contact, features)
+    found = ground.tread(lanes, i, out[f"normal{c}"], ops.absolute(radius * lanes[f"wheel_rate{i}"]), step)
+    out[f"tread{c}"], out[f"held{c}"], out[f"softness{c}"] = found.stiffness, found.held, found.softness
+    for a in "xy":
+        out[f"shear_slip_{a}{c}"] = (found.softness * step) * (found.held * lanes[f"shear_{a}{c}"])
 
 
 def _eliminate(corner: Corner, damping: tuple[Value, Value], own: Vector, momentum: Vector, reduced: list[list[Value]]) -> None:
@@ -436,7 +448,8 @@ def _leg_block(lanes: Lanes, i: int, base: Vector, features: frozenset[str], pai
 def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str], pairs: bool) -> tuple[Value, Value]:
     """Slope and curvature of the objective along a joint step that the bodies' motion does not show.
 
-    Rotors with play turn on their own; a creeping tyre's dissipation, taken at its present multiplier, is |p|^2/2 times that.
+    Rotors with play turn on their own; a creeping tyre's dissipation, taken at its present multiplier, is |p|^2/2 times that;
+    an elastic tread stores what it gives way.
     """
     slope: Value = 0.0
     curvature: Value = 0.0
@@ -453,6 +466,13 @@ def _beside_the_bodies(lanes: Lanes, i: int, new: Out, features: frozenset[str],
             change = inverse * new[f"friction_{a}{c}"] - old
             slope = slope + multiplier * (old * change)
             curvature = curvature + multiplier * (change * change)
+    for c in _numbers(i, pairs) if "brush" in features else ():  # strain energy of the tread
+        softness = lanes[f"softness{c}"]
+        for a in "xy":
+            old = lanes[f"friction_{a}{c}"]
+            change = new[f"friction_{a}{c}"] - old
+            slope = slope + (softness * old + lanes[f"shear_slip_{a}{c}"]) * change
+            curvature = curvature + softness * (change * change)
     return slope, curvature
 
 
@@ -540,6 +560,9 @@ def _friction_block(lanes: Lanes, c: int, slip: Vector, multiplier: Value, featu
     b_y = mu_y * (slip[1] - gain_xy * old_x - gain_y * old_y)
     a11 = mu_x * mu_x * gain_x + 1e-9
     a22 = mu_y * mu_y * gain_y + 1e-9
+    if "brush" in features:
+        b_x, b_y = b_x + mu_x * lanes[f"shear_slip_x{c}"], b_y + mu_y * lanes[f"shear_slip_y{c}"]
+        a11, a22 = a11 + mu_x * mu_x * lanes[f"softness{c}"], a22 + mu_y * mu_y * lanes[f"softness{c}"]
     a12 = mu_x * mu_y * gain_xy
 
     def impulse(multiplier: Value) -> tuple[Value, Value, Value, Value, Value]:

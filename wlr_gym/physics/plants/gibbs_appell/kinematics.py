@@ -37,6 +37,7 @@ STATE: tuple[str, ...] = (
     *(f"last_gap_rate{c}" for c in CONTACTS),
     *(f"friction_{a}{c}" for c in CONTACTS for a in "xy"),
     *(f"multiplier{c}" for c in CONTACTS),
+    *(f"shear_{a}{c}" for c in CONTACTS for a in "xy"),
     *(f"gear_friction{j}" for j in range(8)),
     *(f"rolling_friction{i}" for i in CORNERS),
     *(f"gyro_{a}" for a in AXES),

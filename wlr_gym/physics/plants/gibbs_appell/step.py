@@ -23,7 +23,7 @@ solved in ``gauss.py``; ``kinematics.py`` has the geometry and the names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
@@ -35,6 +35,7 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     SINGLE,
     TURN,
     axes_on,
+    contact_numbers,
     contact_place,
     contacts_of,
     cross,
@@ -108,12 +109,13 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
         new_rates[i], new_rates[FIRST_WHEEL + i] = leg_rate - u[4], wheel_rate - leg_rate
         old_rates[i] = lanes[f"leg_rate{i}"] - lanes["wy"]
         old_rates[FIRST_WHEEL + i] = lanes[f"wheel_rate{i}"] - lanes[f"leg_rate{i}"]
-        for a, wheel_entry in (("x", -lanes[f"rolling_radius{i}"]), ("y", 0.0)):
-            z = [lanes[f"z_{a}{i}_{r}"] for r in range(6)]
-            slip = dot(z, [lanes[f"base{r}"] for r in range(6)]) + lanes[f"leg_entry_{a}{i}"] * lanes[f"y_leg{i}"]
-            slip = slip + wheel_entry * lanes[f"y_wheel{i}"]
+        for a, slip in zip("xy", _slip_after(lanes, i), strict=True):
             name = f"slip_displacement_{a}{i}"
             out[name] = lanes[name] + step * slip
+    if "brush" in features:
+        for i in CORNERS:
+            for c in contact_numbers(i, features):
+                out |= _strained_tread(lanes, c, step)
     mechanical, electrical = lanes["mechanical_energy"], lanes["electrical_energy"]
     for j in range(8):
         friction = lanes[f"gear_friction{j}"]
@@ -132,6 +134,28 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
         )
         mean_rate = 0.5 * (lanes[f"w{a}"] + u[3 + k])  # over the step: the rate at its end would come half a step early
         out[f"gyro_{a}"] = lanes[f"gyro_{a}"] + lanes["low_pass"] * (mean_rate - lanes[f"gyro_{a}"])
+    return out
+
+
+def _slip_after(lanes: Lanes, c: int) -> Iterator[Value]:
+    """Yield the slip (m/s) of contact ``c`` along heading and axle under the final impulses."""
+    i = c % len(CORNERS)
+    for a, wheel_entry in (("x", -lanes[f"rolling_radius{c}"]), ("y", 0.0)):
+        z = [lanes[f"z_{a}{c}_{r}"] for r in range(6)]
+        slip = dot(z, [lanes[f"base{r}"] for r in range(6)]) + lanes[f"leg_entry_{a}{c}"] * lanes[f"y_leg{i}"]
+        yield slip + wheel_entry * lanes[f"y_wheel{i}"]
+
+
+def _strained_tread(lanes: Lanes, c: int, step: Value) -> Out:
+    """Shear of the tread at contact ``c`` after the step; where it slides, as much as the friction holds."""
+    impulse = [lanes[f"friction_{a}{c}"] for a in "xy"]
+    scaled = [impulse[k] * lanes[f"acting_inverse_mu_{a}{c}"] for k, a in enumerate("xy")]
+    slides = ops.sqrt(scaled[0] * scaled[0] + scaled[1] * scaled[1]) - (1.0 - 1e-6) * lanes[f"bound{c}"]
+    inverse = 1.0 / ops.maximum(lanes[f"tread{c}"], 1e-9)
+    out: Out = {}
+    for k, (a, slip) in enumerate(zip("xy", _slip_after(lanes, c), strict=True)):
+        stuck = (lanes[f"shear_{a}{c}"] + step * slip) * (lanes[f"held{c}"] * inverse)
+        out[f"shear_{a}{c}"] = ops.where_positive(slides, -(impulse[k] * (1.0 / step)) * inverse, stuck)
     return out
 
 

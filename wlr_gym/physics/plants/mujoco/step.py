@@ -13,8 +13,8 @@ the motors' torques and this step's model fields, after it :func:`after` reads w
   upwards, away from the floor; a capsule's tangent frame turns with its axis, a sphere's does not. Before each step the
   sphere is placed so that MuJoCo's contact point, which lies halfway into the overlap, is exactly the disc's lowest point.
 - Rolling resistance is a torque of our own: MuJoCo's (``condim`` 6) shares one cone with sliding friction, so a wheel that
-  rolls would lose its grip. Tyre creep is a force of our own: MuJoCo's friction knows no such curve. Both depend on a rate,
-  steeply; they are at the end of this file.
+  rolls would lose its grip. Tyre creep and the elastic tread are forces of our own: MuJoCo's friction knows no such curves.
+  They depend on a rate, steeply; they are at the end of this file.
 - MuJoCo's velocities: of the body origin in the floor frame, angular in the body frame, joint rates relative to the parent.
 """
 
@@ -51,7 +51,7 @@ from wlr_gym.robot import FIRST_WHEEL
 
 #: Families of effects: always all, so that no robot's bits can depend on what its neighbours have. On a floor with relief,
 #: :data:`ON_RELIEF`: MuJoCo's model is then another one.
-FEATURES = frozenset({"drive", "backlash", "ground", "compliance"})
+FEATURES = frozenset({"drive", "backlash", "ground", "compliance", "brush"})
 ON_RELIEF = FEATURES | {"relief", "waves", "bumps", "piece", "pieces"}
 
 #: MuJoCo's state by lane: ``qpos`` and ``qvel``. Joints along the tree: leg, wheel, leg, wheel, ...
@@ -78,6 +78,7 @@ STATE: tuple[str, ...] = (
     *(f"gyro_{a}" for a in AXES),
     *(f"acceleration_{a}" for a in AXES),
     *(f"own_force_{a}{c}" for c in CONTACTS for a in "xy"),
+    *(f"shear_{a}{c}" for c in CONTACTS for a in "xy"),
     *(f"rolling_torque{i}" for i in CORNERS),
     *(f"old_spin{i}" for i in CORNERS),
     *(f"old_{v}{a}" for v in "uw" for a in AXES),
@@ -226,16 +227,19 @@ def _push_contact(lanes: Lanes, contact: Contact, rows: list[Vector], step: Valu
     speed = ops.sqrt(slip[0] * slip[0] + slip[1] * slip[1])
     place = [lanes[f"p{a}"] + dot(rows[k], point) for k, a in enumerate("xy")]
     mu = ground.friction(lanes, i, place[0], place[1], speed, FEATURES)
-    creeps = lanes[f"creep_speed{i}"]
+    creeps, is_elastic = lanes[f"creep_speed{i}"], lanes[f"tread_stiffness{i}"]
     for a, value in (("x", mu.mu_x), ("y", mu.mu_y)):
-        out[f"friction_{a}{c}"] = ops.where_positive(creeps, LEAST_MU, ops.maximum(value, LEAST_MU))
+        least = ops.where_positive(creeps, LEAST_MU, ops.maximum(value, LEAST_MU))
+        out[f"friction_{a}{c}"] = ops.where_positive(is_elastic, LEAST_MU, least)
 
     push = ops.maximum(-(lanes[f"stiffness{i}"] * gap) - lanes[f"damping{i}"] * approach, 0.0)
     normal = ops.where_positive(-gap, push, 0.0)
     spin_inertia = lanes[f"wheel_spin{i}"] + out[f"armature_joint_rate{FIRST_WHEEL + i}"]
     creep = creep_force(lanes, contact, mu, normal, slip, speed, spin_inertia, step)
+    elastic = tread_force(lanes, contact, mu, normal, slip, out[f"rolling_radius{c}"], spin_inertia, step, out)
     for k, a in enumerate("xy"):
-        out[f"own_force_{a}{c}"] = creep[k] = ops.where_positive(creeps, creep[k], 0.0)
+        creep[k] = ops.where_positive(is_elastic, elastic[k], ops.where_positive(creeps, creep[k], 0.0))
+        out[f"own_force_{a}{c}"] = creep[k]
     force = [creep[0] * heading[k] + creep[1] * lateral[k] for k in range(3)]
     for k, a in enumerate(AXES):
         applied[f"u{a}"] = applied[f"u{a}"] + dot(rows[k], force)
@@ -454,3 +458,38 @@ def creep_force(
     x, y = force[0] * mu.inverse_mu_x, force[1] * mu.inverse_mu_y
     shrink = ops.minimum(normal / ops.sqrt(x * x + y * y + 1e-30), 1.0)
     return [shrink * f for f in force]
+
+
+def tread_force(
+    lanes: Lanes,
+    contact: Contact,
+    mu: ground.Friction,
+    normal: Value,
+    slip: Vector,
+    radius: Value,
+    spin_inertia: Value,
+    step: Value,
+    out: Out,
+) -> Vector:
+    """Force (N) of an elastic tread along heading and axle (:func:`wlr_gym.physics.plants.ground.tread`), and its new shear.
+
+    The shear first follows the slip that the last step has left; what this step adds is taken as in :func:`_relaxed`.
+    """
+    c, i = contact.number, contact.wheel
+    found = ground.tread(lanes, i, normal, ops.absolute(radius * lanes[f"wheel_rate{i}"]), step)
+    inverse_spin = lanes[f"radius{i}"] * lanes[f"radius{i}"] * (1.0 / spin_inertia)
+    lightness = [lanes[f"contact_lightness_x{i}"] + inverse_spin, lanes[f"contact_lightness_y{i}"]]
+    drag = step * found.held + lanes[f"tread_damping{i}"]
+    inverse_stiffness = 1.0 / ops.maximum(found.stiffness, 1e-9)
+    shear = [(lanes[f"shear_{a}{c}"] + step * slip[k]) * (found.held * inverse_stiffness) for k, a in enumerate("xy")]
+    force: Vector = []
+    for k, a in enumerate("xy"):
+        target = -(found.held * shear[k] + drag * slip[k])
+        force.append(_relaxed(lanes[f"own_force_{a}{c}"], target, step * lightness[k] * drag))
+    x, y = force[0] * mu.inverse_mu_x, force[1] * mu.inverse_mu_y
+    shrink = ops.minimum(normal / ops.sqrt(x * x + y * y + 1e-30), 1.0)
+    for k, a in enumerate("xy"):
+        force[k] = shrink * force[k]
+        strained = ops.where_positive(1.0 - shrink, -(force[k] * inverse_stiffness), shear[k])
+        out[f"shear_{a}{c}"] = ops.where_positive(normal, strained, 0.0)
+    return force
