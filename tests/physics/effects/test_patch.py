@@ -82,6 +82,10 @@ CHANGES = [
         | {f"ground.weakening_speed[wheel_{corner}]": 0.2 for corner in ("lf", "rf", "lr", "rr")},
     ),
     (("tyre_creep", ["wheel_rr"], {"creep_speed": 0.05}), {"ground.creep_speed[wheel_rr]": 0.05}),
+    (
+        ("tyre_brush", ["wheel_rr"], {"slip_compliance": 0.05, "relaxation_length": 0.01}),
+        {"ground.slip_compliance[wheel_rr]": 0.05, "ground.relaxation_length[wheel_rr]": 0.01},
+    ),
     (("rolling_resistance", ["wheel_lf"], {"coefficient": 0.1}), {"ground.rolling_resistance[wheel_lf]": 0.1}),
     (("wheel_radius_error", ["wheel_lr"], {"scale": 1.025}), {"wheel.radius[wheel_lr]": 0.034 * 1.025}),
     (

@@ -409,7 +409,7 @@ GROUND_EFFECTS: tuple[Effect, ...] = (
     Effect(
         "tyre_brush",
         "an elastic tread: friction builds up with the way that the wheel rolls, and holds a parked robot",
-        "u' = s - |V|/sigma u, F = -c u - d s up to mu N; c = load/(slip_compliance sigma)",
+        "u' = s - |V|/relaxation_length u, F = -load/(slip_compliance relaxation_length) u up to mu load",
         WHEELS,
         {
             "slip_compliance": EffectParameter("-", "slip per friction over load", 0, 5, 0.0, (0, 0.5), 0.06),
