@@ -55,7 +55,7 @@ RELIEF_LANES: tuple[str, ...] = (
 
 def families(parameters: Parameters) -> set[str]:
     """Return which families of relief some robot of the batch stands on."""
-    pieces = (parameters["piece.height"] > 0.0).any(axis=0)
+    pieces = np.any(parameters["piece.height"] > 0.0, axis=0)
     present = {
         "waves": parameters["wave.height"].any(),
         "bumps": parameters["bumps.height"].any(),

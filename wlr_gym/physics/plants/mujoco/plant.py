@@ -375,8 +375,8 @@ class RobotBatch:
     def stores(self) -> dict[str, RowStore]:
         """Return what a step takes from the one before it."""
         names = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")
-        contacts = {f"contact{number}": values for number, values in enumerate(self.per_contact)}
-        return {name: getattr(self, name) for name in names} | contacts
+        stores: dict[str, RowStore] = {name: getattr(self, name) for name in names}
+        return stores | {f"contact{number}": values for number, values in enumerate(self.per_contact)}
 
     def model_of(self, robot: int) -> mujoco.MjModel:
         """Return a copy of the model with the numbers of one robot."""

@@ -153,7 +153,8 @@ def before(lanes: Lanes, time: Value, step: Value, features: frozenset[str] = FE
     for i in CORNERS:
         contacts = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
         pushed = [_push_contact(lanes, contact, rows, step, applied, out) for contact in contacts]
-        _turn_wheel(lanes, i, *(reduce(add, each) for each in zip(*pushed, strict=True)), step, applied, out)
+        normal, swing, spin = (reduce(add, each) for each in zip(*pushed, strict=True))
+        _turn_wheel(lanes, i, normal, swing, spin, step, applied, out)
     out |= {f"applied_{name}": value for name, value in applied.items()}
     return out
 
