@@ -281,7 +281,7 @@ def test_contact_frames_of_a_tilted_robot_are_the_slip_definitions(robot, parame
     )
     truth = truth_of(parameters, quaternion=quaternion, position=[[0.3, -0.2, 0.25]])
     stage = posed(robot, truth, parameters)
-    points, heading, left = stage.contact_frames()
+    points, heading, left, *_ = stage.contact_frames()
     turn = np.array([0.3, -0.2, 0.9])  # rad/s, floor frame, about the body origin
     body = stage.data.body("body").xmat.reshape(3, 3)
     expected = contact_slip_velocity(
@@ -354,11 +354,11 @@ def test_text_stays_inside_and_can_be_left_out(new_scene, parameters):
     assert (changed.max(axis=0) <= [232, 312]).all()
 
 
-def test_the_robot_is_not_written_over(new_scene, parameters):
+def test_the_robot_is_not_written_over(new_scene, robot, parameters):
     lay_patch(parameters, 0, 0.05, (-0.5, 0.5), (-0.5, 0.5))
     scene = new_scene(View(size=(320, 240), camera="top"))
     scene.draw(truth_of(parameters), parameters)
-    ((_, place),) = scene._labels(marks.areas(parameters, np.zeros(2)), np.zeros(3))
+    ((_, place),) = scene._labels(posed(robot, truth_of(parameters), parameters), marks.areas(parameters, np.zeros(2)))
     robot, corner = scene.pixels([[0, 0, 0.1], [0.175, 0.16, 0.2]])
     assert np.linalg.norm(np.array(place) - robot) > np.abs(corner - robot).max()
 

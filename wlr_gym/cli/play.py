@@ -87,6 +87,8 @@ class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
     """Width and height of the video, pixels."""
     forces: bool = False
     """Also draw the friction force on each wheel; a page can switch it on and off."""
+    loads: bool = False
+    """Also draw the normal force on each wheel; a page draws it with the friction force."""
     path: bool = False
     """In a video: also draw where the robot went and where its commands would have taken it."""
 
@@ -136,7 +138,8 @@ def _check(options: PlayOptions) -> None:
 
 
 def _view(options: PlayOptions) -> View:
-    return View(size=options.size, camera=options.camera, forces=options.forces, path=options.path)
+    arrows = {"forces": options.forces, "loads": options.loads}
+    return View(size=options.size, camera=options.camera, path=options.path, **arrows)
 
 
 def _driver(options: PlayOptions, core: Core) -> Driver | None:
@@ -223,12 +226,13 @@ def _viewer(options: PlayOptions, robot: Robot, on_key: KeyCallback | None) -> V
 def show(options: PlayOptions, core: Core, policy: Policy, driver: Driver | None, new_viewer: NewViewer = _viewer) -> None:
     """Play in a window until it is closed, on a page until Ctrl-C, or for ``options.seconds``; ``new_viewer`` makes either."""
     from wlr_gym.learning.evaluation.film import commands, drive, present_time
+    from wlr_gym.physics.plants.contacts import contacts_of_plant
 
-    period = core.task.config.control_period
+    period, contacts = core.task.config.control_period, contacts_of_plant(core.plant)
     with closing(new_viewer(options, core.task.robot, driver.press if isinstance(driver, Keyboard) else None)) as viewer:
         for tick, _ in enumerate(drive(core, policy, options.seed, driver)):
             if options.seconds is not None and tick * period > options.seconds:
                 break
             texts = {"time": present_time(core), "command": commands(core), "title": options.agent}
-            if not viewer.show(core.plant.truth(), core.parameters, period=period, **texts):
+            if not viewer.show(core.plant.truth(), core.parameters, period=period, contacts=contacts, **texts):
                 break

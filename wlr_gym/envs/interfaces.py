@@ -27,7 +27,10 @@ from wlr_gym.envs.episodes import Mask, own_seed, read_seed
 from wlr_gym.envs.observation import read_actions
 from wlr_gym.envs.settings import read_settings, task_of
 from wlr_gym.envs.tasks.task import limits_of, scales_of, succeeded, tracking_error
+from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.plants.contacts import contacts_of_plant
 from wlr_gym.render.view import has_display, require_display
+from wlr_gym.robot.parameters import Parameters
 
 if TYPE_CHECKING:
     from wlr_gym.render import Scene, Viewer
@@ -278,7 +281,7 @@ class Pictures:
             from wlr_gym.render import Scene
 
             self._scene = Scene(self.core.task.robot, self.core.settings.picture_view)
-        return self._scene.draw(self.core.plant.truth(), self.core.parameters, row, **self._texts(row))
+        return self._scene.draw(*self._shown(), row, contacts=contacts_of_plant(self.core.plant), **self._texts(row))
 
     def show(self) -> None:
         """Show the first robot in a window, in real time. Once the user has closed it, nothing happens."""
@@ -288,13 +291,17 @@ class Pictures:
 
             self._viewer = Viewer(self.core.task.robot, self.core.settings.picture_view)
         period = self.core.task.config.control_period
-        self._viewer.show(self.core.plant.truth(), self.core.parameters, period=period, **self._texts(0))
+        contacts = contacts_of_plant(self.core.plant)
+        self._viewer.show(*self._shown(), period=period, contacts=contacts, **self._texts(0))
 
     def close(self) -> None:
         """Close the window and give OpenGL back."""
         for drawer in (self._scene, self._viewer):
             if drawer is not None:
                 drawer.close()
+
+    def _shown(self) -> tuple[Truth, Parameters]:
+        return self.core.plant.truth(), self.core.parameters
 
     def _texts(self, row: int) -> dict[str, Any]:
         core = self.core

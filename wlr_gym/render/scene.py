@@ -28,7 +28,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth, standing_state
 from wlr_gym.render import stage as marks
-from wlr_gym.render.stage import Area, Mark, Stage, Trail
+from wlr_gym.render.stage import Area, ContactsOf, Mark, Stage, Trail
 from wlr_gym.render.view import (
     CAMERAS,
     LOOK_HEIGHT,
@@ -91,6 +91,12 @@ class Canvas:
         self._rectangle = mujoco.MjrRect(0, 0, *size)
         self._upside_down = np.empty((size[1], size[0], 3), np.uint8)
 
+    def take_floor(self, model: mujoco.MjModel) -> None:
+        """Take the meshes of a floor that is not flat; the model is the one that it was made with."""
+        self._context.make_current()
+        for name in marks.MESHES:
+            mujoco.mjr_uploadMesh(model, self._drawing, model.mesh(name).id)
+
     def draw(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
         """Return the picture (H, W, 3) of a scene."""
         self._context.make_current()
@@ -151,6 +157,7 @@ class Scene:
         self._stage: Stage | None = None
         self._canvas: Canvas | None = None
         self._scene: mujoco.MjvScene | None = None
+        self._model: mujoco.MjModel | None = None
 
     def draw(
         self,
@@ -161,6 +168,7 @@ class Scene:
         result: str = "",
         look_at: ArrayLike | None = None,
         trails: Sequence[Trail] = (),
+        contacts: ContactsOf | None = None,
         **texts: Unpack[Texts],
     ) -> Picture:
         """Return the picture (H, W, 3), uint8, of one robot.
@@ -171,20 +179,26 @@ class Scene:
             result: last line of the text.
             look_at: (x, y) of the floor in the middle of the picture, m; None = the robot.
             trails: paths over the floor to draw.
+            contacts: ``plant.contacts``, for the forces on wheels that touch the floor twice; None = where each is deepest.
             texts: what else is written into the picture.
 
         Raises:
             InputError: no OpenGL on this machine; the message says what to install or set.
         """
         self._stage = stage = self._stage or Stage(self.robot, parameters, row, self.view.size)
-        stage.pose(truth, parameters, row)
+        stage.pose(truth, parameters, row, contacts)
+        has_new_floor = stage.lay_floor()
+        if self._model is not stage.model:
+            self.close()
         if self._canvas is None or self._scene is None:
-            self._canvas = Canvas(stage.model, self.view.size)
+            self._canvas, self._model = Canvas(stage.model, self.view.size), stage.model
             self._scene = mujoco.MjvScene(stage.model, maxgeom=stage.model.ngeom + MAX_MARKS)
+        elif has_new_floor:
+            self._canvas.take_floor(stage.model)
         scene, eye = self._scene, mujoco.MjvCamera()
         middle = truth.position[row] if look_at is None else np.asarray(look_at)
         up = up_direction(stage.parameters["ground.slope"][0])
-        place = (CAMERAS[self.view.camera], middle, stage.yaw(), up, magnification(self.robot))
+        place = (CAMERAS[self.view.camera], middle, stage.yaw(), up, magnification(self.robot), stage.level(middle))
         # The endless floor is laid out around the camera the scene had before, so it gets its own first.
         mujoco.mjv_updateCamera(stage.model, stage.data, eye, scene)
         aim(scene, *place)
@@ -193,12 +207,12 @@ class Scene:
         aim(scene, *place)
         floor = marks.areas(stage.parameters, truth.position[row]) if self.view.friction else []
         marks.add_marks(scene, marks_of(stage, floor, self.view))
-        marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail)])
+        marks.add_marks(scene, [piece for trail in trails for piece in marks.pieces(trail, stage)])
         picture = self._canvas.draw(scene)
         if not self.view.text:
             return picture
         lines = describe(stage, slip=self.view.slip, **texts) + [result] * bool(result)
-        notes = self._labels(floor, truth.position[row])
+        notes = self._labels(stage, floor)
         return annotate(picture, lines, legend(stage.parameters, self.view), self.view.friction, notes)
 
     def pixels(self, points: object) -> NDArray[np.float64]:
@@ -213,17 +227,18 @@ class Scene:
             self._canvas.close()
         self._canvas = self._scene = None
 
-    def _labels(self, floor: list[Area], position: NDArray[np.float64]) -> list[Note]:
+    def _labels(self, stage: Stage, floor: list[Area]) -> list[Note]:
         """Write the friction of each area on it, beside the robot and clear of the other text."""
         width, height = self.view.size
-        scale = magnification(self.robot)
-        middle = np.array([*position[:2], scale * LOOK_HEIGHT])
+        scale, position = magnification(self.robot), stage.truth.position[0]
+        middle = np.array([*position[:2], scale * LOOK_HEIGHT + stage.level(position)])
         around = middle + 0.32 * scale * np.vstack([np.eye(3), -np.eye(3)[:2]])
         robot = self.pixels(middle)
         clear = np.linalg.norm(self.pixels(around) - robot, axis=1).max() + 0.02 * width
         notes = []
         for area in floor:
-            places = self.pixels(area.points(position))
+            points = area.points(position)
+            places = self.pixels(points + stage.height(points)[:, None] * [0.0, 0.0, 1.0])
             inside = (np.abs(places[:, 0] / width - 0.5) < 0.44) & (np.abs(places[:, 1] / height - 0.5) < 0.46)
             text = (places[:, 0] < 0.48 * width) & ((places[:, 1] < 0.27 * height) | (places[:, 1] > 0.76 * height))
             good = inside & ~text & (np.linalg.norm(places - robot, axis=1) > clear)
@@ -235,11 +250,13 @@ class Scene:
 
 def marks_of(stage: Stage, floor: list[Area], view: View) -> list[Mark]:
     """Return all that is drawn besides the robot, posed in ``stage``."""
-    drawn: list[Mark] = [marks.squares(stage), *floor]
+    drawn = marks.ground(stage, floor)
     if view.friction:
         drawn += marks.spots(stage)
     if view.forces:
         drawn += marks.force_arrows(stage)
+    if view.loads:
+        drawn += marks.load_arrows(stage)
     if view.slip:
         drawn += marks.slip_arrows(stage)
     return drawn
@@ -253,11 +270,24 @@ def legend(parameters: Parameters, view: View) -> list[str]:
     lines = [f"{floor}, squares 0.2 m" if view.friction else "squares 0.2 m"]
     if view.slip:
         lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
+    lines += [relief] if (relief := _relief(parameters)) else []
     if view.forces:
         lines.append(f"friction (green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
+    if view.loads:
+        lines.append(f"load (light green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
     if view.path:
         lines.append("path: pink; as commanded: dashed")
     return lines
+
+
+def _relief(parameters: Parameters) -> str:
+    """Return how high one robot's floor is where it is not flat; nothing where it is."""
+    heights = {
+        "waves ±": parameters["wave.height"][0].sum(),
+        "bumps up to ": parameters["bumps.height"][0],
+        "pieces up to ": parameters["piece.height"][0].max(),
+    }
+    return ", ".join(f"{what}{1e3 * height:.3g} mm" for what, height in heights.items() if height > 0.0)
 
 
 #: Command -> label, unit, and the truth that answers it.

@@ -1,7 +1,7 @@
 """The robot as MuJoCo draws it: the model of :mod:`wlr_gym.physics.plants.mujoco.mjcf` without contacts, dressed up.
 
 Only shapes and joints are used; poses come from a plant's truth, so every plant looks the same. Beside the robot there are
-marks: areas of other friction, paths, arrows of slip and force. Nothing here needs OpenGL.
+marks: the floor where it is not flat, areas of other friction, paths, arrows of slip and force. Nothing here needs OpenGL.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -9,16 +9,20 @@ marks: areas of other friction, paths, arrows of slip and force. Nothing here ne
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 from itertools import pairwise
-from typing import Any, assert_never
+from typing import Any, NamedTuple, assert_never
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.plants.base import Contacts, Truth
+from wlr_gym.physics.plants.contacts import ContactsOf, contacts_at
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
+from wlr_gym.render import surface
+from wlr_gym.render.surface import REACH, Relief, Surface
 from wlr_gym.render.view import FORCE, LOAD, Colour, friction_colour, slip_colour
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameter_table import PATCHES
@@ -33,6 +37,9 @@ _SHAPES = ("body_pos", "body_quat", "geom_pos", "geom_quat", "geom_size", "geom_
 PAYLOAD_DENSITY = 2500.0  # kg/m3, for its size only
 SPOKES = 3
 SQUARE = 0.2  # m; width of the floor's squares
+DARK_SQUARE, SQUARE_LINE = 0.90, 0.62  # brightness of every second one, and of the lines between them
+#: Meshes of a floor that is not flat: of the bare floor, and of areas of other friction.
+MESHES = tuple(f"surface_{number}" for number in range(1 + len(PATCHES)))
 # Colours (red, green, blue, opacity), 0 to 1.
 METAL = (0.72, 0.74, 0.78, 1.0)
 DARK = (0.16, 0.17, 0.19, 1.0)
@@ -40,74 +47,153 @@ ACCENT = (1.0, 0.45, 0.05, 1.0)
 WHITE = (0.95, 0.95, 0.95, 1.0)
 
 
+class Frames(NamedTuple):
+    """Contacts of the wheels, (n, 3) each, floor frame: the first four are those of the wheels, where each is deepest.
+
+    Attributes:
+        points: m. heading, left, normal: unit vectors. force: along these three, N.
+    """
+
+    points: Array
+    heading: Array
+    left: Array
+    normal: Array
+    force: Array
+
+
 class Stage:
     """One robot in the pose of a plant.
 
     Attributes:
-        model, data: MuJoCo's; the model's structure never changes, so viewers and canvases may keep it.
+        model, data: MuJoCo's; viewers and canvases may keep them until :meth:`lay_floor` says otherwise.
         shape: changes when sizes or colours of the model do.
         truth, parameters: (1) of the robot as it was posed last.
+        relief: its floor; None = flat.
     """
 
     truth: Truth
+    relief: Relief | None
 
     def __init__(self, robot: Robot, parameters: Parameters, row: int = 0, size: tuple[int, int] = (640, 480)) -> None:
         self.robot = robot
         self._size = size
         self.parameters: Parameters = Parameters(parameters.values[[row]])
-        self.shape: bytes = self._shape_of_parameters()
+        self.shape: bytes = self._numbers(SHAPING)
+        self._room = 0
         self.model: Any = self._build()
         self.data: Any = mujoco.MjData(self.model)
         self._addresses = [int(self.model.joint(joint).qposadr[0]) for joint in JOINTS]
         self.wheel_bodies: list[int] = [int(self.model.body(wheel).id) for wheel in WHEELS]
+        self._floor, self._laid = b"", b""
+        self._contacts: Contacts | None = None
 
-    def pose(self, truth: Truth, parameters: Parameters, row: int = 0) -> None:
-        """Put the robot where row ``row`` of a plant's truth is, in the shape that row of its parameters gives it."""
+    def pose(self, truth: Truth, parameters: Parameters, row: int = 0, contacts: ContactsOf | None = None) -> None:
+        """Put the robot where row ``row`` of a plant's truth is, in the shape that row of its parameters gives it.
+
+        Args:
+            truth, parameters: of the same robots. row: which one.
+            contacts: of the same robots, for the forces on wheels that touch the floor twice; None = those where each wheel is
+                deepest, which the truth knows.
+        """
         self.truth, self.parameters = Truth(truth.values[[row]]), Parameters(parameters.values[[row]])
-        shape = self._shape_of_parameters()
+        shape, floor = self._numbers(SHAPING), self._numbers(surface.SHAPING)
         if shape != self.shape:
             other = self._build()
             for name in _SHAPES:
                 getattr(self.model, name)[:] = getattr(other, name)
             self.shape = shape
-        self.data.qpos[:3] = truth.position[row]
-        self.data.qpos[3:7] = truth.quaternion[row]
-        self.data.qpos[self._addresses] = truth.joint_position[row]
+        if floor != self._floor:
+            self.relief, self._floor = Relief.of(self.robot, self.parameters), floor
+        self._contacts = self._contacts_of(row, contacts) if self.relief else None
+        self._place()
+
+    def _place(self) -> None:
+        self.model.geom("floor").pos[2] = self.relief.lowest if self.relief else 0.0
+        self.data.qpos[:3] = self.truth.position[0]
+        self.data.qpos[3:7] = self.truth.quaternion[0]
+        self.data.qpos[self._addresses] = self.truth.joint_position[0]
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
 
-    def contact_frames(self) -> tuple[Array, Array, Array]:
-        """Return contact points, headings and axle directions in the floor, each (4, 3)."""
+    def lay_floor(self) -> bool:
+        """Lay the surface of a floor that is not flat around the robot into the model's meshes.
+
+        Returns:
+            Whether they have changed. ``model`` and ``data`` are others where there was no room for them.
+        """
+        if self.relief is None:
+            return False
+        middle = surface.STEP * np.round(self.truth.position[0, :2] / surface.STEP)
+        wanted = self._floor + middle.tobytes()
+        if wanted == self._laid:
+            return False
+        rectangles = [(area.low, area.high) for area in areas(self.parameters, middle)]
+        found = self.relief.surface(middle, rectangles)
+        needed = _room_for(found)
+        if needed > self._room:
+            self._room = round(1.2 * needed)
+            self.model = self._build(self._room)
+            self.data = mujoco.MjData(self.model)
+            self._place()
+        _fill_meshes(self.model, found)
+        self._laid = wanted
+        return True
+
+    def height(self, points: Array) -> Array:
+        """Return the floor's height (m) at points (N, 2 or more), m."""
+        return np.zeros(len(points)) if self.relief is None else self.relief.height(points[:, 0], points[:, 1])
+
+    def level(self, place: Array) -> float:
+        """Return the floor's mean height (m) around a place (x, y), m."""
+        return 0.0 if self.relief is None else self.relief.level(place)
+
+    def contact_frames(self) -> Frames:
+        """Return where the wheels touch the floor, or are nearest to it."""
+        if self._contacts is not None:
+            found = self._contacts
+            return Frames(*(one[0] for one in (found.point, found.heading, found.lateral, found.normal, found.force)))
         centres = self.data.xpos[self.wheel_bodies]
         axles = self.data.xmat[self.wheel_bodies].reshape(4, 3, 3)[:, :, 1]
         left = axles * [1.0, 1.0, 0.0]
         left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
         heading = np.cross(left, [0.0, 0.0, 1.0])
         upwards = np.cross(heading, axles)  # in the disc, away from its lowest point
-        return centres - self.parameters["wheel.radius"][0][:, None] * upwards, heading, left
+        points = centres - self.parameters["wheel.radius"][0][:, None] * upwards
+        return Frames(points, heading, left, np.tile([0.0, 0.0, 1.0], (4, 1)), self.truth.contact_force[0].reshape(4, 3))
 
     def yaw(self) -> float:
         """Return the heading of the body drawn last, rad."""
         ahead = self.data.body("body").xmat.reshape(3, 3)[:, 0]
         return float(np.arctan2(ahead[1], ahead[0]))
 
-    def _shape_of_parameters(self) -> bytes:
-        return b"".join(np.asarray(self.parameters[name]).tobytes() for name in SHAPING)
+    def _contacts_of(self, row: int, contacts: ContactsOf | None) -> Contacts:
+        if contacts is not None:
+            found = contacts()
+            return Contacts(**{field.name: getattr(found, field.name)[[row]] for field in fields(found)})
+        force = np.zeros((1, 8, 3))
+        force[:, :4] = self.truth.contact_force.reshape(1, 4, 3)
+        return contacts_at(self.robot, self.parameters, self.truth, force)
 
-    def _build(self) -> mujoco.MjModel:
+    def _numbers(self, names: Sequence[str]) -> bytes:
+        return b"".join(np.asarray(self.parameters[name]).tobytes() for name in names)
+
+    def _build(self, room: int = 0) -> mujoco.MjModel:
         shape = Parameters.nominal(self.robot)  # masses may be such that MuJoCo takes no model of them; they are not seen
         for name in SHAPING:
             shape[name] = self.parameters[name]
-        model = build_model(self.robot, shape, contacts=False, wheel_shape="capsule", extend=self._dress)
+        model = build_model(self.robot, shape, contacts=False, wheel_shape="capsule", extend=partial(self._dress, room=room))
         model.geom("floor").rgba = (*floor_colour(shape), 1.0)
+        model.geom("floor").sameframe = 0  # else it stays at z = 0
         payload = model.geom("payload")
         payload.size = 0.5 * np.cbrt(shape["payload.mass"][0] / PAYLOAD_DENSITY)
         payload.rgba[3] = float(shape["payload.mass"][0] > 0)
         return model
 
-    def _dress(self, spec: mujoco.MjSpec) -> None:
+    def _dress(self, spec: mujoco.MjSpec, room: int) -> None:
         _light_and_floor(spec, self._size)
+        if room:
+            _add_meshes(spec, room)
         _dress_platform(spec.body("body"), self.robot)
         for leg, wheel in zip(LEGS, WHEELS, strict=True):
             _geom(spec.body(leg), "CYLINDER", size=[0.022, 0.016, 0], quat=_AXLE, rgba=DARK)
@@ -147,15 +233,63 @@ def _light_and_floor(spec: mujoco.MjSpec, size: tuple[int, int]) -> None:
     # Two by two squares as a shade (red, green, blue, opacity) to be laid over floors of any colour.
     shades = np.zeros((256, 256, 4), np.uint8)
     # What shines through twice: MuJoCo draws once for the light that casts shadows, once for all others.
-    dark, line = (round(255 * (1.0 - np.sqrt(share))) for share in (0.90, 0.62))
+    dark, line = (round(255 * (1.0 - np.sqrt(share))) for share in (DARK_SQUARE, SQUARE_LINE))
     shades[:128, :128, 3] = shades[128:, 128:, 3] = dark
     shades[[0, -1], :, 3] = shades[:, [0, -1], 3] = line
     spec.add_texture(name="squares", type=texture.mjTEXTURE_2D, width=256, height=256, nchannel=4, data=shades.ravel())
     squares = spec.add_material(name="squares", texuniform=True, texrepeat=[1 / SQUARE] * 2, reflectance=0.0, specular=0.0)
     squares.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "squares"
+    shade = squares_picture()
+    spec.add_texture(name="shade", type=texture.mjTEXTURE_2D, width=256, height=256, nchannel=3, data=shade.ravel())
+    shaded = spec.add_material(name="shade", texuniform=True, texrepeat=[1 / SQUARE] * 2, reflectance=0.0, specular=0.0)
+    shaded.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "shade"
     spec.add_material(name="floor", reflectance=0.0, specular=0.0)
     plane = spec.geom("floor")
     plane.size, plane.material = [0.0, 0.0, 0.05], "floor"  # without end
+
+
+def squares_picture() -> NDArray[np.uint8]:
+    """Return two by two squares (256, 256, 3) that the colour of a floor is multiplied by."""
+    shades = np.full((256, 256, 3), 255, np.uint8)
+    shades[:128, :128] = shades[128:, 128:] = round(255 * DARK_SQUARE)
+    shades[[127, 128]] = shades[:, [127, 128]] = round(255 * SQUARE_LINE)
+    return shades
+
+
+def _add_meshes(spec: mujoco.MjSpec, room: int) -> None:
+    """Add meshes whose numbers :func:`_fill_meshes` replaces; the first has room for grids of so many lines each way."""
+    for name in MESHES:
+        lines = np.arange(float(room if name == MESHES[0] else 2))
+        grid = np.stack(np.meshgrid(lines, lines, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+        corner = np.arange(len(grid)).reshape(len(lines), len(lines))
+        a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
+        faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).ravel()
+        upwards = np.tile([0.0, 0.0, 1.0], len(grid))
+        spec.add_mesh(
+            name=name, uservert=grid.ravel(), userface=faces, usernormal=upwards, userfacenormal=faces,
+            inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
+        )  # fmt: skip
+
+
+def _room_for(found: Surface) -> int:
+    """Return how many lines a grid must have each way to have as many vertices and triangles as a surface."""
+    triangles = sum(map(len, found.faces))
+    return 1 + max(int(np.sqrt(len(found.vertices))), int(np.sqrt(triangles / 2))) + 1
+
+
+def _fill_meshes(model: Any, found: Surface) -> None:
+    """Write a surface into the model: all its meshes have the vertices of the first, and triangles one after the other."""
+    numbers = [int(model.mesh(name).id) for name in MESHES]
+    vertex, normal, face = (int(getattr(model, f"mesh_{kind}adr")[numbers[0]]) for kind in ("vert", "normal", "face"))
+    count = len(found.vertices)
+    model.mesh_vert[vertex : vertex + count], model.mesh_normal[normal : normal + count] = found.vertices, found.normals
+    for k, number in enumerate(numbers):
+        faces = found.faces[k] if k < len(found.faces) else found.faces[0][:0]
+        model.mesh_vertadr[number], model.mesh_vertnum[number] = vertex, count
+        model.mesh_normaladr[number], model.mesh_normalnum[number] = normal, count
+        model.mesh_faceadr[number], model.mesh_facenum[number] = face, len(faces)
+        model.mesh_face[face : face + len(faces)] = model.mesh_facenormal[face : face + len(faces)] = faces
+        face += len(faces)
 
 
 def _dress_platform(body: mujoco.MjsBody, robot: Robot) -> None:
@@ -208,7 +342,6 @@ SHAFT = 0.006  # m; half the width of an arrow
 #: m; slip arrows start this far outside the wheel's middle plane, beside the tyre, where they can be seen.
 SLIP_BESIDE = 0.022
 FORCE_BESIDE = 0.040  # m; force arrows start outside of them
-REACH = 15.0  # m; areas are drawn on the floor this far around the robot
 LAYER = 4e-4
 #: m; the floor's squares are drawn this far around the robot, and this high: over areas and pads.
 SQUARES_REACH = 40.0
@@ -261,9 +394,10 @@ class Trail:
 
 @dataclass(frozen=True)
 class Spot:
-    """A round pad under a wheel that has a floor friction of its own."""
+    """A round pad under a wheel that has a floor friction of its own; ``normal`` to the floor."""
 
     centre: Array
+    normal: Array
     mu: float
 
 
@@ -275,7 +409,30 @@ class Squares:
     material: int
 
 
-Mark = Squares | Area | Spot | Arrow
+@dataclass(frozen=True)
+class Mesh:
+    """One of :data:`MESHES`, of a floor that is not flat: its number, its colour, and number of the material of its squares."""
+
+    number: int
+    colour: Colour
+    material: int
+
+
+Mark = Squares | Area | Mesh | Spot | Arrow
+
+
+def ground(stage: Stage, floor: Sequence[Area]) -> list[Mark]:
+    """Return the floor around the robot, with its squares; ``floor`` are the areas whose colours are to be seen."""
+    if stage.relief is None:
+        return [squares(stage), *floor]
+    material, bare = int(stage.model.material("shade").id), floor_colour(stage.parameters)
+    colours = [bare, *(friction_colour(area.mu) for area in floor)]
+    numbers = [int(stage.model.mesh(name).id) for name in MESHES]
+    return [
+        Mesh(number, colours[k] if k < len(colours) else bare, material)
+        for k, number in enumerate(numbers)
+        if stage.model.mesh_facenum[number]
+    ]
 
 
 def squares(stage: Stage) -> Squares:
@@ -309,17 +466,20 @@ def spots(stage: Stage) -> list[Spot]:
     mu = 0.5 * (stage.parameters["ground.mu_x"][0] + stage.parameters["ground.mu_y"][0])
     if np.ptp(mu) < 1e-9:
         return []
-    points, _, _ = stage.contact_frames()
-    return [Spot(point, float(value)) for point, value in zip(points, mu, strict=True)]
+    frames = stage.contact_frames()
+    centres = frames.points[:4] * ([1.0, 1.0, 0.0] if stage.relief is None else 1.0)
+    return [Spot(*one) for one in zip(centres, frames.normal[:4], mu.tolist(), strict=True)]
 
 
-def pieces(trail: Trail) -> list[Arrow]:
-    """Return a trail as straight pieces of at least :data:`PIECE`."""
+def pieces(trail: Trail, stage: Stage | None = None) -> list[Arrow]:
+    """Return a trail as straight pieces of at least :data:`PIECE`, over the floor of a stage; None = over z = 0."""
     corners = list(trail.points[:1])
     for point in trail.points[1:]:
         if np.hypot(*(point - corners[-1])) >= PIECE:
             corners.append(point)
-    places = [np.append(point, 2.0 * LINE) for point in (*corners, *trail.points[1:][-1:])]
+    corners = np.array([*corners, *trail.points[1:][-1:]]).reshape(-1, 2)
+    height = 0.0 if stage is None else stage.height(corners)
+    places = np.column_stack([corners, np.full(len(corners), 2.0 * LINE) + height])
     parts = list(pairwise(places))[:: 2 if trail.dashed else 1]
     return [Arrow(a, b, trail.colour, has_head=False) for a, b in parts if np.hypot(*(b - a)[:2]) > 1e-6]
 
@@ -333,29 +493,34 @@ def slip_arrows(stage: Stage) -> list[Arrow]:
 
 
 def force_arrows(stage: Stage) -> list[Arrow]:
-    """Return one arrow per wheel: the floor's friction force on it."""
-    force = stage.truth.contact_force[0].reshape(4, 3)[:, :2]
-    return _arrows(stage, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * 4)
+    """Return one arrow per contact: the floor's friction force on the wheel."""
+    force = stage.contact_frames().force[:, :2]
+    return _arrows(stage, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * len(force))
 
 
 def load_arrows(stage: Stage) -> list[Arrow]:
-    """Return one arrow per loaded wheel: the floor's normal force on it, upwards beside the wheel."""
-    load = stage.truth.contact_force[0].reshape(4, 3)[:, 2]
-    points, _, left = stage.contact_frames()
-    starts = points + FORCE_BESIDE * OUTWARDS * left
-    ends = starts + np.minimum(FORCE_SCALE * load, LONGEST_ARROW)[:, None] * [0.0, 0.0, 1.0]
-    return [Arrow(starts[wheel], ends[wheel], LOAD) for wheel in np.flatnonzero(load >= FORCE_FLOOR)]
+    """Return one arrow per loaded contact: the floor's normal force on the wheel, along the normal, beside the wheel."""
+    frames = stage.contact_frames()
+    load = frames.force[:, 2]
+    starts = frames.points + FORCE_BESIDE * _outwards(frames.points) * frames.left
+    ends = starts + np.minimum(FORCE_SCALE * load, LONGEST_ARROW)[:, None] * frames.normal
+    return [Arrow(starts[contact], ends[contact], LOAD) for contact in np.flatnonzero(load >= FORCE_FLOOR)]
+
+
+def _outwards(points: Array) -> Array:
+    """Return which side of each contact is away from the body: 1 = the left one, (n, 1)."""
+    return np.tile(OUTWARDS, (len(points) // 4, 1))
 
 
 def _arrows(stage: Stage, vectors: Array, shortest: float, beside: float, colours: list[Colour]) -> list[Arrow]:
-    """Return an arrow in the floor per wheel with a vector (4, 2) along heading and left, m, that is not too short."""
-    points, heading, left = stage.contact_frames()
-    starts = points + beside * OUTWARDS * left + [0.0, 0.0, SHAFT + LAYER * 5]
+    """Return an arrow in the floor per contact with a vector (n, 2) along heading and left, m, that is not too short."""
+    points, heading, left, normal, _ = (one[: len(vectors)] for one in stage.contact_frames())
+    starts = points + beside * _outwards(points) * left + (SHAFT + LAYER * 5) * normal
     length = np.hypot(vectors[:, 0], vectors[:, 1])
     scale = np.minimum(1.0, LONGEST_ARROW / np.maximum(length, 1e-12))[:, None]
     ends = starts + scale * (vectors[:, :1] * heading + vectors[:, 1:] * left)
     drawn = np.flatnonzero((length >= shortest) & np.isfinite(length))
-    return [Arrow(starts[wheel], ends[wheel], colours[wheel]) for wheel in drawn]
+    return [Arrow(starts[contact], ends[contact], colours[contact]) for contact in drawn]
 
 
 # --- into MuJoCo's scene ----------------------------------------------------------------------------------------------
@@ -380,8 +545,11 @@ def _draw(geom: mujoco.MjvGeom, mark: Mark) -> None:
             _start(geom, "PLANE", [SQUARES_REACH, SQUARES_REACH, 0.0], [*middle, SQUARES_HEIGHT], (1.0, 1.0, 1.0))
             geom.matid = material
             geom.rgba[3] = 0.99  # only what is not quite opaque is blended with what lies below
-        case Spot(centre, mu):
-            _start(geom, "CYLINDER", [0.06, LAYER * 5, 0.0], centre * [1.0, 1.0, 0.0], friction_colour(mu))
+        case Mesh(number, colour, material):
+            _start(geom, "MESH", [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], colour)
+            geom.dataid, geom.matid, geom.specular = 2 * number, material, 0.0
+        case Spot(centre, normal, mu):
+            _start(geom, "CYLINDER", [0.06, LAYER * 5, 0.0], centre, friction_colour(mu), turn_to(normal))
         case Arrow(start, end, colour, has_head):
             kind, width = ("ARROW", SHAFT) if has_head else ("CAPSULE", LINE)
             _start(geom, kind, [width] * 3, start, colour)
@@ -391,8 +559,16 @@ def _draw(geom: mujoco.MjvGeom, mark: Mark) -> None:
             assert_never(mark)
 
 
-def _start(geom: mujoco.MjvGeom, kind: str, size: Sequence[float], position: ArrayLike, colour: Colour) -> None:
+def turn_to(normal: Array) -> Array:
+    """Return the smallest rotation (3, 3) that takes z to a normal."""
+    cross = np.array([[0.0, 0.0, normal[0]], [0.0, 0.0, normal[1]], [-normal[0], -normal[1], 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + normal[2])
+
+
+def _start(
+    geom: mujoco.MjvGeom, kind: str, size: Sequence[float], position: ArrayLike, colour: Colour, turn: Array | None = None
+) -> None:
     shape, paint = getattr(mujoco.mjtGeom, f"mjGEOM_{kind}"), np.array([*colour, 1.0], np.float32)
     sizes, place = np.array(size, np.float64), np.array(position, np.float64)
-    mujoco.mjv_initGeom(geom, shape, sizes, place, np.eye(3).ravel(), paint)
+    mujoco.mjv_initGeom(geom, shape, sizes, place, (np.eye(3) if turn is None else turn).ravel(), paint)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value

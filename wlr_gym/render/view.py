@@ -35,7 +35,8 @@ class View:
         camera: ``follow`` (fixed direction), ``chase`` (behind the robot), ``side`` or ``top``.
         friction: areas of other friction in their colours, and the bar that says which colour is which.
         slip: an arrow per slipping wheel, along the velocity of its contact point over the floor.
-        forces: an arrow per wheel, along the floor's friction force.
+        forces: an arrow per contact of a wheel, along the floor's friction force.
+        loads: an arrow per contact of a wheel, along the floor's normal force.
         path: of films: where the robot went, and, dashed, where its commands would have taken it from the same start.
         text: time, commands, speed, slip and the legend.
     """
@@ -45,6 +46,7 @@ class View:
     friction: bool = True
     slip: bool = True
     forces: bool = False
+    loads: bool = False
     path: bool = False
     text: bool = True
 
@@ -54,7 +56,7 @@ class View:
         if not (isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and fits(int(n)) for n in size)):
             raise InputError(f"view: size = {size!r}: expected width and height, each {SMALLEST} to {LARGEST} pixels")
         object.__setattr__(self, "size", (int(size[0]), int(size[1])))
-        for name in ("friction", "slip", "forces", "path", "text"):
+        for name in ("friction", "slip", "forces", "loads", "path", "text"):
             if not isinstance(getattr(self, name), bool):
                 raise InputError(f"view: {name} = {getattr(self, name)!r}: expected True or False")
 
@@ -125,7 +127,9 @@ def up_direction(slope: Array) -> Array:
     return np.array([pitch, roll, math.sqrt(max(0.0, 1.0 - pitch**2 - roll**2))])
 
 
-def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, up: Array, scale: float = 1.0) -> None:
+def aim(
+    scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, up: Array, scale: float = 1.0, level: float = 0.0
+) -> None:
     """Point the scene's camera at a robot, with gravity pulling down in the picture: a slope is seen as a slope.
 
     Args:
@@ -133,11 +137,12 @@ def aim(scene: mujoco.MjvScene, camera: FollowCamera, place: Array, yaw: float, 
         place: (x, y, ...) of the robot in the floor frame, m. yaw: its heading, rad.
         up: (3,) unit vector against gravity in the floor frame.
         scale: factor on distance and height; see :func:`magnification`.
+        level: height of the floor about there, m.
     """
     skew = np.array([[0.0, 0.0, up[0]], [0.0, 0.0, up[1]], [-up[0], -up[1], 0.0]])
     tilt = np.eye(3) + skew + skew @ skew / (1.0 + up[2])  # the smallest rotation that takes z to ``up``
     forward, above = (tilt @ direction for direction in directions(camera, yaw))
-    target = np.array([place[0], place[1], scale * LOOK_HEIGHT])
+    target = np.array([place[0], place[1], scale * LOOK_HEIGHT + level])
     for eye in scene.camera:
         eye.forward, eye.up = forward, above
         eye.pos = target - scale * camera.distance * forward

@@ -19,7 +19,7 @@ import numpy as np
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants.base import Truth
 from wlr_gym.render.scene import Texts, describe, marks_of
-from wlr_gym.render.stage import Stage, add_marks, areas
+from wlr_gym.render.stage import MESHES, ContactsOf, Stage, add_marks, areas
 from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, View, magnification, require_display
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
@@ -75,17 +75,26 @@ class Viewer:
         self._on_key, self._pace = on_key, Pace()
         self._stage: Stage | None = None
         self._window: Any = None
+        self._model: mujoco.MjModel | None = None
 
     @property
     def is_open(self) -> bool:
         """False before the first picture, and once the user has closed the window."""
         return self._window is not None and self._window.is_running()
 
-    def show(self, truth: Truth, parameters: Parameters, *, period: float, **texts: Unpack[Texts]) -> bool:
+    def show(
+        self,
+        truth: Truth,
+        parameters: Parameters,
+        *,
+        period: float,
+        contacts: ContactsOf | None = None,
+        **texts: Unpack[Texts],
+    ) -> bool:
         """Show the first robot and wait until its control period is over.
 
         Args:
-            truth, parameters, texts: as in :meth:`wlr_gym.render.scene.Scene.draw`.
+            truth, parameters, contacts, texts: as in :meth:`wlr_gym.render.scene.Scene.draw`.
             period: s that this picture stands for.
 
         Returns:
@@ -95,17 +104,24 @@ class Viewer:
             InputError: no display.
         """
         self._stage = stage = self._stage or Stage(self.robot, parameters, size=self.view.size)
-        stage.pose(truth, parameters)
+        stage.pose(truth, parameters, contacts=contacts)
+        has_new_floor = stage.lay_floor()
+        if self.is_open and self._model is not stage.model:
+            self.close()
         if self._window is None:
-            self._window = open_window(stage.model, stage.data, self._on_key)
+            self._window, self._model = open_window(stage.model, stage.data, self._on_key), stage.model
             start, eye = CAMERAS[self.view.camera], self._window.cam
             eye.type = mujoco.mjtCamera.mjCAMERA_FREE
             eye.distance, eye.elevation = 1.2 * magnification(self.robot) * start.distance, np.degrees(start.elevation)
             eye.azimuth = np.degrees(start.azimuth + (stage.yaw() if start.turns else 0.0))
+        elif has_new_floor and self._window.is_running():
+            for name in MESHES:
+                self._window.update_mesh(stage.model.mesh(name).id)
         if not self._window.is_running():
             return False
         with self._window.lock():
-            self._window.cam.lookat[:] = [*truth.position[0, :2], magnification(self.robot) * LOOK_HEIGHT]
+            middle = truth.position[0, :2]
+            self._window.cam.lookat[:] = [*middle, magnification(self.robot) * LOOK_HEIGHT + stage.level(middle)]
             scene = self._window.user_scn
             scene.ngeom = 0
             floor = areas(stage.parameters, truth.position[0]) if self.view.friction else []

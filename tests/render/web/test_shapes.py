@@ -63,7 +63,7 @@ def test_the_floor_moves_so_that_the_robot_stays_in_front_of_the_eye_and_gravity
     place, yaw, up = np.array([3.0, -2.0, 0.2]), 0.7, up_direction(np.array([0.2, -0.1]))
     turn, position = floor_pose(place, yaw, up, CAMERAS[camera])
     rotation = Rotation.from_quat(turn, scalar_first=True)
-    assert np.allclose(rotation.apply([place[0], place[1], 0.0]) + position, 0.0, atol=1e-12)
+    assert np.allclose(rotation.apply(place) + position, 0.0, atol=1e-12)  # with the floor's level there
     assert np.allclose(rotation.apply(up), [0.0, 0.0, 1.0], atol=1e-12)
     ahead = rotation.apply([np.cos(yaw), np.sin(yaw), 0.0])
     assert np.arctan2(ahead[1], ahead[0]) == pytest.approx(0.0 if camera == "chase" else yaw, abs=0.03)

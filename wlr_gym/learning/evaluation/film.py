@@ -92,11 +92,12 @@ def film(
     Raises:
         InputError: no OpenGL on this machine.
     """
+    from wlr_gym.physics.plants.contacts import contacts_of_plant
     from wlr_gym.render import Scene
 
     count, every, _ = film_length(core, seconds, fps)
     scene, path = Scene(core.task.robot, view), Journey()
-    ticks = drive(core, policy, seed, driver)
+    ticks, contacts = drive(core, policy, seed, driver), contacts_of_plant(core.plant)
     try:
         for index in range(count):
             for _ in range(every if index else 1):
@@ -104,7 +105,7 @@ def film(
                 path.note(core)
             trails = path.trails() if scene.view.path else []
             texts = {"time": present_time(core), "command": commands(core), "title": title, "result": result(core)}
-            yield scene.draw(core.plant.truth(), core.parameters, trails=trails, **texts)
+            yield scene.draw(core.plant.truth(), core.parameters, trails=trails, contacts=contacts, **texts)
     finally:
         scene.close()
 

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.model.dynamics import rotation_matrix
 from wlr_gym.physics.plants import relief
-from wlr_gym.physics.plants.base import Contacts, Truth
+from wlr_gym.physics.plants.base import Contacts, Plant, Truth
 from wlr_gym.physics.plants.gibbs_appell.kinematics import AXES, CONTACTS, CORNERS, axes_on, contacts_of
 from wlr_gym.robot import CORNER_SIGNS, Robot
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
+
+
+#: Returns the contacts (N) of a plant's robots now: :meth:`wlr_gym.physics.plants.simulator.Simulator.contacts`.
+ContactsOf = Callable[[], Contacts]
+
+
+def contacts_of_plant(plant: Plant) -> ContactsOf | None:
+    """Return what tells the contacts of a plant's robots; None = it does not know them."""
+    return getattr(plant, "contacts", None)
 
 
 def contacts_at(robot: Robot, parameters: Parameters, truth: Truth, force: Array) -> Contacts:

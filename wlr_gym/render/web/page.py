@@ -106,7 +106,7 @@ def floor_pose(place: Array, yaw: float, up: Array, camera: FollowCamera) -> tup
     So the mouse turns the eye about the robot wherever that goes, and every browser has its own eye.
 
     Args:
-        place: (x, y, ...) of the robot in the floor frame, m. yaw: its heading, rad.
+        place: of the robot in the floor frame, and the floor's height about there (3,), m. yaw: its heading, rad.
         up: (3,) against gravity in the floor frame: it becomes the eye's z, so that a slope is seen as a slope.
         camera: turns with the robot, or keeps its direction.
     """
@@ -115,7 +115,14 @@ def floor_pose(place: Array, yaw: float, up: Array, camera: FollowCamera) -> tup
     turn = Rotation.from_rotvec([0.0, 0.0, -yaw if camera.turns else 0.0])
     tilt = Rotation.from_quat([1.0 + up[2], up[1], -up[0], 0.0], scalar_first=True)  # about up x z
     whole = turn * tilt
-    return whole.as_quat(scalar_first=True), -whole.apply([place[0], place[1], 0.0])
+    return whole.as_quat(scalar_first=True), -whole.apply(place)
+
+
+def quaternion(turn: Array) -> Array:
+    """Return the quaternion (w, x, y, z) of a rotation (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(turn).as_quat(scalar_first=True)
 
 
 def html_lines(lines: list[str]) -> str:

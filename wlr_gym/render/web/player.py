@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth
 from wlr_gym.render import stage as marks
+from wlr_gym.render import surface
 from wlr_gym.render.scene import Texts, describe, legend
-from wlr_gym.render.stage import SQUARE, Stage
+from wlr_gym.render.stage import SQUARE, ContactsOf, Stage
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP
 from wlr_gym.render.view import CAMERAS, Colour, View, friction_colour, up_direction
 from wlr_gym.render.viewer import KeyCallback, Pace
@@ -41,7 +42,9 @@ _WIDE = 60.0  # m; width of the floor
 _HEAD, _HEAD_LENGTH = 2.2 * marks.SHAFT, 6.0 * marks.SHAFT  # m; heads of arrows
 #: m; where an arrow lies that is not shown: viser keeps their number.
 _BELOW = np.array([[0.0, 0.0, -9.0], [0.0, 0.0, -8.9]])
-_ARROWS = 12
+_ARROWS = 24
+#: m; a surface is sent anew when the robot has gone so far. Its grid is coarser than that of pictures: it must be sent.
+_SURFACE_STEP, _COARSENESS = 0.8, 1.5
 _SIDES = 32  # sides of what is round
 _HIDDEN = 3  # geoms of this group are hidden: what touches the floor, not what is drawn
 
@@ -74,10 +77,10 @@ class Figure:
         if self._frame.visible:
             self._frame.visible = False
 
-    def pose(self, truth: Truth, parameters: Parameters) -> Stage:
+    def pose(self, truth: Truth, parameters: Parameters, contacts: ContactsOf | None = None) -> Stage:
         """Put it where the first robot of a plant's truth is, in the sizes that its parameters give it."""
         self._stage = stage = self._stage or Stage(self.robot, parameters)
-        stage.pose(truth, parameters)
+        stage.pose(truth, parameters, contacts=contacts)
         if stage.shape != self._shape:
             self._nodes = [(body.index, self._add(body)) for body in bodies(stage)]
             self._shape = stage.shape
@@ -112,13 +115,17 @@ class Figure:
 
 
 class PageFloor:
-    """The floor on the page: its colour is its friction, areas and pads of other friction lie on it."""
+    """The floor on the page: its colour is its friction, areas and pads of other friction lie on it.
+
+    Where it is not flat, it is triangles with squares, and the plane lies below.
+    """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._frame: Any = server.scene.add_frame(FLOOR, show_axes=False)
         self._colour: Colour | None = None
-        self._areas: list[marks.Area] = []
+        self._plane: Any = None
+        self._seen: tuple[Any, ...] = ()  # what the areas and triangles that are shown follow from
         self._shown: list[Any] = []
         self._pads: list[Any] = []
 
@@ -126,23 +133,30 @@ class PageFloor:
         """Draw the floor around the robot that is posed in ``stage``, and move it so that ``view``'s camera sees the robot."""
         parameters, place = stage.parameters, stage.truth.position[0]
         up = up_direction(parameters["ground.slope"][0])
-        self._frame.wxyz, self._frame.position = page.floor_pose(place, stage.yaw(), up, CAMERAS[view.camera])
+        middle = np.array([*place[:2], stage.level(place)])
+        self._frame.wxyz, self._frame.position = page.floor_pose(middle, stage.yaw(), up, CAMERAS[view.camera])
         scene = self._server.scene
         if (colour := marks.floor_colour(parameters)) != self._colour:
-            scene.add_grid(
+            self._plane = scene.add_grid(
                 f"{FLOOR}/plane", _WIDE, _WIDE, cell_size=SQUARE, section_size=5 * SQUARE, cell_color=(170, 170, 170),
                 section_color=(140, 140, 140), plane_color=rgb(colour), plane_opacity=1.0, shadow_opacity=0.3,
                 fade_distance=12.0,
             )  # fmt: skip
             self._colour = colour
-        # Far around, so that areas need not be drawn anew at each step.
-        middle = np.round(place / marks.REACH) * marks.REACH
+        depth = 0.0 if stage.relief is None else stage.relief.lowest
+        if self._plane.position[2] != depth:
+            self._plane.position = (0.0, 0.0, depth)
+        # Far around, so that areas need not be drawn anew at each step; triangles are too many for that.
+        step = marks.REACH if stage.relief is None else _SURFACE_STEP
+        middle = np.round(place / step) * step
         areas = marks.areas(parameters, middle) if view.friction else []
-        if areas != self._areas:
+        seen = (areas, stage.relief and (stage.relief, *middle[:2], colour))
+        if seen != self._seen:
             for node in self._shown:
                 node.remove()
-            self._shown = [node for k, area in enumerate(areas) for node in self._area(k, area)]
-            self._areas = areas
+            self._shown = self._boxes(areas) if stage.relief is None else self._triangles(stage, areas, middle)
+            self._shown += self._labels(stage, areas)
+            self._seen = seen
         spots = marks.spots(stage) if view.friction else []
         if len(spots) != len(self._pads):
             for node in self._pads:
@@ -150,16 +164,40 @@ class PageFloor:
             names = [f"{FLOOR}/pad_{k}" for k in range(len(spots))]
             self._pads = [scene.add_cylinder(name, 0.06, 10 * marks.LAYER, cast_shadow=False) for name in names]
         for node, spot in zip(self._pads, spots, strict=True):
-            node.position, colour = spot.centre * [1.0, 1.0, 0.0], rgb(friction_colour(spot.mu))
+            node.position, colour = spot.centre, rgb(friction_colour(spot.mu))
+            if stage.relief is not None:
+                node.wxyz = page.quaternion(marks.turn_to(spot.normal))
             if tuple(node.color) != colour:
                 node.color = colour
 
-    def _area(self, k: int, area: marks.Area) -> list[Any]:
-        (x, y), scene = area.low, self._server.scene
-        size = (area.high[0] - x, area.high[1] - y, 2.0 * area.height)
-        middle = (x + 0.5 * size[0], y + 0.5 * size[1], 0.0)
-        box = scene.add_box(f"{FLOOR}/area_{k}", rgb(friction_colour(area.mu)), size, position=middle, cast_shadow=False)
-        return [box, scene.add_label(f"{FLOOR}/label_{k}", f"µ {area.mu:.2g}", position=(x, y, 0.01))]
+    def _boxes(self, areas: Sequence[marks.Area]) -> list[Any]:
+        boxes = []
+        for k, area in enumerate(areas):
+            (x, y), (right, top) = area.low, area.high
+            size, middle = (right - x, top - y, 2.0 * area.height), (0.5 * (x + right), 0.5 * (y + top), 0.0)
+            colour = rgb(friction_colour(area.mu))
+            boxes.append(self._server.scene.add_box(f"{FLOOR}/area_{k}", colour, size, position=middle, cast_shadow=False))
+        return boxes
+
+    def _labels(self, stage: Stage, areas: Sequence[marks.Area]) -> list[Any]:
+        corners = np.array([area.low for area in areas]).reshape(-1, 2)
+        return [
+            self._server.scene.add_label(f"{FLOOR}/label_{k}", f"µ {area.mu:.2g}", position=(*area.low, 0.01 + height))
+            for k, (area, height) in enumerate(zip(areas, stage.height(corners), strict=True))
+        ]
+
+    def _triangles(self, stage: Stage, areas: Sequence[marks.Area], middle: NDArray[np.float64]) -> list[Any]:
+        """Add what can be seen of a floor that is not flat from a place, as one mesh per colour."""
+        assert stage.relief is not None
+        found = stage.relief.surface(middle, [(area.low, area.high) for area in areas], _COARSENESS)
+        colours = [marks.floor_colour(stage.parameters), *(friction_colour(area.mu) for area in areas)]
+        return [
+            self._server.scene.add_mesh_trimesh(
+                f"{FLOOR}/surface_{k}", squared_mesh(found, faces, colour), cast_shadow=False, receive_shadow=False
+            )
+            for k, (faces, colour) in enumerate(zip(found.faces, colours, strict=True))
+            if len(faces)
+        ]
 
 
 def arrows_of(stage: Stage, view: View) -> list[marks.Arrow]:
@@ -168,6 +206,26 @@ def arrows_of(stage: Stage, view: View) -> list[marks.Arrow]:
     if view.forces:
         arrows += marks.force_arrows(stage) + marks.load_arrows(stage)
     return arrows
+
+
+def squared_mesh(found: surface.Surface, faces: surface.Faces, colour: Colour) -> Any:
+    """Return some triangles of a floor as a ``trimesh.Trimesh`` of a colour, with the floor's squares."""
+    import trimesh
+    from PIL import Image
+
+    used, numbers = np.unique(faces, return_inverse=True)
+    vertices = found.vertices[used]
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorTexture=Image.fromarray(marks.squares_picture()), baseColorFactor=[*rgb(colour), 255],
+        metallicFactor=0.0, roughnessFactor=1.0,
+    )  # fmt: skip
+    return trimesh.Trimesh(
+        vertices,
+        numbers.reshape(-1, 3),
+        vertex_normals=found.normals[used],
+        visual=trimesh.visual.TextureVisuals(vertices[:, :2] / (2.0 * SQUARE), material=material),
+        process=False,
+    )
 
 
 # ---- the robot's bodies as triangles ----------------------------------------------------------------------------------
@@ -250,9 +308,17 @@ class _Page:
         self._ground = PageFloor(self.server)
         self._told = -np.inf
 
-    def _show(self, figure: Figure, truth: Truth, parameters: Parameters, view: View, arrows: View) -> Stage:
+    def _show(
+        self,
+        figure: Figure,
+        truth: Truth,
+        parameters: Parameters,
+        view: View,
+        arrows: View,
+        contacts: ContactsOf | None = None,
+    ) -> Stage:
         """Pose the robot that the page goes along with, with the arrows that a view has, and the floor under it."""
-        stage = figure.pose(truth, parameters)
+        stage = figure.pose(truth, parameters, contacts)
         figure.point(arrows_of(stage, arrows))
         self._ground.show(stage, view)
         return stage
@@ -320,7 +386,15 @@ class WebViewer(_Page):
         self._plots = page.Plots(self.server, page.plot_panel(self.server), _TITLES, _FIRST)
         print(self._address, flush=True)
 
-    def show(self, truth: Truth, parameters: Parameters, *, period: float, **texts: Unpack[Texts]) -> bool:
+    def show(
+        self,
+        truth: Truth,
+        parameters: Parameters,
+        *,
+        period: float,
+        contacts: ContactsOf | None = None,
+        **texts: Unpack[Texts],
+    ) -> bool:
         """Show the first robot and wait until its control period is over; the arguments are those of the window's viewer.
 
         Returns:
@@ -329,7 +403,7 @@ class WebViewer(_Page):
         view = self._look.view
         self._note(truth, texts.get("time") or 0.0)
         with self.server.atomic():
-            stage = self._show(self._figure, truth, parameters, view, view)
+            stage = self._show(self._figure, truth, parameters, view, view, contacts)
         if self._texts_are_due():
             lines = describe(stage, slip=view.slip, **texts)
             self._text.content = page.html_lines([*lines, *legend(stage.parameters, view)])
