@@ -193,8 +193,9 @@ class FakeViewer:
         self.shown, self.closed = [], False
         FakeViewer.made.append(self)
 
-    def show(self, truth, parameters, *, period, time, command):
+    def show(self, truth, parameters, *, period, contacts, time, command):
         assert period == 0.02
+        assert contacts is None
         self.shown.append((round(time, 6), set(command)))
         return True
 

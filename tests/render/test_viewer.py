@@ -13,8 +13,9 @@ from standing import truth_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.render import viewer as viewer_module
+from wlr_gym.render.stage import MESHES
 from wlr_gym.render.teleop import DOWN, LEFT, RESET, RIGHT, SPACE, UP, Gamepad, Keyboard, Script
-from wlr_gym.render.view import View
+from wlr_gym.render.view import LOOK_HEIGHT, View
 from wlr_gym.render.viewer import Viewer, open_window
 
 RANGES = {"linear_velocity_x": (-0.1, 0.2), "yaw_rate": (-0.5, 0.5)}
@@ -27,7 +28,7 @@ class FakeWindow:
         self.model, self.data, self.on_key = model, data, on_key
         self.cam = mujoco.MjvCamera()
         self.user_scn = mujoco.MjvScene(model, 100)
-        self.texts, self.poses, self.running, self.locked = [], [], True, False
+        self.texts, self.poses, self.taken, self.running, self.locked = [], [], [], True, False
 
     def is_running(self):
         return self.running
@@ -41,6 +42,10 @@ class FakeWindow:
     def sync(self):
         assert not self.locked
         self.poses.append(self.data.qpos[:3].copy())
+
+    def update_mesh(self, number):
+        assert not self.locked
+        self.taken.append(number)
 
     def set_texts(self, texts):
         self.texts.append(texts[0][2])
@@ -226,3 +231,24 @@ def test_what_is_no_schedule(text):
 def test_times_that_do_not_rise(text):
     with pytest.raises(InputError, match="expected rising times from 0"):
         Script(text, NAMES)
+
+
+def test_the_window_takes_a_new_floor_and_opens_anew_where_it_has_no_room(opened, parameters):
+    viewer, windows, _ = opened
+    truth = truth_of(parameters)
+    kerb = parameters.copy()
+    kerb["piece.x"][:, 0], kerb["piece.height"][:, 0] = 0.4, 0.05
+    for given in (parameters, kerb):
+        assert viewer.show(truth, given, period=0.02)
+    flat, window = windows
+    assert not flat.running
+    assert window.user_scn.geoms[0].type == mujoco.mjtGeom.mjGEOM_MESH
+    assert window.taken == []
+    truth["position"][:, 0] = 1.5
+    assert viewer.show(truth, kerb, period=0.02)
+    assert window.taken == [window.model.mesh(name).id for name in MESHES]
+    assert window.cam.lookat[2] == pytest.approx(LOOK_HEIGHT + 0.05)
+    window.close()
+    kerb["bumps.height"][:] = 0.02  # needs more room
+    assert not viewer.show(truth, kerb, period=0.02)
+    assert len(windows) == 2

@@ -2,6 +2,7 @@
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false
 # (What stands on a page is looked up in viser by name; stand-ins have only what is used.)
 
+import io
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,43 @@ def test_the_floor_has_areas_and_pads_of_other_friction(server, parameters):
     assert len({tuple(node(server, f"/floor/pad_{k}").color) for k in range(4)}) == 2
     floor.show(stage, View(friction=False))
     assert "/floor/area_0" not in server.scene._handle_from_node_name
+
+
+def test_a_floor_that_is_not_flat_is_triangles_in_its_colours_and_the_eye_goes_up_with_it(server, parameters):
+    import trimesh
+
+    floor, stage, truth = PageFloor(server), Stage(ROBOT, parameters), truth_of(parameters)
+    stage.pose(truth, parameters)
+    floor.show(stage, View())
+    assert "/floor/surface_0" not in server.scene._handle_from_node_name
+    kerb = parameters.copy()
+    kerb["piece.x"][:, 0], kerb["piece.height"][:, 0] = 0.4, 0.05
+    for name, value in (("mu", 0.1), ("x_min", 0.5), ("x_max", 1), ("y_min", 0), ("y_max", 1)):
+        kerb[f"patch.{name}"][:, 0] = value
+    stage.pose(truth, kerb)
+    floor.show(stage, View())
+    bare, ice = (trimesh.load(io.BytesIO(node(server, f"/floor/surface_{k}").glb_data), "glb").to_mesh() for k in range(2))
+    assert bare.bounds[1, 2] == pytest.approx(0.05)
+    assert np.allclose(ice.bounds[:, :2], [[0.5, 0.0], [1.0, 1.0]])
+    colours = [mesh.visual.material.baseColorFactor.astype(int) for mesh in (bare, ice)]
+    assert colours[1][2] > colours[1][0] + 60
+    assert abs(colours[0][2] - colours[0][0]) < 15
+    assert node(server, "/floor/plane").position[2] < 0.0
+    assert node(server, "/floor/label_0").position[2] > 0.05
+    shown = node(server, "/floor/surface_0")
+    truth.position[0, 0] = 0.1
+    stage.pose(truth, kerb)
+    floor.show(stage, View())
+    assert node(server, "/floor/surface_0") is shown  # sent once, not at every step
+    truth.position[0, 0] = 2.0
+    stage.pose(truth, kerb)
+    floor.show(stage, View())
+    assert node(server, "/floor/surface_0") is not shown
+    assert np.allclose(node(server, "/floor").position, [-2.0, 0.0, -0.05])
+    stage.pose(truth, parameters)
+    floor.show(stage, View())
+    assert "/floor/surface_0" not in server.scene._handle_from_node_name
+    assert node(server, "/floor/plane").position[2] == 0.0
 
 
 @pytest.fixture
