@@ -215,9 +215,9 @@ def squared_mesh(found: surface.Surface, faces: surface.Faces, colour: Colour) -
 
     used, numbers = np.unique(faces, return_inverse=True)
     vertices = found.vertices[used]
-    linear = (np.round(255.0 * ((part + 0.055) / 1.055) ** 2.4) for part in colour)  # glTF has no sRGB
+    linear = (((part + 0.055) / 1.055) ** 2.4 for part in colour)  # glTF's colours are no sRGB
     material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(marks.squares_picture()), baseColorFactor=[*linear, 255],
+        baseColorTexture=Image.fromarray(marks.squares_picture()), baseColorFactor=[*linear, 1.0],
         metallicFactor=0.0, roughnessFactor=1.0,
     )  # fmt: skip
     return trimesh.Trimesh(
