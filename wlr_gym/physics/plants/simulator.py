@@ -25,6 +25,7 @@ from wlr_gym.physics.plants.base import (
     hold_where_off,
     standing_state,
 )
+from wlr_gym.physics.plants.contacts import contacts_at
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel, check_flow
 from wlr_gym.robot import LEG_SLICE, Robot
 from wlr_gym.robot.parameter_table import SPECS
@@ -247,8 +248,6 @@ class Simulator(ABC):
 
     def contacts(self) -> Contacts:
         """Return where the wheels touch the floor now, and the forces of the last step there."""
-        from wlr_gym.physics.plants.contacts import contacts_at
-
         return contacts_at(self.robot, self.parameters, self._truth, self._contact_forces())
 
     def truth(self) -> Truth:

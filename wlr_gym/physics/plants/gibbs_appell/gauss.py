@@ -13,23 +13,21 @@ from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.model.equations import assembly_terms, platform_terms
 from wlr_gym.physics.plants import drive, ground
-from wlr_gym.physics.plants.gibbs_appell.kinematics import (
-    ASSEMBLY,
+from wlr_gym.physics.plants.contacts import (
     AXES,
     CORNERS,
-    PLATFORM,
     Contact,
     axes_on,
     contact_place,
     contacts_of,
     dot,
-    joints_of,
     rolling_contact,
     rotation_rows,
     slip_velocity,
     to_body,
     vector,
 )
+from wlr_gym.physics.plants.gibbs_appell.kinematics import ASSEMBLY, PLATFORM, joints_of
 from wlr_gym.robot import FIRST_WHEEL, JOINTS
 
 

@@ -32,7 +32,7 @@ from wlr_gym.physics.codegen import (
 )
 from wlr_gym.physics.model import equations
 from wlr_gym.physics.model.dynamics import inertial_constants
-from wlr_gym.physics.plants import drive, ground, relief
+from wlr_gym.physics.plants import contacts, drive, ground, relief
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import gauss, kinematics
 from wlr_gym.physics.plants.gibbs_appell import step as substep
@@ -392,7 +392,7 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    substep, gauss, kinematics, equations, servo, drive, ground, relief, ops, compilation, sys.modules[__name__]
+    substep, gauss, kinematics, equations, servo, drive, contacts, ground, relief, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join(
     [source_of(*TRACED), *PARAMETER_LANES, *FORMULA_INPUTS, *FORMULA_OUTPUTS, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"]

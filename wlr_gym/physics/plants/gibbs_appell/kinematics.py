@@ -1,4 +1,4 @@
-"""The engine's lanes by name (what a step keeps, reads and shows), and the geometry of the wheels on the floor.
+"""The engine's lanes by name: what a step keeps, reads and shows.
 
 Every function of the step maps lanes (state, parameters, inputs; each a scalar) to new lanes.
 """
@@ -6,19 +6,12 @@ Every function of the step maps lanes (state, parameters, inputs; each a scalar)
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
-from wlr_gym.physics.codegen import ops
-from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
-from wlr_gym.physics.plants import drive, relief
+from wlr_gym.physics.codegen.ops import Lanes, Value
+from wlr_gym.physics.plants import drive
 from wlr_gym.physics.plants.base import COORDINATES
 from wlr_gym.physics.plants.base import INPUTS as INPUTS_OF_FORMULAS
-
-CORNERS = range(4)
-#: Contacts of the wheels: contact i and contact i + 4 are those of wheel i. Without pieces on the floor the second has none.
-CONTACTS = range(8)
-AXES = "xyz"
+from wlr_gym.physics.plants.contacts import AXES, CONTACTS, CORNERS
 
 STATE: tuple[str, ...] = (
     *(f"p{a}" for a in AXES),
@@ -95,169 +88,7 @@ FORMULA_INPUTS: tuple[str, ...] = tuple(f"formula_input_{name}" for name in INPU
 FORMULA_OUTPUTS: tuple[str, ...] = tuple(f"formula_{name}" for name in COORDINATES)
 
 
-# ---- vectors, turns, and the wheels on the floor ---------------------------------------------------------------------
-
-
-def cross(a: Sequence[Value], b: Sequence[Value]) -> Vector:
-    """Vector product."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
-    """Scalar product."""
-    total: Value = a[0] * b[0]
-    for x, y in zip(a[1:], b[1:], strict=True):
-        total = total + x * y
-    return total
-
-
-def vector(lanes: Lanes, prefix: str) -> Vector:
-    """Read the three lanes ``prefix + x|y|z``."""
-    return [lanes[prefix + a] for a in AXES]
-
-
-def rotation_rows(lanes: Lanes) -> list[Vector]:
-    """Rotation matrix body -> floor as rows, from the unit quaternion."""
-    w, x, y, z = (lanes[f"q{a}"] for a in "wxyz")
-    return [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-
-
-def to_body(rows: Sequence[Sequence[Value]], a: Sequence[Value]) -> Vector:
-    """Turn a floor-frame vector into the body frame."""
-    return [rows[0][k] * a[0] + rows[1][k] * a[1] + rows[2][k] * a[2] for k in range(3)]
-
-
-def axes_on(n: Vector) -> tuple[Vector, Vector, Vector, Value]:
-    """Return a floor normal n, the wheels' heading t_x and lateral axis t_y on that floor, body frame, and 1/|axle x n|.
-
-    All axles are parallel to body y. t_x = (axle x n)/|.|, t_y = n x t_x.
-    """
-    scale = 1.0 / ops.sqrt(n[0] * n[0] + n[2] * n[2] + 1e-12)
-    heading = [n[2] * scale, 0.0, -(n[0] * scale)]
-    return list(n), heading, cross(n, heading), scale
-
-
-@dataclass(frozen=True)
-class Contact:
-    """One place where a wheel touches the floor, or is nearest to it. Vectors in the body frame.
-
-    Attributes:
-        number: contact i and contact i + 4 are those of wheel i.
-        hip, leg, rim: from the body's origin to the hip, on to the axle, and on to the point of the wheel that is deepest, m.
-        axes: see :func:`axes_on`.
-        depth: how far that point is in the floor, m; None: as far as it is below z = 0.
-    """
-
-    number: int
-    hip: Vector
-    leg: Vector
-    rim: Vector
-    axes: tuple[Vector, Vector, Vector, Value]
-    depth: Value | None = None
-
-    @property
-    def wheel(self) -> int:
-        """Of which wheel it is."""
-        return self.number % len(CORNERS)
-
-    @property
-    def point(self) -> Vector:
-        """From the body's origin, m."""
-        return [self.hip[k] + self.leg[k] + self.rim[k] for k in range(3)]
-
-    def gap(self, lanes: Lanes) -> Value:
-        """Distance from the floor, m; negative: in it."""
-        return lanes["pz"] + dot(self.axes[0], self.point) if self.depth is None else -self.depth
-
-    def row(self, e: Sequence[Value], rise: Vector | None = None) -> tuple[Vector, Value]:
-        """Jacobian of the point's velocity along ``e``: six base entries and the leg-rate entry.
-
-        The wheel-rate entry is -radius along the heading and zero along the lateral axis and the normal. ``rise``, and that
-        radius: :func:`rolling_contact`.
-        """
-        hip, leg, rim = self.hip, self.leg, self.rim
-        point = [hip[0] + leg[0] + rim[0], hip[1] + rim[1], hip[2] + leg[2] + rim[2]]
-        if rise is not None:
-            point = [point[k] + rise[k] for k in range(3)]
-        arm = cross(point, e)
-        return [*e, arm[0], hip[2] * e[0] - hip[0] * e[2], arm[2]], leg[2] * e[0] - leg[0] * e[2]
-
-
-def contacts_of(
-    lanes: Lanes,
-    i: int,
-    rows: Sequence[Sequence[Value]],
-    level: tuple[Vector, Vector, Vector, Value],
-    leg_turn: tuple[Value, Value],
-    features: frozenset[str],
-) -> list[Contact]:
-    """Return the contacts of wheel ``i``: one, or two where there are pieces on the floor.
-
-    On a level floor the wheel is a thin disc, whose lowest point lies in its plane.
-
-    Args:
-        lanes: of the step.
-        i: wheel.
-        rows: of the rotation body -> floor.
-        level: :func:`axes_on` the normal of z = 0.
-        leg_turn: sine and cosine of the leg's angle.
-        features: families that are traced.
-    """
-    sine, cosine = leg_turn
-    hip = [lanes[f"hip_{a}{i}"] for a in AXES]
-    leg = [lanes[f"length{i}"] * cosine, 0.0, -(lanes[f"length{i}"] * sine)]
-    if "relief" not in features:
-        n, _, _, scale = level
-        reach = lanes[f"radius{i}"] * scale
-        return [Contact(i, hip, leg, [-(reach * n[0]), 0.0, -(reach * n[2])], level)]
-    centre = [lanes[f"p{a}"] + dot(rows[k], [hip[m] + leg[m] for m in range(3)]) for k, a in enumerate(AXES)]
-    found = relief.touches(lanes, i, centre, [row[1] for row in rows], features)
-    return [
-        Contact(i + 4 * k, hip, leg, to_body(rows, touch.reach), axes_on(to_body(rows, touch.normal)), touch.depth)
-        for k, touch in enumerate(found)
-    ]
-
-
-def contact_numbers(i: int, features: frozenset[str]) -> list[int]:
-    """Return the numbers of the contacts of wheel ``i``."""
-    return [i, i + 4] if "piece" in features else [i]
-
-
-def rolling_contact(lanes: Lanes, contact: Contact, features: frozenset[str]) -> tuple[Vector | None, Value]:
-    """How far above the deepest point friction acts (body frame; None = there), and the radius on which the wheel rolls.
-
-    A loaded tyre flattens: it rolls on its radius less a share of what it is deeper in the floor than the robot at rest.
-    """
-    i, (n, heading, _, scale) = contact.wheel, contact.axes
-    radius = lanes[f"radius{i}"]
-    if contact.depth is not None:
-        radius = contact.rim[0] * heading[2] - contact.rim[2] * heading[0]
-    if "compliance" not in features:
-        return None, radius
-    flat = lanes[f"flattening{i}"] * (ops.maximum(-contact.gap(lanes), 0.0) - lanes[f"rest_depth{i}"])
-    return [(flat * scale) * n[k] for k in range(3)], radius - flat
-
-
-def contact_place(lanes: Lanes, rows: Sequence[Sequence[Value]], contact: Contact) -> Vector:
-    """Place (x, y) of a contact on the floor, m."""
-    point = contact.point
-    return [lanes[f"p{a}"] + dot(rows[k], point) for k, a in enumerate("xy")]
-
-
-def slip_velocity(lanes: Lanes, contact: Contact, twist: Vector, features: frozenset[str]) -> Vector:
-    """Velocity of a contact's point over the floor along heading and axle, at the present rates, m/s."""
-    i, (_, heading, lateral, _) = contact.wheel, contact.axes
-    rise, radius = rolling_contact(lanes, contact, features)
-    slip: Vector = []
-    for e, wheel_entry in ((heading, -radius), (lateral, 0.0)):
-        base_row, leg_entry = contact.row(e, rise)
-        speed = dot(base_row, twist) + leg_entry * lanes[f"leg_rate{i}"] + wheel_entry * lanes[f"wheel_rate{i}"]
-        slip.append(speed)
-    return slip
+# ---- joints ----------------------------------------------------------------------------------------------------------
 
 
 def wheel_angle(lanes: Lanes, i: int, features: frozenset[str]) -> Value:

@@ -15,8 +15,9 @@ from wlr_gym.base.snapshot import RowStore, Snapshot
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground, relief
 from wlr_gym.physics.plants.base import MEMORY, Capabilities, PlantOptions, PlantState, Sensors
+from wlr_gym.physics.plants.contacts import CONTACTS
 from wlr_gym.physics.plants.gibbs_appell import kernel
-from wlr_gym.physics.plants.gibbs_appell.kinematics import CONTACTS, STORED, TURN
+from wlr_gym.physics.plants.gibbs_appell.kinematics import STORED, TURN
 from wlr_gym.physics.plants.simulator import Simulator, refitted_lead
 from wlr_gym.robot import LEG_SLICE, WHEEL_SLICE, Robot
 from wlr_gym.robot.parameters import Parameters

@@ -28,25 +28,21 @@ from collections.abc import Iterator, Mapping
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.plants import drive, ground, relief
-from wlr_gym.physics.plants.gibbs_appell.kinematics import (
+from wlr_gym.physics.plants.contacts import (
     AXES,
     CORNERS,
-    INPUTS_OF_FORMULAS,
-    SINGLE,
-    TURN,
     axes_on,
     contact_numbers,
     contact_place,
     contacts_of,
     cross,
     dot,
-    joints_of,
     rotation_rows,
     slip_velocity,
     to_body,
     vector,
-    wheel_angle,
 )
+from wlr_gym.physics.plants.gibbs_appell.kinematics import INPUTS_OF_FORMULAS, SINGLE, TURN, joints_of, wheel_angle
 from wlr_gym.robot import FIRST_WHEEL
 
 

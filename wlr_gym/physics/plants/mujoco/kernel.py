@@ -26,12 +26,13 @@ from wlr_gym.physics.codegen import (
     source_of,
     straight_line_source,
 )  # fmt: skip
-from wlr_gym.physics.plants import base, drive, ground, relief
+from wlr_gym.physics.plants import base, contacts, drive, ground, relief
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
+from wlr_gym.physics.plants.contacts import CONTACTS, CORNERS
 from wlr_gym.physics.plants.gibbs_appell import kinematics
 from wlr_gym.physics.plants.gibbs_appell import step as engine
 from wlr_gym.physics.plants.mujoco import step as source
-from wlr_gym.physics.plants.mujoco.step import CONTACTS, CORNERS, STATE
+from wlr_gym.physics.plants.mujoco.step import STATE
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -241,6 +242,6 @@ def load_kernel(features: frozenset[str]) -> ModuleType:
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    source, engine, kinematics, base, servo, drive, ground, relief, ops, compilation, sys.modules[__name__]
+    source, engine, kinematics, base, servo, drive, contacts, ground, relief, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join([source_of(*TRACED), *PARAMETER_LANES, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"])

@@ -14,8 +14,8 @@ from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import COORDINATES, INPUTS, MEMORY, Capabilities, PlantOptions, PlantState, Sensors
+from wlr_gym.physics.plants.contacts import CONTACTS
 from wlr_gym.physics.plants.forces import Force, compile_forces
-from wlr_gym.physics.plants.gibbs_appell.kinematics import CONTACTS
 from wlr_gym.physics.plants.mujoco.kernel import PARAMETER_LANES, addresses, load_kernel, pack
 from wlr_gym.physics.plants.mujoco.mjcf import build_model, principal_inertia
 from wlr_gym.physics.plants.mujoco.step import CAPSULE_HALF_LENGTH, FEATURES, ON_RELIEF, STATE, TICK_SUMS

@@ -29,12 +29,10 @@ from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.plants import drive, ground
 from wlr_gym.physics.plants.base import COORDINATES
-from wlr_gym.physics.plants.gibbs_appell import step as engine
-from wlr_gym.physics.plants.gibbs_appell.kinematics import (
+from wlr_gym.physics.plants.contacts import (
     AXES,
     CONTACTS,
     CORNERS,
-    INPUTS_OF_FORMULAS,
     Contact,
     axes_on,
     contact_numbers,
@@ -47,6 +45,8 @@ from wlr_gym.physics.plants.gibbs_appell.kinematics import (
     to_body,
     vector,
 )
+from wlr_gym.physics.plants.gibbs_appell import step as engine
+from wlr_gym.physics.plants.gibbs_appell.kinematics import INPUTS_OF_FORMULAS
 from wlr_gym.robot import FIRST_WHEEL
 
 #: Families of effects: always all, so that no robot's bits can depend on what its neighbours have. On a floor with relief,
