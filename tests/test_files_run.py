@@ -28,7 +28,8 @@ def files_run(what: str, *, traced: bool) -> set[str]:
 
     def note(frame: FrameType, event: str, _: object) -> None:
         place = frame.f_code.co_filename
-        if place.startswith(package) and frame.f_code.co_flags & 1:  # bodies of modules and classes are no functions
+        # Bodies of modules and classes are no functions, comprehensions are part of what they stand in.
+        if place.startswith(package) and frame.f_code.co_flags & 1 and not frame.f_code.co_name.startswith("<"):
             found.add(place.removeprefix(package))
 
     if traced:

@@ -29,7 +29,7 @@ from wlr_gym.envs.tasks.terms import COMPUTED, SCALARS
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics import plants
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.physics.floor import load_floor
+from wlr_gym.physics.floor import Floor, load_floor
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, Sensors
 from wlr_gym.policy.agents import FED_AS
 
@@ -60,7 +60,7 @@ class Core:
     """N robots on a task.
 
     Attributes:
-        task, plant, floor, randomization, patch: what it is made of. count: N.
+        task, plant, randomization, patch: what it is made of. floor: that it stands on; None = flat. count: N.
         unmeasured: rewards and terminations of the task that are left out because a real robot cannot measure them.
         limit: control steps until an episode is truncated.
         episodes: seeds, steps so far and end flags. robots: parameters and where the episodes started.
@@ -89,7 +89,7 @@ class Core:
         chosen = config.randomization if settings.randomization is None else settings.randomization
         self.randomization = load_randomization("none" if settings.is_real else chosen, robot)
         on = config.floor if settings.floor is None else settings.floor
-        self.floor = load_floor("flat" if settings.is_real else on, robot)
+        self.floor: Floor | None = None if settings.is_real or on == "flat" else load_floor(on, robot)
         self.patch = load_patch(settings.effects)
         options = PlantOptions(
             control_period=config.control_period,
@@ -317,7 +317,7 @@ class Core:
     def contract(self) -> dict[str, Any]:
         """Return what a policy must be fed and what its output means (see :func:`wlr_gym.envs.tasks.describe.contract`)."""
         randomization = self.randomization.config.model_dump(mode="json", exclude_none=True)
-        return contract(self.task, randomization, None if self.floor.is_flat else self.floor.content())
+        return contract(self.task, randomization, None if self.floor is None else self.floor.content())
 
     def shorten(self, max_episode_steps: int | None) -> None:
         """Truncate episodes after ``max_episode_steps``, if that is before the task's own limit; None and -1 keep the limit."""
@@ -374,7 +374,7 @@ class Snapshots:
         self._fits = {
             "task": core.task.config.model_dump(mode="json"),
             "randomization": core.randomization.config.model_dump(mode="json"),
-            "floor": core.floor.content(),
+            "floor": None if core.floor is None else core.floor.content(),
             "effects": core.patch.content(),
             "free_wheels": core.settings.free_wheels,
             "observation": core.settings.observation,

@@ -286,7 +286,7 @@ class RandomizedRobots:
 
     Args:
         robot: the nominal one.
-        floor: that they drive on.
+        floor: that they drive on; None = a plane.
         randomization: what is drawn.
         patch: effects that are added to it.
         control_period: s.
@@ -303,7 +303,7 @@ class RandomizedRobots:
     def __init__(
         self,
         robot: Robot,
-        floor: Floor,
+        floor: Floor | None,
         randomization: Randomization,
         patch: Patch,
         control_period: float,
@@ -319,7 +319,8 @@ class RandomizedRobots:
         self.share: float = 1.0
         self._shares = np.ones(count)  # that the present episodes were drawn with
         self.parameters: Parameters = Parameters.nominal(robot, count)
-        floor.write(self.parameters, np.zeros(count, np.uint64))
+        if floor is not None:
+            floor.write(self.parameters, np.zeros(count, np.uint64))
         self.parameters = apply_patch(patch, self.parameters)
         self.state: PlantState = randomization.state(self.parameters, np.zeros(count, np.uint64))
         self.changed = np.zeros(count, bool)
@@ -414,7 +415,8 @@ class RandomizedRobots:
     ) -> Parameters:
         """Randomisation of some robots, then the floor, then the effects, then the sensors."""
         robots = self._randomization.parameters(robot_seeds, seeds, occurrences, time, share)
-        self._floor.write(robots, seeds)
+        if self._floor is not None:
+            self._floor.write(robots, seeds)
         robots = apply_patch(self._patch, robots) if self._patch else robots
         for (name, share), drawn in zip(self._presence, uniforms(seeds, self._presence_streams).T, strict=True):
             robots[name] = drawn < share

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import LARGEST_NOISE_SEED, InputError, require_seed, unknown_name
 from wlr_gym.base.snapshot import Snapshot
+from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.standing import settle
 from wlr_gym.robot import JOINTS, LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameter_table import XYZ
@@ -292,7 +293,8 @@ def standing_state(robot: Robot, parameters: Parameters, leg_angle: float | None
     state = PlantState(
         position, quaternion, zeros, zeros.copy(), joints, np.zeros((count, 8)), joints.copy(), np.zeros((count, 8))
     )
-    settle(robot, parameters, state)
+    if relief.families(parameters):
+        settle(robot, parameters, state)
     return state
 
 
