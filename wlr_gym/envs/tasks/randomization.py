@@ -21,6 +21,7 @@ from wlr_gym.base.random import stream_numbers, uniforms
 from wlr_gym.base.settings import Layer, SettingsModel, layers_of, overlay, parse_config, read_config
 from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Entry, EventConfig, Sampler, elements_of, entries_of
 from wlr_gym.envs.tasks.identified import identified_events
+from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.standing import settle
 from wlr_gym.robot import LEG_SLICE, LEGS, Robot
