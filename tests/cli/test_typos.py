@@ -117,7 +117,7 @@ KEYWORDS = {
     "how many": ({"num_envs": 4}, "'num_envs'; several at once: gymnasium.make_vec(ID, num_envs=4); valid: backend,"),
     "a seed": ({"seed": 3}, "'seed'; it goes to env.reset(seed=3); valid: backend,"),
     "sensors": ({"sensors": "cam"}, "'sensors'; it is of the task: task={\"sensors\": {\"camera\": 1.0}}; valid: backend,"),
-    "nothing like it": ({"foo": 1}, "got an unexpected keyword argument 'foo'; valid: backend,"),
+    "nothing like it": ({"xyzzy": 1}, "got an unexpected keyword argument 'xyzzy'; valid: backend,"),
     "no keys": ({"task": {"sensors": ["camera"]}}, "sensors = ['camera']: expected keys and values; keys: camera, flow"),
     "a simulator": ({"backend": "mujco"}, "did you mean 'mujoco'?"),
     "a precision": ({"precision": "float16"}, "unknown precision 'float16' (did you mean 'float64'?); valid: float32, float64"),

@@ -21,7 +21,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
 from wlr_gym.base.text import duration, pairs
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PORT, Count, JsonOption, PatchOption, Seed, SensorsOption, refuse_given
+from wlr_gym.cli.options import PORT, Count, FloorOption, JsonOption, PatchOption, Seed, SensorsOption, refuse_given
 from wlr_gym.cli.terminal import print_json, print_table, wait_for_enter
 from wlr_gym.policy import policy_environment
 from wlr_gym.robot import load_robot
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class AdaptOptions(JsonOption, PatchOption, SensorsOption):
+class AdaptOptions(JsonOption, PatchOption, FloorOption, SensorsOption):
     policy: tyro.conf.Positional[str]
     """Policy that PPO trained: shipped, a file, or a policy or run folder."""
     robot_runs: Path | None = None
@@ -92,6 +92,7 @@ def run(options: AdaptOptions) -> int:
         with progress(console) as tell:
             own = {name: getattr(options, name) for name in Asked.model_fields if hasattr(options, name)} | {
                 "driven": real, "effects": options.patch() if options.emulated else None, "environment": options.env,
+                "floor": options.load_floor(),
                 "excitations": options.excitation, "sensors": options.present() or (),
                 "threads": options.threads or os.cpu_count() or 1, "tell": partial(tell, ""),
             }  # fmt: skip
@@ -113,7 +114,7 @@ def _check(options: AdaptOptions) -> None:
     if options.emulated and (options.robot_runs or options.hardware):
         raise InputError("--emulated: an emulated robot, a real one (--hardware) or its runs (--robot-runs): one of them")
     if not options.emulated:
-        refuse_given(options, ("effects",), "it is for the emulated robot: a real one has its own")
+        refuse_given(options, ("effects", "floor"), "it is for the emulated robot: a real one has its own")
     if options.hardware is None:
         refuse_given(options, ("port",), "it goes with --hardware")
 

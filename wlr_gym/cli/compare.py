@@ -18,7 +18,17 @@ from wlr_gym.base.files import output_folder, write_json, write_text
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import Count, JsonOption, OutOption, PatchOption, RunsRobotOption, Seconds, Seed, settings_of
+from wlr_gym.cli.options import (
+    Count,
+    FloorOption,
+    JsonOption,
+    OutOption,
+    PatchOption,
+    RunsRobotOption,
+    Seconds,
+    Seed,
+    settings_of,
+)
 from wlr_gym.cli.terminal import print_json, print_table
 from wlr_gym.robot import Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
@@ -27,10 +37,11 @@ if TYPE_CHECKING:
     from wlr_gym.data.comparison import ReportTable
     from wlr_gym.data.excitations import Motion
     from wlr_gym.physics.effects import Patch
+    from wlr_gym.physics.floor import Floor
 
 
 @dataclass(frozen=True)
-class CompareOptions(JsonOption, OutOption, RunsRobotOption, PatchOption):
+class CompareOptions(JsonOption, OutOption, RunsRobotOption, PatchOption, FloorOption):
     plants: tuple[str, str] = ("gibbs_appell", "mujoco")
     """Two of: BACKEND or BACKEND:option=value,... with the options physics_step (s) and precision; for example
     gibbs_appell gibbs_appell:precision=float32."""
@@ -67,7 +78,7 @@ def run(options: CompareOptions) -> int:
     first, second = (parse_plant(text, options.physics_step) for text in options.plants)
     if first == second:
         raise InputError(f"--plants {' '.join(options.plants)}: the same plant twice; expected two that differ")
-    motions, robot = _motions(options)
+    motions, robot, floor = _motions(options)
     patches = _patches(options, robot)
     options.refuse_results(options.out, "compare.json")
     console, comparisons = Console(), []
@@ -80,7 +91,7 @@ def run(options: CompareOptions) -> int:
 
             found = compare(
                 motions, (first, second), robot, None, patch, options.threshold, halve=options.halve, threads=options.threads,
-                tell=told,
+                tell=told, floor=floor,
             )  # fmt: skip
             comparisons.append(found)
             if options.plots:
@@ -100,24 +111,29 @@ def run(options: CompareOptions) -> int:
     write_json(options.out / "compare.json", content)
     write_text(options.out / "report.md", markdown(comparisons, f"{first.label} and {second.label}"))
     driven = {"robot": robot.name, "motions": [motion.name for motion in motions], "effects": patches[0].content()["effects"]}
+    driven["floor"] = floor.content()
     record_provenance(options.out, settings_of(options) | driven)
     console.print(f"report: {options.out / 'report.md'}", soft_wrap=True)
     return FAILED if options.strict and any(comparison.broken for comparison in comparisons) else OK
 
 
-def _motions(options: CompareOptions) -> tuple[list[Motion], Robot]:
+def _motions(options: CompareOptions) -> tuple[list[Motion], Robot, Floor]:
     from wlr_gym.data.excitations import EXCITATIONS, excite
     from wlr_gym.data.record import motion_of
-    from wlr_gym.data.runs import read_runs, robot_of
+    from wlr_gym.data.runs import floor_of, read_runs, robot_of
+    from wlr_gym.physics.floor import load_floor
 
     if options.runs is None:
         robot = load_robot(options.robot or "nominal")
         names = options.excitation or tuple(EXCITATIONS)
-        return [excite(name, options.seed, robot, seconds=options.seconds) for name in names], robot
+        floor = load_floor(options.floor, robot).drawn(options.seed)
+        return [excite(name, options.seed, robot, seconds=options.seconds) for name in names], robot, floor
     if options.excitation:
         raise InputError("--runs and --excitation: expected one of them")
     runs = read_runs(options.runs)
-    return [motion_of(measured).cut(options.seconds) for measured in runs], robot_of(runs[0], options.robot)
+    robot = robot_of(runs[0], options.robot)
+    floor = floor_of(runs[0], options.floor, robot)
+    return [motion_of(measured).cut(options.seconds) for measured in runs], robot, floor
 
 
 def _patches(options: CompareOptions, robot: Robot) -> list[Patch]:

@@ -21,11 +21,13 @@ from rich.text import Text
 
 from wlr_gym.base.errors import InputError, Interval, check_name
 from wlr_gym.base.files import require_ending, require_output_place
+from wlr_gym.base.provenance import write_yaml
 from wlr_gym.base.text import pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import (
     PORT,
     CameraOption,
+    FloorOption,
     JsonOption,
     PatchOption,
     Seconds,
@@ -56,6 +58,7 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import DrivingPad, Keys
     from wlr_gym.hardware.safety.rules import RobotStatus
+    from wlr_gym.physics.floor import Floor
     from wlr_gym.physics.plants.base import RobotOptions
 
 #: How a stop begins that an emulated robot in real time owes to a busy computer.
@@ -65,7 +68,7 @@ _PAD_DEADMAN = 0.2
 
 
 @dataclass(frozen=True)
-class DeployOptions(JsonOption, PatchOption, CameraOption):
+class DeployOptions(JsonOption, PatchOption, FloorOption, CameraOption):
     policy: tyro.conf.Positional[str]
     """Policy file or folder, run folder, or name of an agent or shipped policy."""
     env: str | None = None
@@ -113,13 +116,14 @@ def run(options: DeployOptions) -> int:
     command = checked_command(options)
     environment = environment_of(options.env, options.policy)
     note_untrained([options.policy])
-    hardware, robot = robot_options(options), driven_robot(options)
+    robot = driven_robot(options)
+    hardware = robot_options(options, robot)
     keywords = {"backend": "dynamixel", "hardware": hardware, "robot": robot, "episode_length": options.seconds}
     policy = _make_policy(options.policy, environment, keywords, command)
     console = Console()
     with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:  # the stream ends when the motors are off
         if options.emulated and not options.stepped:
-            ports, poses = stack.enter_context(_emulator(options, console, robot))
+            ports, poses = stack.enter_context(_emulator(options, console, robot, hardware.floor))
             keywords["hardware"] = replace(hardware, ports=ports, poses=poses)
         core = make_core(environment, 1, environment_for(options.policy, keywords))
         stack.callback(core.close)
@@ -243,16 +247,20 @@ def driven_robot(options: DeployOptions) -> Any:
     return made_for if options.hardware == DeployOptions.hardware and not is_same else wired
 
 
-def robot_options(options: DeployOptions) -> RobotOptions:
-    """Return which robot is driven, and how it is connected; an emulated one in real time gets its ports once it runs."""
+def robot_options(options: DeployOptions, robot: Any) -> RobotOptions:
+    """Return how the robot is connected and on what it drives; an emulated one in real time gets its ports once it runs."""
     from wlr_gym.physics.plants.base import RobotOptions
 
+    floor = options.load_floor(None if robot is None else load_robot(robot))
+    if floor is not None and options.emulated:
+        floor = floor.drawn(options.seed)
     own = {
         "ports": pairs("--port", options.port, PORT),
         "emulated": options.stepped,
         "log": options.out,
         "deadman": _PAD_DEADMAN if options.deadman is None and options.gamepad is not None else options.deadman,
         "effects": options.patch() if options.stepped else None,
+        "floor": floor,
     }
     return RobotOptions(**handed(options, RobotOptions, **own))
 
@@ -295,7 +303,9 @@ def _report_stream(stream: McapStream, console: Console) -> None:
 
 
 @contextlib.contextmanager
-def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> Iterator[tuple[dict[str, str], Path | None]]:
+def _emulator(
+    options: DeployOptions, console: Console, robot: Any = None, floor: Floor | None = None
+) -> Iterator[tuple[dict[str, str], Path | None]]:
     """Start ``wlr emulate`` as a process of its own; yield its ports, and the file of its poses where a camera needs it."""
     import subprocess
     import tempfile
@@ -310,6 +320,9 @@ def _emulator(options: DeployOptions, console: Console, robot: Any = None) -> It
         if robot is not None:
             write_robot(Path(folder) / "robot.yaml", load_robot(robot))
             words += ["--robot", str(Path(folder) / "robot.yaml")]
+        if floor is not None:
+            write_yaml(Path(folder) / "floor.yaml", floor.content())
+            words += ["--floor", str(Path(folder) / "floor.yaml")]
         words += ["--poses", str(poses)] if poses is not None else []
         words += ["--fault", *options.fault] if options.fault else []
         words += ["--effects", *options.effects] if options.effects else []

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import HardwareOption, PatchOption, Seconds, Seed
+from wlr_gym.cli.options import FloorOption, HardwareOption, PatchOption, Seconds, Seed, refuse_given
 from wlr_gym.robot import load_robot
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class EmulateOptions(HardwareOption, PatchOption):
+class EmulateOptions(HardwareOption, PatchOption, FloorOption):
     backend: str = "gibbs_appell"
     """Simulator behind the servos."""
     links: Path | None = None
@@ -109,9 +109,10 @@ def machine_of(options: EmulateOptions) -> Machine:
     robot = load_robot(options.robot or hardware.robot or "nominal")
     hardware = with_flow_port(robot, hardware)
     if options.stand:
+        refuse_given(options, ("floor",), "on a stand no wheel touches it; leave --stand out")
         machine = EmulatedStand(robot, hardware, effects, options=machine_options).machine
     else:
-        machine = Machine(robot, hardware, machine_options, effects=effects)
+        machine = Machine(robot, hardware, machine_options, effects=effects, floor=options.load_floor(robot))
     for fault in options.fault:
         machine.inject(fault)
     return machine

@@ -7,7 +7,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -19,6 +19,7 @@ from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import (
     Count,
+    FloorOption,
     ForceOption,
     JsonOption,
     PatchOption,
@@ -56,7 +57,7 @@ FULL_BLOCKS = 5
 
 
 @dataclass(frozen=True)
-class EvaluateOptions(ProgressOption, JsonOption, ForceOption, PatchOption, SensorsOption):
+class EvaluateOptions(ProgressOption, JsonOption, ForceOption, PatchOption, FloorOption, SensorsOption):
     policy: tyro.conf.Positional[tuple[str, ...]] = ()
     """Agent, policy file (.onnx), policy or run folder, or shipped policy; NAME=POLICY names it. Several, NAME=POLICY,POLICY, a
     pattern ('out/five/trials/*') or a folder of run folders: trainings of one recipe with different seeds, as one column."""
@@ -132,13 +133,15 @@ def run(options: EvaluateOptions) -> int:
         print_card(card)
     robot = options.robot or common_robot(subjects)
     keywords = {
-        "randomization": options.randomization, "robot": robot, "effects": patch, "threads": options.threads,
+        "randomization": options.randomization, "robot": robot, "effects": patch, "floor": options.floor,
+        "threads": options.threads,
         "backend": BACKENDS[0] if options.backend == "both" else options.backend, **having(options.present()),
     }  # fmt: skip
     if options.out is not None:
-        driven = {} if robot is None else {"robot": robot_content(robot)}
+        driven: dict[str, Any] = {} if robot is None else {"robot": robot_content(robot)}
         _write(options.out, card, first[0], options.seed)
-        record_provenance(options.out, settings_of(options) | driven | {"effects": patch.content()["effects"]}, options.seed)
+        driven |= {"effects": patch.content()["effects"]} | options.floor_content()
+        record_provenance(options.out, settings_of(options) | driven, options.seed)
         if options.record:
             source, folder = _shown(card, subjects[0]).sources[0], options.out / "runs"
             core, policy = make_player(str(options.env), source, options.record, keywords)
@@ -171,7 +174,8 @@ def _accept(options: EvaluateOptions) -> int:
             "floors": None if options.randomization is None else (options.randomization,),
             "episodes": scoring.ACCEPTANCE_EPISODES if options.episodes is None else options.episodes,
             "blocks": scoring.ACCEPTANCE_BLOCKS if options.blocks is None else options.blocks,
-            "sensors": options.present(), "effects": options.patch(), "threads": options.threads, "tell": tell,
+            "sensors": options.present(), "effects": options.patch(), "floor": options.floor,
+            "threads": options.threads, "tell": tell,
         }  # fmt: skip
         result = accept(**handed(options, accept, **own))
     if options.json:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.link import Link
     from wlr_gym.hardware.plant import RobotPlant
     from wlr_gym.physics.effects import Patch
+    from wlr_gym.physics.floor import Floor
     from wlr_gym.robot import Robot
 
 #: Shells that commands and options are completed in.
@@ -152,6 +153,26 @@ class PatchOption:
         from wlr_gym.physics.effects import load_patch
 
         return load_patch(list(self.effects))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FloorOption:
+    """``--floor`` of every command that simulates."""
+
+    floor: str | None = None
+    """What is driven on: name in configs/floor/ (see: wlr robot floors) or path; default: a plane, or the floor of the task or
+    of the runs."""
+
+    def load_floor(self, robot: Robot | None = None) -> Floor | None:
+        """Return the floor; None = none was given. See :func:`wlr_gym.physics.floor.load_floor`."""
+        from wlr_gym.physics.floor import load_floor
+
+        return None if self.floor is None else load_floor(self.floor, robot)
+
+    def floor_content(self) -> dict[str, Any]:
+        """Return what ``config.yaml`` says beside the options: the floor by its content; nothing where none was given."""
+        floor = self.load_floor()
+        return {} if floor is None else {"floor": floor.content()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -399,7 +420,7 @@ class WiredRobotOption(HardwareOption):
         Args:
             robot: the robot.
             log: folder of the runs.
-            meta: of the runs.
+            meta: of the runs; an emulated robot drives on its floor.
             patch: what an emulated robot has that its file does not say.
             seed: of an emulated robot's noise.
         """
@@ -409,7 +430,7 @@ class WiredRobotOption(HardwareOption):
         self.refuse_effects(patch)
         self.camera_file()
         options = RobotOptions(
-            self.hardware, self.ports(), self.emulated, log=log, effects=patch, camera=self.camera, seed=seed
+            self.hardware, self.ports(), self.emulated, log=log, effects=patch, floor=meta.floor, camera=self.camera, seed=seed
         )
         return RobotPlant(robot, 1, hardware=options, meta=meta)
 

@@ -17,6 +17,7 @@ from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import tracked
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import (
+    FloorOption,
     ForceOption,
     JsonOption,
     PatchOption,
@@ -50,7 +51,7 @@ FPS = 25.0
 
 
 @dataclass(frozen=True)
-class PlayOptions(JsonOption, ForceOption, PatchOption, SensorsOption):
+class PlayOptions(JsonOption, ForceOption, PatchOption, FloorOption, SensorsOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id, see: wlr envs; default: the one the policy was trained in, else WLR-Velocity-v0."""
     agent: str = "pid"
@@ -99,7 +100,7 @@ def run(options: PlayOptions) -> int:
     from wlr_gym.learning.evaluation.rollout import make_core
 
     _check(options)
-    keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot")}
+    keywords: dict[str, Any] = {name: getattr(options, name) for name in ("backend", "randomization", "robot", "floor")}
     keywords |= {"effects": options.patch(), **having(options.present())}
     own = environment_for(options.agent, keywords)
     note_untrained([options.agent, *([options.beside] if options.beside else [])])

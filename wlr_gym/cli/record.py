@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -19,7 +19,17 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder, refuse_existing
 from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, INTERRUPTED, OK
-from wlr_gym.cli.options import CameraOption, ForceOption, JsonOption, PatchOption, Seconds, Seed, noise_seed, refuse_given
+from wlr_gym.cli.options import (
+    CameraOption,
+    FloorOption,
+    ForceOption,
+    JsonOption,
+    PatchOption,
+    Seconds,
+    Seed,
+    noise_seed,
+    refuse_given,
+)
 from wlr_gym.cli.terminal import confirm, print_json, print_table
 from wlr_gym.robot import Robot, load_robot
 
@@ -30,7 +40,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption):
+class RecordOptions(JsonOption, ForceOption, CameraOption, PatchOption, FloorOption):
     excitation: tuple[str, ...] = ()
     """Motions to drive, by name, see: wlr record --list; several make a data set."""
     commands: tuple[Path, ...] = ()
@@ -83,7 +93,8 @@ def run(options: RecordOptions) -> int:
     if not motions:
         raise InputError("nothing to drive: name excitations (--excitation straight turns; see --list) or files (--commands)")
     same_profile(motions)
-    meta = meta_of(motions[0], robot, RunMeta(ground=options.ground, notes=options.notes))
+    noted = RunMeta(ground=options.ground, notes=options.notes, floor=_floor(options, robot))
+    meta = meta_of(motions[0], robot, noted)
     code = OK
     if options.commands_only:
         for motion in motions:
@@ -98,6 +109,18 @@ def run(options: RecordOptions) -> int:
     if options.json:
         print_json(found)
     return code
+
+
+def _floor(options: RecordOptions, robot: Robot) -> dict[str, Any] | None:
+    """Return what ``meta.yaml`` says of the floor: one for all runs of the folder, drawn by ``--seed``."""
+    from wlr_gym.physics.floor import floor_noted
+    from wlr_gym.physics.plants import REAL
+
+    floor = options.load_floor(robot)
+    if floor is None:
+        return None
+    is_real = options.backend in REAL and not options.emulated
+    return floor_noted(floor if is_real else floor.drawn(options.seed or 0))
 
 
 # ---- the robot -------------------------------------------------------------------------------------------------------

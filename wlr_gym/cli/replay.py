@@ -24,7 +24,7 @@ from wlr_gym.base.progress import tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.text import counted
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption, PatchOption, RobotOption, settings_of
+from wlr_gym.cli.options import FloorOption, ForceOption, JsonOption, PatchOption, RobotOption, settings_of
 from wlr_gym.cli.terminal import confirm, print_json, print_table
 from wlr_gym.render.video import check_video
 from wlr_gym.robot import CORNERS, JOINTS
@@ -38,7 +38,7 @@ ERRORS_FILE = "errors.json"
 
 
 @dataclass(frozen=True)
-class ReplayOptions(JsonOption, ForceOption, RobotOption, PatchOption):
+class ReplayOptions(JsonOption, ForceOption, RobotOption, PatchOption, FloorOption):
     runs: Positional[Path]
     """A run (CSV or Parquet) or a folder of runs."""
     out: Path
@@ -62,7 +62,7 @@ class ReplayOptions(JsonOption, ForceOption, RobotOption, PatchOption):
 def run(options: ReplayOptions) -> int:
     """Replay, print the tables, write the files; 0 when done, 1 when something stopped the robot."""
     from wlr_gym.data.replay import LEAD, prepare, save_plots
-    from wlr_gym.data.runs import read_runs
+    from wlr_gym.data.runs import floor_of, read_runs
     from wlr_gym.physics.plants import REAL, check_backend
 
     console = Console()
@@ -83,7 +83,7 @@ def run(options: ReplayOptions) -> int:
     for film in films:
         refuse_existing(film, options.force, "--video")
     for measured in runs:  # a refusal leaves no folder behind
-        prepare(measured, options.robot, effects=patch, segment=options.segment)
+        prepare(measured, options.robot, effects=patch, segment=options.segment, floor=options.floor)
     make_output_folder(options.out)
     results = []
     for result in (_repeat_all if on_robot else _replay_all)(options, runs, patch, console):
@@ -100,7 +100,8 @@ def run(options: ReplayOptions) -> int:
     write_json(options.out / ERRORS_FILE, errors)
     first, driven = results[0], [str(result.run.path) for result in results]
     found = {"robot": first.robot.name, "clock": first.clock, "physics_step": first.physics_step, "runs": driven}
-    record_provenance(options.out, settings_of(options) | found | {"effects": patch.content()["effects"]})
+    found |= {"effects": patch.content()["effects"], "floor": floor_of(first.run, options.floor).content()}
+    record_provenance(options.out, settings_of(options) | found)
     console.print(f"errors, plots and provenance: {options.out}")
     for result, film in zip(results, films, strict=False):
         _draw_film(options, result, patch, film, console)
@@ -112,7 +113,7 @@ def _draw_film(options: ReplayOptions, result: ReplayResult, patch: Patch, targe
     from wlr_gym.data.watch import FPS, film_length, replay_film
     from wlr_gym.render import write_video
 
-    _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment)
+    _, parameters = prepare(result.run, options.robot, effects=patch, segment=options.segment, floor=options.floor)
     count, pictures = film_length(result.run), replay_film(result, parameters, options.backend)
     write_video(target, tracked(pictures, count, f"drawing {result.run.name}", console), FPS, count)
     console.print(f"video: {target}")
@@ -122,7 +123,7 @@ def _replay_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.data.replay import replay
 
     for measured in tracked(runs, len(runs), f"replaying on {options.backend}", console):
-        yield replay(measured, options.backend, options.robot, effects=patch, segment=options.segment)
+        yield replay(measured, options.backend, options.robot, effects=patch, segment=options.segment, floor=options.floor)
 
 
 def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, console: Console) -> Iterator[ReplayResult]:
@@ -131,8 +132,9 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
     from wlr_gym.data.format import RunMeta
     from wlr_gym.data.record import meta_of, motion_of
     from wlr_gym.data.replay import compare_repeat
-    from wlr_gym.data.runs import robot_of
+    from wlr_gym.data.runs import floor_of, robot_of
     from wlr_gym.hardware.deployment import drive_robot
+    from wlr_gym.physics.floor import floor_noted
 
     motions = [motion_of(measured) for measured in runs]
     chosen = options.robot or options.load_hardware().robot
@@ -141,7 +143,8 @@ def _repeat_all(options: ReplayOptions, runs: Sequence[Run], patch: Patch, conso
         if not (options.emulated or options.yes):
             confirm(motion, robot, options.load_hardware(), console)
         folder = options.out / "robot" / measured.name
-        with closing(options.plant_of(robot, folder, meta_of(motion, robot, RunMeta()), patch)) as plant:
+        noted = RunMeta(floor=floor_noted(floor_of(measured, options.floor, robot)))
+        with closing(options.plant_of(robot, folder, meta_of(motion, robot, noted), patch)) as plant:
             drive = drive_robot(plant, motion)
         interventions = drive.statistics["interventions"]
         changed = ", ".join(f"{rule} in {count} steps" for rule, count in interventions.items()) or "nothing changed"

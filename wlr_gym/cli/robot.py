@@ -1,4 +1,4 @@
-"""Robot files: make a ``new`` one, ``check`` and ``show`` one, ``import`` one from MJCF or URDF, ``export`` one to them.
+"""Robot files: make a ``new`` one, ``check`` and ``show`` one, ``import`` one from MJCF or URDF, ``export`` one, ``floors``.
 
 Exit code 0: done, nothing stands against the robot; 1: it cannot stand, drive or turn; 2: bad input, nothing written.
 """
@@ -17,7 +17,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import check_new_file, write_text
 from wlr_gym.base.text import counted, pairs
 from wlr_gym.cli import FAILED, OK
-from wlr_gym.cli.options import ForceOption, JsonOption
+from wlr_gym.cli.options import FloorOption, ForceOption, JsonOption, refuse_given
 from wlr_gym.cli.terminal import ask_terminal, print_json, print_table
 from wlr_gym.physics.feasibility import ENTRIES, RobotFinding, capability_of, examine_robot, unusual
 from wlr_gym.robot import Robot, load_robot, robot_hash
@@ -32,6 +32,7 @@ from wlr_gym.robot.interchange.recognition import (
 )
 from wlr_gym.robot.interchange.urdf import NOT_IN_URDF, parse_urdf, urdf_text
 from wlr_gym.robot.outline import QUESTIONS, Question, derived_numbers, question_of
+from wlr_gym.robot.parameters import Parameters
 
 Format = Literal["mjcf", "urdf"]
 #: End of a file's name -> format.
@@ -95,8 +96,8 @@ class RobotImportOptions(JsonOption, ForceOption):
 
 
 @dataclass(frozen=True)
-class RobotExportOptions(JsonOption, ForceOption):
-    """Write a robot as MJCF (the MuJoCo plant's own model) or URDF."""
+class RobotExportOptions(JsonOption, ForceOption, FloorOption):
+    """Write a robot as MJCF (the MuJoCo plant's own model, with --floor the floor's pieces too) or URDF."""
 
     robot: Positional[str]
     """Robot file, or name in configs/robot/."""
@@ -104,6 +105,11 @@ class RobotExportOptions(JsonOption, ForceOption):
     """File to write; .xml or .mjcf: MJCF, .urdf: URDF."""
     format: Format | None = None
     """Format of the file; default: by the end of --out."""
+
+
+@dataclass(frozen=True)
+class FloorsOptions(JsonOption):
+    """List the floors that ship with it, for --floor."""
 
 
 def new_robot(options: NewOptions, ask: Callable[[str], str] | None = None) -> int:
@@ -251,7 +257,8 @@ def _read(path: Path) -> LinkTree:
 
 def export_robot(options: RobotExportOptions) -> int:
     """Write the file, and say what it cannot hold."""
-    from wlr_gym.physics.plants.mujoco.mjcf import NOT_IN_MJCF, mjcf_text
+    from wlr_gym.physics.floor import lay_floor, load_floor
+    from wlr_gym.physics.plants.mujoco.mjcf import NOT_IN_MJCF, NOT_IN_MJCF_FLOOR, mjcf_text
 
     by_name = SUFFIXES.get(options.out.suffix.lower())
     kind = options.format or by_name
@@ -259,14 +266,35 @@ def export_robot(options: RobotExportOptions) -> int:
         raise InputError(f"--out {options.out}: expected a file that ends in {', '.join(SUFFIXES)}, or --format")
     if by_name not in (None, kind) and options.out.suffix.lower() != ".xml":  # which is used for both
         raise InputError(f"--out {options.out}: a name of {by_name}, and --format {kind}; leave --format out")
+    if kind == "urdf":
+        refuse_given(options, ("floor",), "URDF holds a robot, no floor; expected --format mjcf")
     check_new_file(options.out, options.force)
     robot = load_robot(options.robot)
-    text, lost = (mjcf_text(robot), NOT_IN_MJCF) if kind == "mjcf" else (urdf_text(robot), NOT_IN_URDF)
+    if kind == "mjcf":
+        floor = load_floor(options.floor, robot).drawn()
+        text = mjcf_text(robot, lay_floor(floor, Parameters.nominal(robot)))
+        lost = NOT_IN_MJCF if floor.is_flat else NOT_IN_MJCF + NOT_IN_MJCF_FLOOR
+    else:
+        text, lost = urdf_text(robot), NOT_IN_URDF
     write_text(options.out, text)
     if options.json:
         print_json({"out": options.out, "format": kind, "not_held": lost})
     else:
         print(f"written: {options.out}\n{kind.upper()} does not hold: {', '.join(lost)}")
+    return OK
+
+
+def list_floors(options: FloorsOptions) -> int:
+    """List the floors that ship."""
+    from wlr_gym.base.paths import config_names
+    from wlr_gym.physics.floor import load_floor
+
+    floors = [load_floor(name) for name in config_names("floor")]
+    if options.json:
+        print_json([floor.content() for floor in floors])
+        return OK
+    rows = [(floor.name, floor.summary, ", ".join(floor.randomise) or "-") for floor in floors]
+    print_table(Console(highlight=False), ("floor", "what it is", "drawn for every episode"), rows)
     return OK
 
 
@@ -277,4 +305,5 @@ COMMANDS = {
     "show": (ShowOptions, show_robot),
     "import": (RobotImportOptions, import_robot),
     "export": (RobotExportOptions, export_robot),
+    "floors": (FloorsOptions, list_floors),
 }

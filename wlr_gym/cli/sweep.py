@@ -15,7 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
 from wlr_gym.base.text import counted, number, pairs
 from wlr_gym.cli import FAILED, IMPORTED, OK
-from wlr_gym.cli.options import Count, JsonOption, ray_address, refuse_given
+from wlr_gym.cli.options import Count, FloorOption, JsonOption, ray_address, refuse_given
 from wlr_gym.cli.terminal import print_json
 from wlr_gym.learning.sweep.book import SweepResult
 from wlr_gym.learning.sweep.plan import SweepPlan, read_plan
@@ -25,7 +25,7 @@ from wlr_gym.policy.agents import apply_changes
 
 
 @dataclass(frozen=True)
-class SweepOptions(JsonOption):
+class SweepOptions(JsonOption, FloorOption):
     what: tyro.conf.Positional[str | None] = None
     """File of a sweep (YAML; see docs/learning.md) or environment id (see: wlr envs)."""
     config: str | None = None
@@ -56,7 +56,7 @@ def run(options: SweepOptions) -> int:
     """Train, say how it goes, and print where table and page are."""
     ray = ray_address(options.ray)
     if options.resume is not None:
-        own = ("what", "config", "agent", "init", "search", "seeds", "out", "robot", "set")
+        own = ("what", "config", "agent", "init", "search", "seeds", "out", "robot", "set", "floor")
         refuse_given(options, own, "--resume continues a sweep as it was planned; beside it there are --ray and --workers only")
         found = resume_sweep(options.resume, ray=ray, workers=options.workers, say=_say)
     else:
@@ -80,6 +80,8 @@ def _plan(options: SweepOptions) -> SweepPlan:
     changes |= _settings(options.set)
     if options.robot is not None:
         apply_changes(changes["settings"], [f"environment.robot={json.dumps(options.robot)}"])
+    if (floor := options.load_floor()) is not None:
+        apply_changes(changes["settings"], [f"environment.floor={json.dumps(floor.content())}"])
     if not options.what.endswith((".yaml", ".yml")):
         changes["environment"] = options.what
     elif options.search is not None:

@@ -13,14 +13,14 @@ from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import JsonOption, PatchOption, ProgressOption, Seed, environment_of, refuse_given
+from wlr_gym.cli.options import FloorOption, JsonOption, PatchOption, ProgressOption, Seed, environment_of, refuse_given
 from wlr_gym.cli.terminal import print_json
 from wlr_gym.learning.training import resume_training, run_training, settings_of
 from wlr_gym.policy import Training, TrainingProgress, find_policy
 
 
 @dataclass(frozen=True)
-class TrainOptions(ProgressOption, JsonOption, PatchOption):
+class TrainOptions(ProgressOption, JsonOption, PatchOption, FloorOption):
     env: tyro.conf.Positional[str | None] = None
     """Environment id (see: wlr envs); default: that of --init, else WLR-Velocity-v0."""
     agent: str = "ppo"
@@ -52,7 +52,7 @@ def run(options: TrainOptions) -> int:
     seconds = None if options.max_minutes is None else 60.0 * options.max_minutes
     updates: deque[TrainingProgress] = deque(maxlen=1)
     if options.resume is not None:
-        own = ("env", "out", "config", "seed", "backend", "robot", "init", "set", "effects")
+        own = ("env", "out", "config", "seed", "backend", "robot", "init", "set", "effects", "floor")
         refuse_given(options, own, "--resume uses the settings of the run folder: leave it out")
         policy = resume_training(
             options.resume,
@@ -71,6 +71,7 @@ def run(options: TrainOptions) -> int:
         added: dict[str, Any] = {} if options.backend is None else {"backend": options.backend}
         if patch := options.patch():  # its content, so that the run folder says what was added
             added["effects"] = patch.content()["effects"]
+        added |= options.floor_content()
         given = {"changes": options.set, "settings": {"environment": added} if added else None, "seed": options.seed}
         config = settings_of(environment, options.config, options.agent, options.init, robot=options.robot, **given)
         folder = options.out or default_folder(options, environment, config)

@@ -14,7 +14,7 @@ import tyro
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import OK
-from wlr_gym.cli.options import PatchOption, RunsRobotOption, Seconds, require_simulator
+from wlr_gym.cli.options import FloorOption, PatchOption, RunsRobotOption, Seconds, require_simulator
 from wlr_gym.render.web.page import HOST, PORT
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ FIRST = ("cam_xy", "vel_wheel", "pos_leg")
 
 
 @dataclass(frozen=True)
-class ViewOptions(RunsRobotOption, PatchOption):
+class ViewOptions(RunsRobotOption, PatchOption, FloorOption):
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Runs (CSV or Parquet), or folders of runs."""
     backend: str = "gibbs_appell"
@@ -57,7 +57,7 @@ def run(options: ViewOptions) -> int:
         raise InputError("expected runs (CSV or Parquet), or folders of runs; wlr import makes runs of other programs' logs")
     runs = [one for path in options.runs for one in read_runs(path)]
     backend = options.backend if options.ghost else None
-    opened = open_recordings(runs, options.robot, backend, options.patch(), options.segment)
+    opened = open_recordings(runs, options.robot, backend, options.patch(), options.segment, options.floor)
     player = Player(_names(runs), opened, FIRST, host=options.host, port=options.port)
     end = float("inf") if options.seconds is None else time.monotonic() + options.seconds
     player.run(lambda: time.monotonic() >= end)

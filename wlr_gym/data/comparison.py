@@ -26,6 +26,7 @@ from wlr_gym.data.run_states import euler_angles, standing_at
 from wlr_gym.data.sensors import channel_noise
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
 from wlr_gym.physics.effects.patch import Source
+from wlr_gym.physics.floor import FloorSource, lay_floor, load_floor
 from wlr_gym.physics.plants import check_simulator, make_plant
 from wlr_gym.physics.plants.base import PlantOptions, Sensors, Truth
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot, load_robot
@@ -366,6 +367,7 @@ def compare(
     halve: bool = False,
     threads: int = 1,
     tell: Callable[[str, float], None] = lambda doing, share: None,
+    floor: FloorSource = None,
 ) -> Comparison:
     """Drive the same motions on two plants and compare all they show.
 
@@ -380,6 +382,7 @@ def compare(
         halve: repeat at half of both steps.
         threads: of each plant.
         tell: called with what is being done and the share that is done.
+        floor: that both drive on, as ``floor=`` of an environment; what of it is drawn, is drawn by seed 0.
 
     Raises:
         InputError: no motions or of different periods, a threshold that is not positive, an unknown effect.
@@ -391,6 +394,8 @@ def compare(
     check_number("threshold", threshold, "units of sensor noise", above=0.0)
     robot, patch = robot or load_robot(), load_patch(effects)
     signals = resolutions(robot)
+    parameters = Parameters.nominal(robot) if parameters is None else parameters
+    parameters = lay_floor(load_floor(floor, robot).drawn(), parameters)
 
     driven = [*plants, *(plant.halved for plant in plants if halve)]
 

@@ -126,6 +126,8 @@ class RunMeta(SettingsModel):
         robot_hash: fingerprint of the robot in that file when the runs were recorded; None = not noted.
         profile: servo profile, rad/s2 and rad/s.
         ground: what the operator noted about the floor.
+        floor: relief and friction of the floor: path of a floor's file (relative to the meta file), name in ``configs/floor/``,
+            or its content; None = a plane.
         marker_offset: marker centre in the body frame, m.
         notes: free text.
     """
@@ -134,6 +136,7 @@ class RunMeta(SettingsModel):
     robot_hash: str | None = None
     profile: Profile = Profile()
     ground: str | None = None
+    floor: str | dict[str, Any] | None = None
     marker_offset: Vector3 = (0.0, 0.0, 0.0)
     notes: str | None = None
 

@@ -17,9 +17,10 @@ from wlr_gym.data.excitations import CONTROL_PERIOD, SETTLE, Motion
 from wlr_gym.data.format import COMMANDS, Profile, RunMeta
 from wlr_gym.data.replay import held_setpoints, profile_parameters
 from wlr_gym.data.run_states import standing_at
-from wlr_gym.data.runs import Run, Simulation, departures, read_meta, start_of, write_csv, write_meta, write_run
+from wlr_gym.data.runs import Run, Simulation, departures, floor_of_meta, read_meta, start_of, write_csv, write_meta, write_run
 from wlr_gym.data.sensors import channels, sensed_columns
 from wlr_gym.physics.effects import EFFECTS, Patch, apply_patch, load_patch
+from wlr_gym.physics.floor import lay_floor
 from wlr_gym.physics.plants import check_simulator, make_plant
 from wlr_gym.physics.plants.base import PlantOptions
 from wlr_gym.robot import JOINTS, LEGS, Robot
@@ -117,15 +118,17 @@ def record_simulation(
         backend: one of :data:`wlr_gym.physics.plants.SIMULATORS`.
         seed: of the sensors' noise.
         patch: effects that are added.
-        meta: for ``meta.yaml``; its profile is the motion's.
+        meta: for ``meta.yaml``; its profile is the motion's. The robot drives on its floor, drawn by ``seed``.
 
     Raises:
-        InputError: unknown backend, a seed that is out of range, or a folder whose ``meta.yaml`` says something else.
+        InputError: unknown backend or floor, a seed that is out of range, or a folder whose ``meta.yaml`` says something else.
     """
     check_simulator(backend)
     require_seed("seed =", seed, LARGEST_NOISE_SEED)
     patch = patch or load_patch(None)
-    parameters = apply_patch(patch, profile_parameters(Parameters.nominal(robot), motion.profile))
+    floor = floor_of_meta(meta or RunMeta(), path.parent, robot)
+    parameters = profile_parameters(Parameters.nominal(robot), motion.profile)
+    parameters = apply_patch(patch, lay_floor(floor.drawn(seed), parameters))
     options, seeds = PlantOptions(control_period=motion.period), np.array([seed], np.uint64)
     torque_on = np.isfinite(motion.setpoints)
     columns, stand = sensed_columns(robot), motion.start(robot)[None]

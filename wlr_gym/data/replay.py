@@ -24,12 +24,14 @@ from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.plots import BLUE, GREY, ORANGE, new_figure, save, tidy
 from wlr_gym.data.format import ANGLES_OF_THE_BODY, CHANNELS, COLUMNS, COMMANDS, Profile
 from wlr_gym.data.run_states import euler_angles, measured_state, start_state, starts_at_rest
-from wlr_gym.data.runs import Run, Simulation, robot_of, simulation_path
+from wlr_gym.data.runs import Run, Simulation, floor_of, robot_of, simulation_path
 from wlr_gym.data.sensors import channel_noise, channels, sensed_columns
 from wlr_gym.physics.effects import Patch, Source, apply_patch, load_patch
+from wlr_gym.physics.floor import FloorSource, lay_floor
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
 from wlr_gym.physics.plants.sensors import rotation
+from wlr_gym.physics.plants.standing import settle
 from wlr_gym.robot import LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -111,6 +113,7 @@ def replay(
     segment: float = 1.0,
     clock: float = CLOCK,
     physics_step: float = 0.001,
+    floor: FloorSource = None,
 ) -> ReplayResult:
     """Replay one run and compare.
 
@@ -123,12 +126,13 @@ def replay(
         segment: s between anchors.
         clock: s per tick of the plant.
         physics_step: s per physics step.
+        floor: as ``floor=`` of an environment; None = the one that the run's meta data say.
 
     Raises:
-        InputError: unknown backend, robot or effect, a segment shorter than its lead, a run shorter than half a segment.
+        InputError: unknown backend, robot, floor or effect, a segment shorter than its lead, a run shorter than half a segment.
     """
     patch = load_patch(effects)
-    robot, parameters = prepare(run, robot, parameters, patch, segment)
+    robot, parameters = prepare(run, robot, parameters, patch, segment, floor)
     t = run["t"]
     starts = segment_starts(t, segment)
     options = PlantOptions(control_period=clock, physics_step=physics_step, sensor_noise=False)
@@ -139,6 +143,7 @@ def replay(
     full, passed = _simulate(run, plant, parameters, first, begin, t[-1] - begin[0], t[starts])
     many = Parameters(np.repeat(parameters.values, len(starts), axis=0))
     anchors = measured_state(run, t[starts], passed, many)
+    settle(robot, many, anchors)
     ends = np.append(t[starts[1:]] + LEAD, t[-1])
     duration = float(np.max(ends - t[starts]))
     plant = make_plant(backend, robot, len(starts), options, patch.forces)
@@ -159,12 +164,14 @@ def prepare(
     parameters: Parameters | None = None,
     effects: Source = None,
     segment: float = 1.0,
+    floor: FloorSource = None,
 ) -> tuple[Robot, Parameters]:
-    """Check what :func:`replay` is given, without simulating; return the robot and its patched parameters."""
+    """Check what :func:`replay` is given, without simulating; return the robot and its patched parameters on the floor."""
     check_number("segment", segment, "s", above=LEAD)
     robot = robot_of(run, robot)
     parameters = Parameters.nominal(robot) if parameters is None else parameters
-    parameters = apply_patch(load_patch(effects), profile_parameters(parameters, run.meta.profile))
+    parameters = lay_floor(floor_of(run, floor, robot), profile_parameters(parameters, run.meta.profile))
+    parameters = apply_patch(load_patch(effects), parameters)
     t = run["t"]
     if t[-1] - t[0] < 0.5 * segment:
         raise InputError(f"{run.path}: {t[-1] - t[0]:.2f} s long: too short for segments of {segment:g} s")
@@ -360,6 +367,7 @@ def replayed_rows(
                 first, last = np.searchsorted(t, [t[row] - _AROUND, t[row] + _AROUND])
                 near = replace(run, table=run.table.iloc[int(first) : int(last)])
                 state = measured_state(near, t[row : row + 1], plant.mechanical_state(), parameters)
+                settle(robot, parameters, state)
                 sensors = plant.reset(parameters=undelayed, state=replace(state, time=t[row : row + 1] - t[0]))
                 shift = state.joint_position[:, WHEEL_SLICE] - sensors.joint_position[:, WHEEL_SLICE]
             truth = plant.truth()

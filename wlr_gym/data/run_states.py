@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from wlr_gym.data.runs import Run
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
+from wlr_gym.physics.plants.standing import settle
 from wlr_gym.physics.servo import reference_per_effort, reference_per_rate
 from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
@@ -116,6 +117,7 @@ def start_state(run: Run, robot: Robot, parameters: Parameters) -> PlantState:
     if moves:
         held = reference_per_rate(robot, parameters) * state.joint_velocity
         state.reference_position[:, WHEEL_SLICE] += held[:, WHEEL_SLICE]
+    settle(robot, parameters, state)
     return state
 
 
@@ -174,6 +176,7 @@ def standing_at(setpoints: Array, robot: Robot, parameters: Parameters) -> Plant
     pose = rest_pose(parameters, state.joint_position[:, LEG_SLICE])
     state.position[:, 2] += pose[:, 0] - level[:, 0]
     state.quaternion = quaternion(np.zeros(len(pose)), pose[:, 1], pose[:, 2])
+    settle(robot, parameters, state)
     return state
 
 

@@ -22,10 +22,11 @@ from pydantic import Field
 
 from wlr_gym.base.errors import InputError, check_folder, unknown_name
 from wlr_gym.base.files import make_output_folder, replace_file, write_text
-from wlr_gym.base.paths import data_directory
+from wlr_gym.base.paths import data_directory, named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.base.text import row_words
 from wlr_gym.data.format import COLUMNS, META_FILE, ROBOT_FILE, SUFFIXES, Finding, RunMeta, check_names, check_table
+from wlr_gym.physics.floor import Floor, FloorSource, load_floor
 from wlr_gym.physics.plants.base import PlantState
 from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash
 from wlr_gym.robot.parameter_table import ELEMENTS
@@ -382,6 +383,22 @@ def robot_of_meta(meta: RunMeta, folder: Path, file: str = META_FILE) -> Robot:
 def robot_of(run: Run, robot: Robot | str | Path | None = None) -> Robot:
     """Return the robot a run is of: ``robot`` if given, else the one its meta data name, else the nominal one."""
     return robot_of_meta(run.meta, run.path.parent) if robot is None else load_robot(robot)
+
+
+def floor_of(run: Run, floor: FloorSource = None, robot: Robot | None = None) -> Floor:
+    """Return the floor of a run, nothing left to be drawn: ``floor`` if given, else the one its meta data name, else a plane.
+
+    What is drawn follows from the seed of the run's simulation; of a measured run from seed 0. ``robot`` is as for
+    :func:`wlr_gym.physics.floor.load_floor`.
+    """
+    found = floor_of_meta(run.meta, run.path.parent, robot) if floor is None else load_floor(floor, robot)
+    return found.drawn(0 if run.simulation is None else run.simulation.seed)
+
+
+def floor_of_meta(meta: RunMeta, folder: Path, robot: Robot | None = None) -> Floor:
+    """Return the floor that meta data in ``folder`` name or describe; what of it is drawn is still open."""
+    file = folder / META_FILE
+    return load_floor(named_in(file, meta.floor) if isinstance(meta.floor, str) else meta.floor, robot, f"{file}: floor")
 
 
 # ---- the record of a simulation --------------------------------------------------------------------------------------

@@ -30,6 +30,7 @@ from wlr_gym.data.replay import ReplayResult, prepare, replayed_rows, simulated_
 from wlr_gym.data.run_states import frame_near, has_camera, measured_state, rolled_poses
 from wlr_gym.data.runs import Run
 from wlr_gym.physics.effects import Patch
+from wlr_gym.physics.floor import FloorSource
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, standing_state
 from wlr_gym.render.view import View
 from wlr_gym.render.web.page import Curve
@@ -145,6 +146,7 @@ class RunRecording:
         backend: simulator of the ghost; None = no ghost.
         patch: what is added to the ghost's nominal model.
         segment: s between the points at which the ghost starts anew from the measured robot; inf = never.
+        floor: as ``floor=`` of an environment; None = the run's.
 
     Attributes:
         name: of the run.
@@ -152,7 +154,7 @@ class RunRecording:
         ghost, true: the replayed robot, and the run's own simulation.
 
     Raises:
-        InputError: no such robot, a patch that does not fit it, or a run that is too short to be replayed.
+        InputError: no such robot or floor, a patch that does not fit it, or a run that is too short to be replayed.
     """
 
     def __init__(
@@ -162,10 +164,11 @@ class RunRecording:
         backend: str | None = "gibbs_appell",
         patch: Patch | None = None,
         segment: float = SEGMENT,
+        floor: FloorSource = None,
     ) -> None:
         self.run, self._backend, self._patch, self._segment = run, backend, patch, segment
         self.robot: Robot
-        self.robot, self._model = prepare(run, robot, effects=patch)
+        self.robot, self._model = prepare(run, robot, effects=patch, floor=floor)
         self._t = run["t"] - run["t"][0]
         self.name, self.length = run.name, float(self._t[-1])
         self._rolled = rolled_poses(run, self.robot)
@@ -297,9 +300,9 @@ class RunRecording:
 
 
 def open_recordings(
-    runs: Sequence[Run], robot: str | Path | None, backend: str | None, patch: Patch, segment: float
+    runs: Sequence[Run], robot: str | Path | None, backend: str | None, patch: Patch, segment: float, floor: FloorSource = None
 ) -> Callable[[int], RunRecording]:
     """Return what opens each of some runs; what :class:`RunRecording` refuses of any of them is refused here."""
     for run in runs:
-        prepare(run, robot, effects=patch)
-    return lambda place: RunRecording(runs[place], robot, backend, patch, segment)
+        prepare(run, robot, effects=patch, floor=floor)
+    return lambda place: RunRecording(runs[place], robot, backend, patch, segment, floor)

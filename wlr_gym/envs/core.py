@@ -29,7 +29,7 @@ from wlr_gym.envs.tasks.terms import COMPUTED, SCALARS
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT, SlipObserver
 from wlr_gym.physics import plants
 from wlr_gym.physics.effects import load_patch
-from wlr_gym.physics.floor import Floor, load_floor
+from wlr_gym.physics.floor import Floor, floor_noted, load_floor
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, PlantOptions, Sensors
 from wlr_gym.policy.agents import FED_AS
 
@@ -317,7 +317,7 @@ class Core:
     def contract(self) -> dict[str, Any]:
         """Return what a policy must be fed and what its output means (see :func:`wlr_gym.envs.tasks.describe.contract`)."""
         randomization = self.randomization.config.model_dump(mode="json", exclude_none=True)
-        return contract(self.task, randomization, None if self.floor is None else self.floor.content())
+        return contract(self.task, randomization, floor_noted(self.floor))
 
     def shorten(self, max_episode_steps: int | None) -> None:
         """Truncate episodes after ``max_episode_steps``, if that is before the task's own limit; None and -1 keep the limit."""
@@ -374,7 +374,7 @@ class Snapshots:
         self._fits = {
             "task": core.task.config.model_dump(mode="json"),
             "randomization": core.randomization.config.model_dump(mode="json"),
-            "floor": None if core.floor is None else core.floor.content(),
+            "floor": floor_noted(core.floor),
             "effects": core.patch.content(),
             "free_wheels": core.settings.free_wheels,
             "observation": core.settings.observation,

@@ -293,6 +293,9 @@ class RandomizedRobots:
         count: N.
         sensors: how often a sensor is present.
 
+    Raises:
+        InputError: floor and randomisation both say what a number is.
+
     Attributes:
         parameters: present parameters of every robot.
         state: where the robots of the present episodes started.
@@ -310,6 +313,8 @@ class RandomizedRobots:
         count: int,
         sensors: SensorsConfig,
     ) -> None:
+        if floor is not None:
+            _refuse_stated_twice(floor, randomization)
         self._floor = floor
         self._randomization = randomization
         self._patch = patch
@@ -425,6 +430,15 @@ class RandomizedRobots:
     def _wait(self, rows: Rows, seeds: Seeds) -> Counts:
         """Control steps (M, intervals) until each interval event strikes some robots next."""
         return self._randomization.next_strike(seeds, self._occurrences[rows], self._period)
+
+
+def _refuse_stated_twice(floor: Floor, randomization: Randomization) -> None:
+    """Refuse a randomisation of what the floor states: the floor would overwrite it without a word."""
+    for element, part in floor.elements().items():
+        if (event := randomization.events.get(element)) is not None:
+            both = f"floor '{floor.name}': {part}, and randomization '{randomization.config.name}': event '{event}'"
+            remedy = f"leave it out of the floor, or lay events: {{{event}: null}} over the randomization"
+            raise InputError(f"{both}: both state {element}; {remedy}")
 
 
 def _type_of(value: Any) -> str:

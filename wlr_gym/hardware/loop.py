@@ -81,8 +81,8 @@ class ControlLoop:
         robot, hardware: what is driven.
         link: its connections; taken over and opened by the first :meth:`start`.
         period: s of a control step.
-        options: ``dry_run``, ``log`` and ``guard`` count here: what is not written, where logs go, whether a watchdog process
-            starts (real ports only).
+        options: ``dry_run``, ``log``, ``guard`` and ``floor`` count here: what is not written, where logs go, whether a
+            watchdog process starts (real ports only), which floor the logs name.
         meta: of the log; its profile is the servos'. None = robot's name, no profile.
 
     Attributes:
@@ -108,6 +108,8 @@ class ControlLoop:
                 f"control period {period:g} s: expected less than safety.watchdog, {longest:g} s: servos would stop"
             )
         meta = meta or RunMeta(robot=robot.name, profile=Profile(), notes="dry run" if options.dry_run else None)
+        if options.floor is not None:
+            meta = meta.model_copy(update={"floor": options.floor})
         self.robot, self.hardware, self.limits = robot, hardware, hardware.safety
         self.phase: Phase = Phase.TORQUE_OFF
         self.reason, self.ended_well = "", True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,8 @@ class RobotPlant:
         self.options: PlantOptions = options or PlantOptions()
         self.parameters: Parameters = Parameters.nominal(robot, 1)
         chosen = hardware or RobotOptions()
+        if chosen.floor is not None:
+            chosen = replace(chosen, floor=_noted_floor(chosen, robot))
         self.capabilities: Capabilities = Capabilities("dynamixel", has_truth=False, can_set_state=False, real_time=True)
         description = with_ports(load_hardware(chosen.hardware), dict(chosen.ports))
         require_leg_range(description, robot, chosen.hardware)
@@ -147,5 +150,15 @@ def link_of(robot: Robot, hardware: Hardware, options: RobotOptions, sensor_nois
         return serial_link(robot, hardware, camera, options.poses)
     from wlr_gym.hardware.emulator.link import emulated_robot  # with the simulators, which a real robot does not need
 
-    effects, seed = options.effects, options.seed
-    return emulated_robot(robot, hardware, effects, sensor_noise=sensor_noise, camera=camera, seed=seed)
+    own = {name: getattr(options, name) for name in ("effects", "floor", "seed")}
+    return emulated_robot(robot, hardware, sensor_noise=sensor_noise, camera=camera, **own)
+
+
+def _noted_floor(options: RobotOptions, robot: Robot) -> dict[str, Any] | None:
+    """Return the content of the floor under a robot; an emulated robot's is drawn, a real one is what it is."""
+    from wlr_gym.physics.floor import floor_noted, load_floor
+
+    floor = load_floor(options.floor, robot)
+    if floor.randomise and not options.emulated:
+        raise InputError(f"floor '{floor.name}': randomise: the floor under a real robot is one: give its numbers")
+    return floor_noted(floor.drawn(options.seed))

@@ -12,6 +12,7 @@ from wlr_gym.base.files import require_empty
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
+from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants import check_simulator
 from wlr_gym.policy.agents import (
     Training,
@@ -108,15 +109,19 @@ def settings_of(
 
 
 def with_robot(settings: Mapping[str, Any], robot: RobotSource | None = None) -> dict[str, Any]:
-    """Return an agent's settings with the robot of their environment by content, so that they mean the same anywhere.
+    """Return an agent's settings with robot and floor of their environment by content, so that they mean the same anywhere.
 
     Args:
         settings: of the agent.
         robot: instead of the one that they name; None = that one. Without any the settings stay as they are.
     """
     environment = settings.get("environment") or {}
-    chosen = environment.get("robot") if robot is None and isinstance(environment, Mapping) else robot
-    return dict(settings) if chosen is None else {**settings, "environment": {**environment, "robot": robot_content(chosen)}}
+    if not isinstance(environment, Mapping):
+        environment = {}
+    chosen, floor = environment.get("robot") if robot is None else robot, environment.get("floor")
+    content = {} if chosen is None else {"robot": robot_content(chosen)}
+    content |= {} if floor is None else {"floor": load_floor(floor).content()}
+    return {**settings, "environment": {**environment, **content}} if content else dict(settings)
 
 
 def resume_training(

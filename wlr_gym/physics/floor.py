@@ -6,6 +6,7 @@ both simulators, snapshots, logs and pictures know of no other. What they mean: 
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -21,7 +22,7 @@ from wlr_gym.base.random import stream_numbers, uniforms
 from wlr_gym.base.settings import ORDERED, SettingsModel, parse_config, read_config
 from wlr_gym.physics.plants.relief import LARGEST_CURVATURE
 from wlr_gym.robot import Robot
-from wlr_gym.robot.parameter_table import PATCHES, PIECES, SPECS, WAVES
+from wlr_gym.robot.parameter_table import ELEMENTS, PATCHES, PIECES, SPECS, WAVES
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -113,7 +114,7 @@ class Stairs(SettingsModel):
     edge_radius: Length = 0.003
 
 
-class Patch(SettingsModel):
+class FrictionPatch(SettingsModel):
     """A rectangle of another friction; x and y: [from, to] in m, without them the floor has no end there."""
 
     mu: float = Field(ge=0.0)
@@ -125,7 +126,7 @@ class FloorFriction(SettingsModel):
     """Friction of the floor (None: the robot's), and patches of another; later ones win."""
 
     mu: float | None = Field(default=None, ge=0.0)
-    patches: list[Patch] = Field(default=[], max_length=len(PATCHES))
+    patches: list[FrictionPatch] = Field(default=[], max_length=len(PATCHES))
 
 
 Base = Annotated[Plane | Waves | Bumps, Field(discriminator="kind")]
@@ -181,17 +182,36 @@ class Floor(SettingsModel):
         """Whether it is a plane with the robot's friction, so that it changes no parameter."""
         return isinstance(self.base, Plane) and not self.pieces and self.friction == FloorFriction()
 
+    def drawn(self, seed: int = 0) -> Floor:
+        """Return the floor that the episode of a seed meets: the numbers that :meth:`write` lays, nothing left to be drawn."""
+        if not self.randomise:
+            return self
+        content, complete = self.content(), self.model_dump(mode="json")
+        content.pop("randomise")
+        for place, value in self._draw(np.array([seed], np.uint64)).items():
+            _put(content, complete, place, int(value[0]) if place.endswith(".seed") else float(value[0]))
+        return parse_config(Floor, content, f"floor '{self.name}'")
+
     # ---- as parameters ----
 
     def write(self, parameters: Parameters, seeds: NDArray[np.uint64]) -> None:
         """Lay robots' parameters (N) on this floor, drawn by the seeds (N) of their episodes."""
-        if self.is_flat:
-            return
-        drawn = {}
-        if self.randomise:
-            draws = uniforms(seeds, stream_numbers(*(f"floor.{place}" for place in self.randomise)))
-            drawn = {place: self._between(place, draws[:, column]) for column, place in enumerate(self.randomise)}
-        self._write(parameters, drawn)
+        if not self.is_flat:
+            self._write(parameters, self._draw(seeds))
+
+    def elements(self) -> dict[str, str]:
+        """Return the elements of the parameter table that it states, each with the part of the floor that states it."""
+        blank = Parameters(np.full((1, len(ELEMENTS)), np.nan))
+        self.write(blank, np.zeros(1, np.uint64))
+        parts = {"wave": "base", "bumps": "base", "piece": "pieces", "patch": "friction.patches", "ground": "friction.mu"}
+        return {ELEMENTS[k]: parts[ELEMENTS[k].partition(".")[0]] for k in np.flatnonzero(np.isfinite(blank.values[0]))}
+
+    def _draw(self, seeds: NDArray[np.uint64]) -> dict[str, Array]:
+        """Return dotted place -> numbers (N) that seeds (N) draw for it."""
+        if not self.randomise:
+            return {}
+        draws = uniforms(seeds, stream_numbers(*(f"floor.{place}" for place in self.randomise)))
+        return {place: self._between(place, draws[:, column]) for column, place in enumerate(self.randomise)}
 
     def _between(self, place: str, share: Array) -> Array:
         """Return a number that is drawn, at a share (N) of its range."""
@@ -329,16 +349,29 @@ def _numbers(content: Any, place: str = "") -> Iterator[tuple[str, float]]:
         yield place, content
 
 
+def _put(content: Any, complete: Any, place: str, value: float) -> None:
+    """Set the number at a dotted place of a floor's content; what that leaves out on the way is taken from ``complete``."""
+    head, _, rest = place.partition(".")
+    key: Any = int(head) if isinstance(content, list) else head
+    if not rest:
+        content[key] = value
+        return
+    if isinstance(content, dict):
+        content.setdefault(key, copy.deepcopy(complete[key]))
+    _put(content[key], complete[key], rest, value)
+
+
 #: What ``floor=`` and ``--floor`` take; see :func:`load_floor`.
 FloorSource = str | Path | Mapping[str, Any] | Floor | None
 
 
-def load_floor(source: FloorSource, robot: Robot | None = None) -> Floor:
+def load_floor(source: FloorSource, robot: Robot | None = None, where: str = "floor") -> Floor:
     """Return a floor.
 
     Args:
         source: name in ``configs/floor/``, path of a YAML file, its content, or a floor; None = ``flat``.
         robot: that shall drive on it; None = nothing is checked against one.
+        where: a mapping comes from, for messages.
 
     Raises:
         InputError: naming file, field, value, what was expected and the nearest valid name.
@@ -346,8 +379,20 @@ def load_floor(source: FloorSource, robot: Robot | None = None) -> Floor:
     if isinstance(source, Floor):
         floor = source
     else:
-        data, where = (source, "floor") if isinstance(source, Mapping) else read_config("floor", source or "flat")
-        floor = parse_config(Floor, data, where)
+        data, place = (dict(source), where) if isinstance(source, Mapping) else read_config("floor", source or "flat")
+        floor = parse_config(Floor, data, place)
     if robot is not None:
         floor.check(robot)
     return floor
+
+
+def lay_floor(floor: Floor, parameters: Parameters) -> Parameters:
+    """Return robots' parameters on a floor that has nothing left to be drawn, see :meth:`Floor.drawn`."""
+    laid = parameters.copy()
+    floor.write(laid, np.zeros(len(laid), np.uint64))
+    return laid
+
+
+def floor_noted(floor: Floor | None) -> dict[str, Any] | None:
+    """Return what the files of runs say of a floor: its content; None = it is flat, as in files that say nothing of it."""
+    return None if floor is None or floor.is_flat else floor.content()

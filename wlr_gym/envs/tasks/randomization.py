@@ -178,6 +178,7 @@ class Randomization:
     Attributes:
         config: the data, complete: laid over its base.
         elements, columns: elements of the parameter table that it changes, and their columns.
+        events: element -> name of an event that changes it.
         timed_elements, timed_columns: those that also change within an episode.
         intervals: names of the events that strike within an episode. drifts: of those that drift.
     """
@@ -198,6 +199,7 @@ class Randomization:
             tuple(name for name, event in config.events.items() if event.when == when) for when in ("interval", "drift")
         )
         self.columns, self.elements = _columns(entries)
+        self.events: dict[str, str] = {ELEMENTS[entry.column]: entry.event for entry in entries}
         self.timed_columns, self.timed_elements = _columns([e for e in entries if e.when in ("interval", "drift")])
         self._at_startup = np.array([entry.when == "startup" for entry in entries], dtype=bool)
         clocks = (*self.intervals, *self.drifts)

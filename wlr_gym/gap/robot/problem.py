@@ -15,7 +15,7 @@ from wlr_gym.base.jobs import in_threads
 from wlr_gym.base.random import generator
 from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.data.replay import profile_parameters
-from wlr_gym.data.runs import Run, read_dataset, robot_of
+from wlr_gym.data.runs import Run, floor_of_meta, read_dataset, robot_of
 from wlr_gym.data.sensors import channel_noise, noise_parts
 from wlr_gym.gap.analysis import NO_PROFILE, IntakeFinding, few_runs
 from wlr_gym.gap.problem import Array, Candidate, MeasuredSignal, Probe, Problem, Range, Setting, since_reversal
@@ -24,6 +24,7 @@ from wlr_gym.gap.robot.intake import CHECKS, findings_of
 from wlr_gym.gap.robot.replay import KERNELS, PHYSICS_STEP, TRUTH, Replays, kernel_of, replay_batch
 from wlr_gym.gap.robot.windows import WINDOW, RunClock, anchored_residuals
 from wlr_gym.physics.effects import EFFECTS, Patch, PatchEffect, Source, apply_patch, load_patch
+from wlr_gym.physics.floor import lay_floor
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.forces import MEMORY, Force, features_read
 from wlr_gym.robot import JOINTS, WHEELS, Robot
@@ -115,7 +116,10 @@ class RobotProblem(Problem):
         self.signals = tuple(signals)
         self._noise = np.array([noise[name] for name in CHANNELS])
         self._tried = _by_slot(Patch(tried_effects()).forces)
-        self._base = profile_parameters(Parameters.nominal(self.robot), profile)
+        floor = floor_of_meta(runs[0].meta, runs[0].path.parent, self.robot)
+        if floor.randomise:
+            raise InputError(f"{runs[0].path.parent}: floor '{floor.name}' was drawn anew for every run; expected one floor")
+        self._base = lay_floor(floor, profile_parameters(Parameters.nominal(self.robot), profile))
         tables = (run.table.reindex(columns=list(CHANNELS)) for run in runs)
         self._measured: list[Array] = [np.array(table, np.float64, order="C") for table in tables]
         self._compared = [values.copy() for values in self._measured]

@@ -30,8 +30,10 @@ from wlr_gym.base.snapshot import RowStore
 from wlr_gym.data.format import CHANNELS
 from wlr_gym.data.replay import profile_parameters
 from wlr_gym.data.run_states import euler_angles, quaternion, rest_pose
+from wlr_gym.data.runs import floor_of
 from wlr_gym.gap.problem import Array
 from wlr_gym.gap.robot.windows import CLOCK, Anchors, RunClock
+from wlr_gym.physics.floor import lay_floor
 from wlr_gym.physics.plants import drive, ground, make_plant
 from wlr_gym.physics.plants.base import (
     SENSOR_LAYOUT,
@@ -272,7 +274,7 @@ def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.boo
 def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
     """State of every setting at the run's start: the measured one, moved by what a setting means for reading and height."""
     # of no setting: results do not depend on company
-    base = profile_parameters(Parameters.nominal(robot), clock.run.meta.profile)
+    base = lay_floor(floor_of(clock.run), profile_parameters(Parameters.nominal(robot), clock.run.meta.profile))
     parameters = Parameters(np.vstack([base.values, parameters.values]))
     count = len(parameters)
     measured = clock.measured_start(robot, base)

@@ -18,6 +18,7 @@ from wlr_gym.hardware.imu import ImuStream
 from wlr_gym.hardware.link import Link
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.effects.patch import Source
+from wlr_gym.physics.floor import FloorSource
 from wlr_gym.robot import Robot
 
 
@@ -120,6 +121,7 @@ def emulated_robot(
     hardware: Hardware,
     effects: Source = None,
     *,
+    floor: FloorSource = None,
     sensor_noise: bool = True,
     camera: CameraFile | None = None,
     seed: int = 0,
@@ -130,8 +132,9 @@ def emulated_robot(
         robot: the robot.
         hardware: wiring and mounting.
         effects: what the emulated robot has that its file does not say.
+        floor: that it drives on, drawn by the seed.
         sensor_noise, seed: of the simulator behind it.
         camera: above its floor; None = there is none.
     """
     options = MachineOptions(timing=NO_TIME, sensor_noise=sensor_noise, seed=seed)
-    return emulated_link(Machine(robot, with_flow_port(robot, hardware), options, effects=effects), camera)
+    return emulated_link(Machine(robot, with_flow_port(robot, hardware), options, effects=effects, floor=floor), camera)

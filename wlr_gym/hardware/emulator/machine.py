@@ -41,6 +41,7 @@ from wlr_gym.hardware.flow import FLOW_FRAMES, FULL_QUALITY, FlowConversion
 from wlr_gym.hardware.imu import IMU_FRAMES, Conversion
 from wlr_gym.physics import servo as law
 from wlr_gym.physics.effects.patch import Source, apply_patch, load_patch
+from wlr_gym.physics.floor import FloorSource, lay_floor, load_floor
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors
 from wlr_gym.robot import JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, Robot
@@ -86,6 +87,7 @@ class Machine:
         plant: one robot with ``control_period`` = ``options.tick``; None makes the options' backend.
         parameters: of the plant; None = nominal. See :class:`PlantCoupling`.
         effects: what the robot has that file and parameters do not say; their forces are for the plant that is made.
+        floor: that it drives on, as ``floor=`` of an environment, drawn by the options' seed.
         state: where the robot starts; None = standing.
 
     Attributes:
@@ -111,6 +113,7 @@ class Machine:
         plant: Plant | None = None,
         parameters: Parameters | None = None,
         effects: Source = None,
+        floor: FloorSource = None,
         state: PlantState | None = None,
     ) -> None:
         self.options: MachineOptions = options or MachineOptions()
@@ -118,7 +121,8 @@ class Machine:
         self.robot = robot
         self.hardware = hardware
         patch = load_patch(effects)
-        parameters = apply_patch(patch, parameters or Parameters.nominal(robot))
+        on_floor = lay_floor(load_floor(floor, robot).drawn(self.options.seed), parameters or Parameters.nominal(robot))
+        parameters = apply_patch(patch, on_floor)
         self.plant: Plant = plant or make_plant(self.options.backend, robot, 1, self.options.plant_options(), patch.forces)
         if self.plant.count != 1 or abs(self.plant.options.control_period - self.options.tick) > 1e-12:
             raise InputError(
@@ -370,6 +374,7 @@ class PlantCoupling:
         servos: in joint order.
         parameters: of the plant. Gains differ from what the registers say by the same factor as they do from nominal.
         seed: of sensor noise.
+        floor: that it drives on, as ``floor=`` of an environment, drawn by the options' seed.
         state: where the robot starts; None = standing.
 
     Attributes:

@@ -11,7 +11,7 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, check_folder, require_package
 from wlr_gym.base.files import alone_in
-from wlr_gym.base.provenance import record_provenance
+from wlr_gym.base.provenance import record_provenance, write_yaml
 from wlr_gym.base.settings import parse_config, parse_options, read_yaml
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import same_profile
@@ -36,6 +36,7 @@ from wlr_gym.learning.adaptation.state import AdaptStep, Asked, Progress, Tell, 
 from wlr_gym.learning.adaptation.uncertainty import Uncertainty, uncertainty_of
 from wlr_gym.learning.evaluation.subjects import identity, read_subjects
 from wlr_gym.physics.effects import Source, load_patch, save_patch
+from wlr_gym.physics.floor import FloorSource, floor_noted, load_floor
 from wlr_gym.physics.plants import check_simulator
 from wlr_gym.policy import agent_names, make_policy, policy_environment, trained_environment
 from wlr_gym.robot import Robot, RobotSource, load_robot
@@ -65,6 +66,7 @@ def adapt(
     driven: AdaptedRobot | None = None,
     robot_runs: str | Path | None = None,
     effects: Source = None,
+    floor: FloorSource = None,
     environment: str | None = None,
     robot: RobotSource | None = None,
     threads: int = 1,
@@ -79,6 +81,8 @@ def adapt(
         driven: the robot; None = without ``robot_runs`` an emulated one that has ``effects``, with them none.
         robot_runs: measured runs; None = they are recorded on the robot.
         effects: what the emulated robot has that its file does not say.
+        floor: that the emulated robot drives on, drawn once by ``seed``, and that the new policy is trained and tested on;
+            None = a plane, and the task's.
         environment: id; None = the one that the policy was trained in.
         robot: None = the policy's.
         threads: of the gap workflow and the acceptance test. tell: called with progress.
@@ -99,6 +103,7 @@ def adapt(
     patch = load_patch(effects)
     if robot_runs is not None and patch:
         raise InputError("--effects: measured runs have what their robot has; they are for --emulated")
+    on = None if floor is None else load_floor(floor, own).drawn(int(asked.get("seed", 0)))
     is_driven = driven is not None or robot_runs is None
     request = parse_options(Asked, {
         **asked,
@@ -109,6 +114,7 @@ def adapt(
         "robot": _fitting(policy, chosen, own),
         "driven": ("real" if isinstance(driven, RealRobot) else "emulated") if is_driven else "",
         "effects": [dict(one.content()) for one in patch.effects],
+        "floor": None if on is None else floor_noted(on),
     })  # fmt: skip
     check_simulator(request.backend, "--backend")
     if is_driven and "camera" in request.sensors:
@@ -118,12 +124,14 @@ def adapt(
         check_folder(Path(robot_runs), "--robot-runs")
         check_runs(Path(robot_runs), own)  # before anything is written
     elif driven is None:
-        driven = EmulatedRobot(own, patch, request.backend)
+        driven = EmulatedRobot(own, patch, request.backend, floor=on)
     progress = open_folder(Path(out), request, tell, threads)
     with alone_in(progress.out):
         if not progress.steps:
             record_provenance(progress.out, request.model_dump(mode="json"), request.seed)
             save_patch(patch, progress.out / "hidden.yaml")
+            if request.floor is not None:
+                write_yaml(progress.out / "floor.yaml", request.floor)
             progress.save()
         return run_steps(progress, driven, own)
 

@@ -39,8 +39,10 @@ from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.learning.evaluation.scoring import evaluate
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.effects import Patch, apply_patch
+from wlr_gym.physics.floor import Floor, floor_noted, lay_floor, load_floor
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantOptions, RobotOptions, standing_state
+from wlr_gym.physics.plants.standing import settle
 from wlr_gym.policy import environment_for, make_policy
 from wlr_gym.robot import Robot, robot_hash
 from wlr_gym.robot.parameters import Parameters
@@ -59,6 +61,7 @@ class EmulatedRobot:
 
     Attributes:
         robot: its file. hidden: what it has that the file does not say.
+        floor: that it drives on, nothing left to be drawn; None = a plane. The logs have it.
         backend, physics_step: simulator behind it, and its step (s).
         copy: parameters of the copy before what is hidden is added; None = nominal.
     """
@@ -68,14 +71,17 @@ class EmulatedRobot:
     backend: str = "gibbs_appell"
     physics_step: float = 0.001
     copy: Parameters | None = None
+    floor: Floor | None = None
 
     def start(self, log: Path | None, seed: int, meta: RunMeta | None = None) -> tuple[RobotPlant, Any]:
         """Return the robot standing with a heading that the seed draws, torque off, and the simulator behind it."""
         own = self.copy.copy() if self.copy is not None else Parameters.nominal(self.robot)
-        parameters = apply_patch(self.hidden, own)
+        floor = self.floor or load_floor(None)
+        parameters = apply_patch(self.hidden, lay_floor(floor, own))
         state = standing_state(self.robot, parameters)
         yaw = generator(seed, "adaptation", "heading").uniform(-np.pi, np.pi)
         state.quaternion[0] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+        settle(self.robot, parameters, state)
         hardware = with_flow_port(self.robot, load_hardware("nominal"))
         options = PlantOptions(control_period=TICK, physics_step=self.physics_step)
         plant = make_plant(self.backend, self.robot, 1, options, self.hidden.forces)
@@ -87,7 +93,8 @@ class EmulatedRobot:
             parameters=parameters,
             state=state,
         )
-        driven = RobotPlant(self.robot, 1, PlantOptions(), RobotOptions(log=log), link=emulated_link(machine), meta=meta)
+        logged = RobotOptions(log=log, floor=floor_noted(floor))
+        driven = RobotPlant(self.robot, 1, PlantOptions(), logged, link=emulated_link(machine), meta=meta)
         return driven, machine.plant
 
 
@@ -402,6 +409,7 @@ def on_the_model(progress: Progress, seeds: Sequence[int]) -> float:
         episodes=len(seeds),
         seed=seeds[0],
         randomization="none",
+        floor=asked.floor,
         sensors=asked.sensors,
     )
     return float(card.scores["main"][card.names[0]]["tracking_error"].mean)
@@ -442,4 +450,7 @@ def _emulated_words(progress: Progress) -> str:
     asked = progress.asked
     if asked.driven != "emulated":
         return ""
-    return " --emulated" + (f" --effects {progress.out / 'hidden.yaml'}" if asked.effects else "")
+    words = [" --emulated"]
+    words += [f"--effects {progress.out / 'hidden.yaml'}"] if asked.effects else []
+    words += [f"--floor {progress.out / 'floor.yaml'}"] if asked.floor is not None else []
+    return " ".join(words)

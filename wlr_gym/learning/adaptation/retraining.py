@@ -73,6 +73,8 @@ def training_settings(asked: Asked, family: Family, rewards: Mapping[str, Any] |
         own = {"rewards": {**(task.get("rewards") or {}), **rewards}} if rewards else {}
         environment["task"] = {**task, **present, **own}
     environment["randomization"] = dict(family.randomization)
+    if asked.floor is not None:
+        environment["floor"] = asked.floor
     if family.effects:
         environment["effects"] = [dict(one) for one in family.effects]
     else:
@@ -150,6 +152,7 @@ def watched(progress: Progress, found: Uncertainty, own: Robot, policy: str) -> 
     path = progress.folder(ACCEPTANCE) / f"stopped_{name}.json"
     if not path.is_file():
         keywords = {"randomization": dict(family.randomization), "effects": list(family.effects) or None, "robot": own}
+        keywords["floor"] = asked.floor
         keywords |= {"precision": "float32", "episode_length": WATCHED_SECONDS, **having(asked.sensors)}
         progress.tell("supervision on simulated episodes", 0.0)
         write_json(path, stopped_episodes(policy, asked.environment, keywords, WATCHED, FIRST_SEED).tolist())
@@ -222,6 +225,7 @@ def acceptance_on(progress: Progress, new: str, family: Family, own: Robot, shar
             sensors=asked.sensors,
             robot=own,
             effects=list(family.effects) or None,
+            floor=asked.floor,
             threads=progress.threads,
         )
         write_acceptance(path, result)

@@ -39,6 +39,7 @@ class Asked(SettingsModel):
         robot: fingerprint of the robot's file.
         driven: what is driven: ``emulated``, ``real``, or nothing (``""``).
         effects: what the emulated robot has that its file does not say. backend: simulator behind it.
+        floor: content of the floor that it drives on, and that is trained on; None = a plane, and the recipe's.
         excitations: of the first runs.
         budget_runs: further runs at most. budget_seconds: of driving them; None = as many as they take.
         drives, drive_seconds: episodes of the task before and after, and their length (s).
@@ -56,6 +57,7 @@ class Asked(SettingsModel):
     driven: Literal["", "emulated", "real"] = ""
     effects: list[dict[str, Any]] = Field(default_factory=list)
     backend: str = "gibbs_appell"
+    floor: dict[str, Any] | None = None
     excitations: tuple[str, ...] = EXCITATIONS
     budget_runs: int = Field(default=2, ge=0)
     budget_seconds: float | None = Field(default=None, ge=0)

@@ -14,6 +14,7 @@ from wlr_gym.data.runs import ParameterChange, Simulation, departures, start_of,
 from wlr_gym.data.sensors import channels, sensed_columns
 from wlr_gym.learning.evaluation.rollout import roll_out
 from wlr_gym.physics.effects import EFFECTS
+from wlr_gym.physics.floor import floor_noted
 from wlr_gym.robot import FIRST_WHEEL
 from wlr_gym.robot.parameters import Parameters
 
@@ -99,7 +100,8 @@ class EpisodeRecorder:
             leg_acceleration=float(acceleration[0]),
             wheel_acceleration=float(acceleration[FIRST_WHEEL]),
         )
-        return write_run(path, table, RunMeta(profile=profile, notes=notes), simulation, core.task.robot)
+        meta = RunMeta(profile=profile, notes=notes, floor=floor_noted(core.floor))
+        return write_run(path, table, meta, simulation, core.task.robot)
 
 
 def record_episodes(core: Core, policy: Policy, folder: Path, first_seed: int = 0) -> list[Path]:

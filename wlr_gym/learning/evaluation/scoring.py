@@ -25,6 +25,7 @@ from wlr_gym.learning.evaluation.card import MAIN, OTHER_PLANT, Card
 from wlr_gym.learning.evaluation.conditions import FIRST_SEED, FLOORS, Condition, Watch, play, read_sweep
 from wlr_gym.learning.evaluation.subjects import Source, common_robot, identity, read_subjects
 from wlr_gym.physics.effects import load_patch
+from wlr_gym.physics.floor import load_floor
 from wlr_gym.policy import make_policy, policy_environment, shipped_names, trained_environment
 from wlr_gym.robot import load_robot, robot_hash
 
@@ -54,6 +55,7 @@ def evaluate(
     sensors: Sequence[str] | None = None,
     robot: Any = None,
     effects: Any = None,
+    floor: Any = None,
     threads: int = 1,
     precision: str = "float64",
     tell: Tell = lambda text, share: None,
@@ -75,8 +77,8 @@ def evaluate(
         sweeps: names of sweeps (:func:`wlr_gym.learning.evaluation.conditions.sweeps_for` lists those that suit a task).
         sweep_episodes: per point of a sweep.
         sensors: which of camera and flow the robots have; None = as their file and the randomisation say.
-        randomization, effects, threads, precision: of the environment; see :class:`wlr_gym.envs.settings.EnvironmentOptions`.
-            None = the task's.
+        randomization, effects, floor, threads, precision: of the environment; see
+            :class:`wlr_gym.envs.settings.EnvironmentOptions`. None = the task's.
         robot: that all drive; None = the one that the first trained policy was made for, else the task's.
         tell: called with what is being played and the share that was done since, of 1.
         watch: called with the episodes of every block once they were played.
@@ -101,7 +103,7 @@ def evaluate(
     main, *others = BACKENDS if backend == "both" else (backend,)
     subjects = read_subjects([policy, *(fitting_baselines(environment) if baselines is None else baselines)])
     robot = common_robot(subjects) if robot is None else robot
-    keywords: dict[str, Any] = {"randomization": randomization, "robot": robot, "effects": patch}
+    keywords: dict[str, Any] = {"randomization": randomization, "robot": robot, "effects": patch, "floor": floor}
     keywords |= {"backend": main, "threads": threads, "precision": precision, **having(sensors)}
     chosen = tuple(read_sweep(name, task) for name in dict.fromkeys(sweeps))
     conditions = [Condition(MAIN, keywords, episodes=episodes, blocks=blocks)]
@@ -116,6 +118,7 @@ def evaluate(
         "environment": environment, "backend": main, "episodes": count, "first seed": seed,
         "randomization": randomization_said(randomization),
         "robot": "the task's" if driven is None else f"{driven.name}, {robot_hash(driven)}", "effects": patch.summary(),
+        "floor": "the task's" if floor is None else load_floor(floor).name,
     }  # fmt: skip
     if sensors is not None:
         said["sensors that not every robot has"] = ", ".join(sensors) or "none"
@@ -242,7 +245,7 @@ def accept(
         largest_loss: % of the tracking error.
         sensors, robot: of the environment; None = the task's.
         tell: called with what is going on and the share of the work that was done since.
-        conditions: further ones of :func:`evaluate`: ``effects``, ``threads``.
+        conditions: further ones of :func:`evaluate`: ``effects``, ``floor``, ``threads``.
 
     Raises:
         InputError: unknown names, or a policy without references.

@@ -396,7 +396,7 @@ class TrainingLog:
 #: Seed of the first held-out episode; those of ``wlr evaluate`` lie above: its scores owe nothing to the choice of the best.
 FIRST_SEED = 90_000
 #: Keywords of the training's environment that say which robot and plant are scored.
-SAME = ("backend", "plant", "robot", "effects", "precision", "control_period", "free_wheels", "threads")
+SAME = ("backend", "plant", "robot", "floor", "effects", "precision", "control_period", "free_wheels", "threads")
 
 
 class HeldOutEpisodes:

@@ -470,6 +470,8 @@ class RobotOptions:
         deadman: s the operator may be silent; None = the hardware file's.
         effects: what the emulated robot has that its file does not say, as ``effects=`` of a simulator; no environment,
             policy or log is told of it.
+        floor: that the emulated robot drives on, as ``floor=`` of a simulator, drawn by ``seed``; the logs' ``meta.yaml`` has
+            it, of a real robot too.
         camera: above the floor: name in ``configs/camera/`` or path of a YAML file; None = there is none.
         poses: file that the emulated robot on ``ports`` writes its true pose into, for a camera that films it by rendering;
             None = the camera is a real one.
@@ -487,6 +489,7 @@ class RobotOptions:
     guard: bool = True
     deadman: float | None = None
     effects: Any = None
+    floor: Any = None
     camera: str | Path | None = None
     poses: Path | None = None
     seed: int = 0

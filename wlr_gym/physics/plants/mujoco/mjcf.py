@@ -212,12 +212,12 @@ def _add_joint(body: mujoco.MjsBody, row: Parameters, joint: int, home: float) -
     )
 
 
-def _add_contact(spec: mujoco.MjSpec, row: Parameters, wheel: int) -> None:
+def _add_contact(spec: mujoco.MjSpec, row: Parameters, wheel: int, floor: str = "floor") -> None:
     along_heading, along_axle = row["ground.mu_x"][0, wheel], row["ground.mu_y"][0, wheel]
     rolling = row["ground.rolling_resistance"][0, wheel] * row["wheel.radius"][0, wheel]
     # First tangent of a capsule: along its axle. Rolling about it is the wheel's own rolling.
     spec.add_pair(
-        geomname1="floor",
+        geomname1=floor,
         geomname2=WHEELS[wheel],
         condim=6 if rolling > 0 else 3,
         friction=[along_axle, along_heading, 0.0, rolling, 0.0],
@@ -253,6 +253,10 @@ Array = NDArray[np.float64]
 NOT_IN_MJCF = (
     "sensors", "tolerances", "dynamixel_ids", "servo gains, no-load speeds, currents, gear stiffness and supply voltage",
 )  # fmt: skip
+#: What of a floor's pieces an MJCF cannot hold.
+NOT_IN_MJCF_FLOOR = ("edge radii of pieces", "direction of friction on pieces", "patches of friction")
+#: m; how far a piece of the floor reaches to both sides, and along its heading where it has no end.
+REACH = 10.0
 _GEOM = mujoco.mjtGeom
 _JOINT = mujoco.mjtJoint
 _SPAN = 1e-9
@@ -261,23 +265,35 @@ _SPAN = 1e-9
 # ---- writing ---------------------------------------------------------------------------------------------------------
 
 
-def mjcf_text(robot: Robot) -> str:
+def mjcf_text(robot: Robot, parameters: Parameters | None = None) -> str:
     """Return the robot as MJCF (XML): the MuJoCo plant's model with the floor's contacts, leg limits and a motor per joint.
 
     Joint angles are those of the robot; the reference pose is its home pose. The motors take torques (N m): the servo's law is
-    no part of the file.
+    no part of the file. Pieces of the floor are boxes where their faces are upright, else convex meshes, :data:`REACH` m long.
+
+    Args:
+        robot: the robot.
+        parameters: (1) it and its floor; None = nominal, on a plane.
+
+    Raises:
+        InputError: a floor of waves or bumps.
     """
+    row = Parameters.nominal(robot) if parameters is None else parameters
+    if row["wave.height"].any() or row["bumps.height"].any():
+        raise InputError("floor: base: MJCF has no waves or bumps; expected a plane, with pieces where there are any")
     kept: list[Any] = []
-    model = build_model(robot, Parameters.nominal(robot), extend=functools.partial(_complete, robot=robot, kept=kept))
+    model = build_model(robot, row, extend=functools.partial(_complete, robot=robot, row=row, kept=kept))
     root = ElementTree.fromstring(kept[0].to_xml())
     _write_full_digits(root, model)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _complete(spec: Any, robot: Robot, kept: list[Any]) -> None:
+def _complete(spec: Any, robot: Robot, row: Parameters, kept: list[Any]) -> None:
     """Add what the plant does not need, take away what only it needs."""
     kept.append(spec)
+    for piece in np.flatnonzero(row["piece.height"][0] > 0.0):
+        _add_piece(spec, row, int(piece))
     spec.delete(spec.body("payload"))
     for leg in LEGS:
         joint = spec.joint(leg)
@@ -287,6 +303,28 @@ def _complete(spec: Any, robot: Robot, kept: list[Any]) -> None:
             name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=mujoco.mjtLimited.mjLIMITED_TRUE,
             ctrlrange=[-torque, torque],
         )  # fmt: skip
+
+
+def _add_piece(spec: Any, row: Parameters, index: int) -> None:
+    """Add a piece of the floor, and its contacts with the wheels. Its profile lies along x, its edges along y."""
+    x, y, heading, height, length, front, rear = (
+        float(row[f"piece.{name}"][0, index]) for name in ("x", "y", "heading", "height", "length", "front_slope", "rear_slope")
+    )
+    name, top = f"piece_{index + 1}", min(length, REACH)
+    place = {"pos": [x, y, 0.0], "quat": [np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)]}
+    look = {"name": name, "contype": 0, "conaffinity": 0, "rgba": [0.7, 0.7, 0.7, 1.0]}
+    if front == rear == np.pi / 2:
+        middle = [x + top / 2 * np.cos(heading), y + top / 2 * np.sin(heading), height / 2]
+        size = [top / 2, REACH, height / 2]
+        spec.worldbody.add_geom(type=_GEOM.mjGEOM_BOX, size=size, **(place | {"pos": middle}), **look)
+    else:
+        crest = height / np.tan(front)
+        profile = [(0.0, 0.0), (crest, height), (crest + top, height), (crest + top + height / np.tan(rear), 0.0)]
+        corners = [(along, side, up) for along, up in profile for side in (-REACH, REACH)]
+        spec.add_mesh(name=name, uservert=np.ravel(corners))
+        spec.worldbody.add_geom(type=_GEOM.mjGEOM_MESH, meshname=name, **place, **look)
+    for wheel in range(len(WHEELS)):
+        _add_contact(spec, row, wheel, name)
 
 
 def _write_full_digits(root: ElementTree.Element, model: Any) -> None:
@@ -515,7 +553,7 @@ def _scene_numbers(model: Any, base: int, source: str) -> dict[str, float | list
     numbers: dict[str, float | list[float]] = {"gravity": gravity}
     if gravity and abs(model.opt.gravity[1]) < 1e-9 * gravity:
         numbers["ground.slope"] = float(np.arcsin(-model.opt.gravity[0] / gravity)) + 0.0
-    if model.npair == 4 and (model.pair_solref < 0.0).all() and (model.pair_solimp[:, 0] == CONTACT_IMPEDANCE).all():
+    if model.npair >= len(WHEELS) and (model.pair_solref < 0.0).all() and (model.pair_solimp[:, 0] == CONTACT_IMPEDANCE).all():
         numbers |= _contact_numbers(model)
     return numbers
 
