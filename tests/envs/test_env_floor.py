@@ -186,7 +186,7 @@ def test_snapshots_do_not_move_between_floors():
 def test_all_interfaces_take_it():
     batch = Sb3VecEnv(ID, 2, seed=5, **ON_STEP)
     batch.reset()
-    vector = gym.make_vec(ID, num_envs=2, **ON_STEP)
+    vector: Any = gym.make_vec(ID, num_envs=2, **ON_STEP)
     vector.reset(seed=5)
     heights = [env.core.parameters["piece.height"][:, 0].tolist() for env in (batch, vector.unwrapped)]
     assert heights[0] == heights[1]

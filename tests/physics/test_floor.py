@@ -133,7 +133,7 @@ def test_draws_fill_their_range():
     assert (drawn.min(axis=0) >= [0.005, 0.005, 0.03]).all()
     assert (drawn.max(axis=0) <= [0.02, 0.02, 0.04]).all()
     np.testing.assert_allclose(drawn.mean(axis=0), [0.0125, 0.0125, 0.035], rtol=0.05)
-    assert np.abs(np.corrcoef(drawn.T)[np.triu_indices(3, 1)]).max() < 0.15
+    assert np.abs(np.asarray(np.corrcoef(drawn.T)) - np.eye(3)).max() < 0.15
     seeds = laid(load_floor("rough"), *range(400))["bumps.seed"]
     assert (seeds == np.floor(seeds)).all()
     assert 0 <= seeds.min() < 0.05 * SEEDS < 0.95 * SEEDS < seeds.max() < SEEDS
