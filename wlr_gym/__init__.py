@@ -38,6 +38,8 @@ HOMES = {
     "Effect": "wlr_gym.physics.effects.effect",
     "Patch": "wlr_gym.physics.effects.patch",
     "load_patch": "wlr_gym.physics.effects.patch",
+    "Floor": "wlr_gym.physics.floor",
+    "load_floor": "wlr_gym.physics.floor",
     "SlipObserver": "wlr_gym.perception.observer.observer",
     "Run": "wlr_gym.data.runs",
     "read_run": "wlr_gym.data.runs",

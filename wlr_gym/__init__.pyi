@@ -26,6 +26,8 @@ from wlr_gym.perception.observer.observer import SlipObserver as SlipObserver
 from wlr_gym.physics.effects.effect import Effect as Effect
 from wlr_gym.physics.effects.patch import Patch as Patch
 from wlr_gym.physics.effects.patch import load_patch as load_patch
+from wlr_gym.physics.floor import Floor as Floor
+from wlr_gym.physics.floor import load_floor as load_floor
 from wlr_gym.physics.plants import make_plant as make_plant
 from wlr_gym.physics.plants.base import PlantOptions as PlantOptions
 from wlr_gym.policy.agents import Policy as Policy
@@ -42,6 +44,7 @@ __all__ = [
     "Card",
     "Effect",
     "EnvironmentOptions",
+    "Floor",
     "InputError",
     "Parameters",
     "Patch",
@@ -60,6 +63,7 @@ __all__ = [
     "evaluate",
     "hardware",
     "import_policy",
+    "load_floor",
     "load_patch",
     "load_policy",
     "load_robot",
