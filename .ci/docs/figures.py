@@ -32,6 +32,15 @@ PRESETS = ("nominal", "wide", "ice", "split", "patches", "slippery", "asymmetric
 #: Seed of the floors: one of which each kind is well seen.
 FLOOR = 6
 EPISODES = 8
+#: Floors that ship -> camera, where along x the robot stands on them (m), and a seed that draws large heights.
+FLOORS = {
+    "flat": ("follow", 0.0, 0),
+    "rough": ("follow", 0.0, 6),
+    "gravel": ("follow", 0.0, 6),
+    "kerbs": ("follow", 0.66, 168),
+    "ramps": ("side", 0.66, 19),
+    "stairs": ("side", 1.02, 141),
+}
 #: Environment steps of a leg sweep that are shown.
 SHOWN = (190, 345, 525)
 #: Pixels; of a still with text.
@@ -110,6 +119,19 @@ def scene(path: Path) -> None:
     slope = {"ground.slope[pitch]": 0.15, "payload.mass": 1.0, "payload.position[z]": 0.07, **wheels}
     (one,) = _drawn([View(size, camera="side")], slope, {"linear_velocity_x": 0.0}, 0)
     _write(path, np.vstack([np.hstack(three[:2]), np.hstack([three[2], one])]))
+
+
+def floors(path: Path) -> None:
+    """A robot on each floor that ships."""
+    from wlr_gym.physics.floor import load_floor
+    from wlr_gym.render.scene import banner, floor_portrait
+
+    robot, panels = load_robot(), []
+    for name, (camera, x, seed) in FLOORS.items():
+        floor, size = load_floor(name), (420, 300)
+        picture = floor_portrait(robot, floor, View(size, camera, text=False), (x, 0.0), seed)
+        panels.append(np.vstack([banner(size[0], f"{name}: {floor.summary}", 22), picture]))
+    _write(path, np.vstack([np.hstack(panels[:3]), np.hstack(panels[3:])]))
 
 
 def _patch(number: int, mu: float, x: tuple[float, float]) -> dict[str, float]:
@@ -212,6 +234,7 @@ FIGURES: dict[str, Callable[[Path], None]] = {
         environment_posture,
         environment_slope,
         scene,
+        floors,
         vision_slip,
     )
 }

@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from standing import PLAIN, truth_of
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants import PlantOptions, make_plant
 from wlr_gym.physics.plants.base import PlantState, standing_state
 from wlr_gym.physics.plants.contacts import contacts_of_plant
 from wlr_gym.physics.plants.standing import settle
 from wlr_gym.render import stage as marks
-from wlr_gym.render.scene import legend
+from wlr_gym.render.scene import floor_portrait, legend
 from wlr_gym.render.stage import Stage
-from wlr_gym.render.surface import REACH, Relief
+from wlr_gym.render.surface import BAND, REACH, Relief
 from wlr_gym.render.view import View
 from wlr_gym.robot.parameters import Parameters
 
@@ -86,10 +87,23 @@ def test_a_kerb_is_drawn_where_it_stands(robot):
     assert x.max() == pytest.approx(0.3 + REACH)
 
 
+def test_lines_lie_along_the_edges_and_feet_of_pieces(robot):
+    """Of a ramp to a level top: two feet and two edges, each seen from above as a line across."""
+    floor = {"pieces": [{"kind": "ramp", "at": [0.6, 0.0], "slope": 0.2, "height": 0.06, "depth": 0.4}]}
+    found = surface_of(robot, floor)
+    x, z = found.vertices[np.unique(found.faces[-1])][:, [0, 2]].T
+    run = 0.06 / np.tan(0.2)
+    edges = np.array([0.6, 0.6 + run, 1.0 + run, 1.0 + 2.0 * run])
+    nearest = np.abs(x[:, None] - edges).argmin(axis=1)
+    assert (np.abs(x - edges[nearest]) < 1.6 * BAND).all()
+    assert np.bincount(nearest).min() >= 4
+    assert np.abs(z - np.array([0.0, 0.06, 0.06, 0.0])[nearest]).max() < 3e-3
+
+
 def test_triangles_are_cut_at_areas_of_other_friction(robot):
     area = ((0.3, -0.4), (0.7, 0.1))
     found = surface_of(robot, KERB | WAVES, [area])
-    bare, inside = found.faces
+    bare, inside, _ = found.faces
     a, b, c = corners(found, inside)
     assert (np.minimum.reduce([a, b, c])[:, :2] > np.array(area[0]) - 1e-9).all()
     assert (np.maximum.reduce([a, b, c])[:, :2] < np.array(area[1]) + 1e-9).all()
@@ -97,7 +111,7 @@ def test_triangles_are_cut_at_areas_of_other_friction(robot):
     assert not ((middle > area[0]) & (middle < area[1])).all(axis=1).any()
     top = (np.stack([a, b, c])[:, :, 2] > 0.049).all(axis=0)  # of the kerb, within the area: 0.3 m by 0.5 m
     size = 0.5 * np.abs(np.cross(b - a, c - a)[top, 2]).sum()
-    assert size == pytest.approx(0.3 * 0.5, abs=0.003)
+    assert size == pytest.approx((0.3 - BAND) * 0.5, abs=0.003)
 
 
 def test_the_level_rises_little_by_little_at_a_kerb(robot):
@@ -244,3 +258,15 @@ def test_a_path_goes_over_a_kerb(robot):
     )
     assert before == {2.0 * marks.LINE}
     assert behind == {0.05 + 2.0 * marks.LINE}
+
+
+def test_a_floors_portrait_is_of_a_robot_that_stands_on_it(robot, graphics):
+    view = View(size=(320, 240), camera="side", text=False)
+    flat = floor_portrait(robot, load_floor("flat"), view)
+    assert np.array_equal(flat, floor_portrait(robot, load_floor({}), view, seed=3))
+    stairs = load_floor("stairs")
+    assert not np.array_equal(
+        floor_portrait(robot, stairs, view, (1.02, 0.0), 1), floor_portrait(robot, stairs, view, (1.02, 0.0), 2)
+    )
+    with pytest.raises(InputError, match="curvature"):
+        floor_portrait(robot, load_floor({"base": {"kind": "bumps", "height": 0.05, "spacing": 0.05}}), view)

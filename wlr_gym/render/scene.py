@@ -26,7 +26,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
-from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth, standing_state
+from wlr_gym.physics.floor import Floor
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, standing_state
+from wlr_gym.physics.plants.standing import settle
 from wlr_gym.render import stage as marks
 from wlr_gym.render.stage import Area, ContactsOf, Mark, Stage, Trail
 from wlr_gym.render.view import (
@@ -397,7 +399,7 @@ def banner(width: int, text: str, height: int) -> Picture:
     return np.asarray(image)
 
 
-# ---- the portrait ----------------------------------------------------------------------------------------------------
+# ---- portraits ----------------------------------------------------------------------------------------------------
 
 
 SIZE = (640, 480)  # pixels; of one of the four views
@@ -424,10 +426,38 @@ def draw_portrait(path: Path, robot: Robot) -> None:
         ("side", low, [f"lower limit: legs at {low:.3g} rad"]),
         ("side", high, [f"upper limit: legs at {high:.3g} rad"]),
     ):
-        state, truth = standing_state(robot, parameters, angle), Truth(np.zeros((1, TRUTH_LAYOUT.width)))
-        for name in ("position", "quaternion", "joint_position"):
-            truth[name][:] = getattr(state, name)
+        truth = _truth_of(standing_state(robot, parameters, angle))
         with closing(Scene(robot, View(size=SIZE, camera=camera, friction=False, slip=False, text=False))) as scene:
             panels.append(annotate(scene.draw(truth, parameters), lines, bar=False))
     picture = np.vstack([np.hstack(panels[:2]), np.hstack(panels[2:])])
     replace_file(path, lambda temporary: Image.fromarray(picture).save(temporary))
+
+
+def floor_portrait(
+    robot: Robot, floor: Floor, view: View | None = None, place: tuple[float, float] = (0.0, 0.0), seed: int = 0
+) -> Picture:
+    """Return a picture of a robot that stands on a floor.
+
+    Args:
+        robot: which.
+        floor: which. seed: of the episode that draws what of it is randomised.
+        view: what to show. place: where the robot stands, heading along x, m.
+
+    Raises:
+        InputError: a floor that the robot cannot be simulated on, or no OpenGL on this machine.
+    """
+    floor.check(robot)
+    parameters = Parameters.nominal(robot)
+    floor.write(parameters, np.array([seed], np.uint64))
+    state = standing_state(robot, parameters)
+    state.position[:, :2] = place
+    settle(robot, parameters, state)
+    with closing(Scene(robot, view)) as scene:
+        return scene.draw(_truth_of(state), parameters)
+
+
+def _truth_of(state: PlantState) -> Truth:
+    truth = Truth(np.zeros((1, TRUTH_LAYOUT.width)))
+    for name in ("position", "quaternion", "joint_position"):
+        truth[name][:] = getattr(state, name)
+    return truth

@@ -38,8 +38,9 @@ PAYLOAD_DENSITY = 2500.0  # kg/m3, for its size only
 SPOKES = 3
 SQUARE = 0.2  # m; width of the floor's squares
 DARK_SQUARE, SQUARE_LINE = 0.90, 0.62  # brightness of every second one, and of the lines between them
-#: Meshes of a floor that is not flat: of the bare floor, and of areas of other friction.
-MESHES = tuple(f"surface_{number}" for number in range(1 + len(PATCHES)))
+EDGE = (0.36, 0.37, 0.38)  # lines along the edges of pieces
+#: Meshes of a floor that is not flat: of the bare floor, of areas of other friction, and of the edges of pieces.
+MESHES = tuple(f"surface_{number}" for number in range(2 + len(PATCHES)))
 # Colours (red, green, blue, opacity), 0 to 1.
 METAL = (0.72, 0.74, 0.78, 1.0)
 DARK = (0.16, 0.17, 0.19, 1.0)
@@ -47,7 +48,7 @@ ACCENT = (1.0, 0.45, 0.05, 1.0)
 WHITE = (0.95, 0.95, 0.95, 1.0)
 
 
-class Frames(NamedTuple):
+class ContactFrames(NamedTuple):
     """Contacts of the wheels, (n, 3) each, floor frame: the first four are those of the wheels, where each is deepest.
 
     Attributes:
@@ -69,6 +70,7 @@ class Stage:
         shape: changes when sizes or colours of the model do.
         truth, parameters: (1) of the robot as it was posed last.
         relief: its floor; None = flat.
+        areas: of other friction, in the surface that was laid last.
     """
 
     truth: Truth
@@ -79,6 +81,7 @@ class Stage:
         self._size = size
         self.parameters: Parameters = Parameters(parameters.values[[row]])
         self.shape: bytes = self._numbers(SHAPING)
+        self.areas: list[Area] = []
         self._room = 0
         self.model: Any = self._build()
         self.data: Any = mujoco.MjData(self.model)
@@ -128,8 +131,8 @@ class Stage:
         wanted = self._floor + middle.tobytes()
         if wanted == self._laid:
             return False
-        rectangles = [(area.low, area.high) for area in areas(self.parameters, middle)]
-        found = self.relief.surface(middle, rectangles)
+        self.areas = areas(self.parameters, middle)
+        found = self.relief.surface(middle, [(area.low, area.high) for area in self.areas])
         needed = _room_for(found)
         if needed > self._room:
             self._room = round(1.2 * needed)
@@ -148,11 +151,11 @@ class Stage:
         """Return the floor's mean height (m) around a place (x, y), m."""
         return 0.0 if self.relief is None else self.relief.level(place)
 
-    def contact_frames(self) -> Frames:
+    def contact_frames(self) -> ContactFrames:
         """Return where the wheels touch the floor, or are nearest to it."""
         if self._contacts is not None:
             found = self._contacts
-            return Frames(*(one[0] for one in (found.point, found.heading, found.lateral, found.normal, found.force)))
+            return ContactFrames(*(one[0] for one in (found.point, found.heading, found.lateral, found.normal, found.force)))
         centres = self.data.xpos[self.wheel_bodies]
         axles = self.data.xmat[self.wheel_bodies].reshape(4, 3, 3)[:, :, 1]
         left = axles * [1.0, 1.0, 0.0]
@@ -160,7 +163,7 @@ class Stage:
         heading = np.cross(left, [0.0, 0.0, 1.0])
         upwards = np.cross(heading, axles)  # in the disc, away from its lowest point
         points = centres - self.parameters["wheel.radius"][0][:, None] * upwards
-        return Frames(points, heading, left, np.tile([0.0, 0.0, 1.0], (4, 1)), self.truth.contact_force[0].reshape(4, 3))
+        return ContactFrames(points, heading, left, np.tile([0.0, 0.0, 1.0], (4, 1)), self.truth.contact_force[0].reshape(4, 3))
 
     def yaw(self) -> float:
         """Return the heading of the body drawn last, rad."""
@@ -283,8 +286,9 @@ def _fill_meshes(model: Any, found: Surface) -> None:
     vertex, normal, face = (int(getattr(model, f"mesh_{kind}adr")[numbers[0]]) for kind in ("vert", "normal", "face"))
     count = len(found.vertices)
     model.mesh_vert[vertex : vertex + count], model.mesh_normal[normal : normal + count] = found.vertices, found.normals
-    for k, number in enumerate(numbers):
-        faces = found.faces[k] if k < len(found.faces) else found.faces[0][:0]
+    *floors, edges = found.faces
+    filled = [*floors, *([edges[:0]] * (len(MESHES) - len(found.faces))), edges]
+    for number, faces in zip(numbers, filled, strict=True):
         model.mesh_vertadr[number], model.mesh_vertnum[number] = vertex, count
         model.mesh_normaladr[number], model.mesh_normalnum[number] = normal, count
         model.mesh_faceadr[number], model.mesh_facenum[number] = face, len(faces)
@@ -425,14 +429,12 @@ def ground(stage: Stage, floor: Sequence[Area]) -> list[Mark]:
     """Return the floor around the robot, with its squares; ``floor`` are the areas whose colours are to be seen."""
     if stage.relief is None:
         return [squares(stage), *floor]
-    material, bare = int(stage.model.material("shade").id), floor_colour(stage.parameters)
-    colours = [bare, *(friction_colour(area.mu) for area in floor)]
+    material, colours = int(stage.model.material("shade").id), [floor_colour(stage.parameters)] * (len(MESHES) - 1)
+    for k, area in enumerate(stage.areas if floor else (), 1):
+        colours[k] = friction_colour(area.mu)
     numbers = [int(stage.model.mesh(name).id) for name in MESHES]
-    return [
-        Mesh(number, colours[k] if k < len(colours) else bare, material)
-        for k, number in enumerate(numbers)
-        if stage.model.mesh_facenum[number]
-    ]
+    drawn = [Mesh(number, colour, material) for number, colour in zip(numbers, (*colours, EDGE), strict=True)]
+    return [mesh for mesh in drawn if stage.model.mesh_facenum[mesh.number]]
 
 
 def squares(stage: Stage) -> Squares:

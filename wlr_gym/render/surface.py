@@ -6,7 +6,7 @@ The base is a grid whose lines lie closer near the place; pieces are their profi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -31,6 +31,7 @@ FINEST, WIDEST = 0.0125, 0.05
 LIT = 3.0  # times as steep as it is, the base is lit, so that low bumps are seen
 STEP = 0.2  # m; the place moves in such steps, so that a moving robot seldom needs another surface
 ARC = 4  # strips of a rounded edge
+BAND = 0.006  # m; width of the lines along the edges and feet of pieces
 BURIED = 1e-3  # m; faces of pieces go on so far below the base
 #: m; half the width of the square over which a floor's level is averaged, and how many points it takes along a side.
 LEVEL_REACH, LEVEL_POINTS = 0.3, 25
@@ -50,7 +51,8 @@ class Surface:
     Attributes:
         vertices: (V, 3) m.
         normals: (V, 3) unit vectors out of the floor, for its light; see :data:`LIT`.
-        faces: triangles (F, 3) of vertices, counter-clockwise from outside: of the bare floor, then of each area.
+        faces: triangles (F, 3) of vertices, counter-clockwise from outside: of the bare floor, of each area, and of the lines
+            along the edges of pieces.
     """
 
     vertices: Array
@@ -96,10 +98,11 @@ class Relief:
             areas: rectangles that have triangles of their own; of those that overlap, the last one has them.
             coarseness: of the base's grid; 1 = fine.
         """
-        parts = [self._base(around, areas, coarseness)]
+        parts, edges = [self._base(around, areas, coarseness)], 1 + len(areas)
         for number in np.flatnonzero(self._parameters["piece.height"][0] > 0.0):
-            parts += [_part(*one) for strip in self._strips(int(number), around) for one in _cut(strip, areas)]
-        return _joined(parts, 1 + len(areas))
+            for strip, is_edge in self._strips(int(number), around):
+                parts += [_part(*one) for one in ([(edges, strip)] if is_edge else _cut(strip, areas))]
+        return _joined(parts, 1 + edges)
 
     # ---- the base ----
 
@@ -131,25 +134,25 @@ class Relief:
 
     # ---- pieces ----
 
-    def _strips(self, number: int, around: Array) -> Iterator[Array]:
-        """Yield the strips of a piece around a place, corners (4, 6): points and normals."""
+    def _strips(self, number: int, around: Array) -> Iterator[tuple[Array, bool]]:
+        """Yield the strips of a piece around a place, corners (4, 6): points and normals, and whether it lies along an edge."""
         heading = float(self._parameters["piece.heading"][0, number])
         ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
         foot = np.array([self._parameters[f"piece.{axis}"][0, number] for axis in "xy"])
         middle, aside = float((around[:2] - foot) @ ahead), float((around[:2] - foot) @ left)
         turn = np.array([[*ahead, 0.0], [*left, 0.0], [0.0, 0.0, 1.0]])
-        for points, normals in _profile({name: values[0] for name, values in self._piece(number).items()}, self.lowest):
-            (points, normals) = _between(points, normals, middle - REACH, middle + REACH)
+        for points, normals, is_edge in _profile(self._piece(number), self.lowest):
+            points, normals = _between(points, normals, middle - REACH, middle + REACH)
             if not len(points):
                 continue
             corners = [(0, -REACH), (1, -REACH), (1, REACH), (0, REACH)]
             at = np.array([[points[k, 0], aside + side, points[k, 1]] for k, side in corners]) @ turn + np.append(foot, 0.0)
             out = np.array([[normals[k, 0], 0.0, normals[k, 1]] for k, _ in corners]) @ turn
-            yield np.hstack([at, out])
+            yield np.hstack([at, out]), is_edge
 
-    def _piece(self, number: int) -> dict[str, Array]:
+    def _piece(self, number: int) -> dict[str, float]:
         names = ("height", "length", "front_slope", "rear_slope", "edge_radius")
-        return {name: self._parameters[f"piece.{name}"][:, number] for name in names}
+        return {name: float(self._parameters[f"piece.{name}"][0, number]) for name in names}
 
 
 def _middles(lines: Array) -> Array:
@@ -167,21 +170,38 @@ def _lines(middle: float, finest: float, edges: Array) -> Array:
     return np.unique(np.round(np.array(lines, np.float64), 9))
 
 
-def _profile(piece: dict[str, float], lowest: float) -> Iterator[tuple[Array, Array]]:
-    """Yield the lines of a piece's profile: ends (2, 2) and normals (2, 2) there, along its heading from its foot and up, m."""
-    height, radius, front, rear = (float(piece[name]) for name in ("height", "edge_radius", "front_slope", "rear_slope"))
+def _profile(piece: Mapping[str, float], lowest: float) -> Iterator[tuple[Array, Array, bool]]:
+    """Yield the lines of a piece's profile, along its heading from its foot and up, m.
+
+    Ends (2, 2), normals (2, 2) there, and whether it is of an edge: the rounding, and a band beside it and at the foot.
+    """
+    height, radius, front, rear = (piece[name] for name in ("height", "edge_radius", "front_slope", "rear_slope"))
     inset = radius * np.tan(0.5 * np.array([front, rear]))
     begin = height / np.tan(front) + inset[0]
-    end = begin + max(float(piece["length"]) - inset.sum(), 0.0)
-    up = np.linspace(-front, 0.0, ARC + 1), np.linspace(0.0, rear, ARC + 1)
-    arcs = [np.stack([np.sin(angles), np.cos(angles)], axis=1) for angles in up]
-    normals = np.concatenate(arcs)
-    points = np.concatenate([[corner, height - radius] + radius * arc for corner, arc in zip((begin, end), arcs, strict=True)])
-    down = np.maximum(points[[0, -1], 1] - lowest, 0.0)
-    feet = points[[0, -1]] + np.stack([down / np.tan([front, rear]) * [-1.0, 1.0], -down], axis=1)
-    points = np.concatenate([feet[:1], points, feet[1:]])
-    normals = np.concatenate([normals[:1], normals, normals[-1:]])
-    yield from zip(map(np.array, pairwise(points)), map(np.array, pairwise(normals)), strict=True)
+    end = begin + max(piece["length"] - inset.sum(), 0.0)
+    band = min(BAND, (end - begin) / 3.0)
+    angles = np.linspace(-front, 0.0, ARC + 1), np.linspace(0.0, rear, ARC + 1)
+    arcs = [np.stack([np.sin(angle), np.cos(angle)], axis=1) for angle in angles]
+    first, last = (np.array([corner, height - radius]) + radius * arc for corner, arc in zip((begin, end), arcs, strict=True))
+    points = [
+        *_face(first[0], front, -1.0, lowest)[::-1],
+        *first,
+        np.array([begin + band, height]),
+        np.array([end - band, height]),
+        *last,
+        *_face(last[-1], rear, 1.0, lowest),
+    ]
+    normals = [*arcs[0][[0, 0]], *arcs[0], *([[0.0, 1.0]] * 2), *arcs[1], *arcs[1][[-1, -1]]]
+    plain = (1, len(points) // 2 - 1, len(points) - 3)  # faces and top
+    for k, (line, normal) in enumerate(zip(pairwise(points), pairwise(normals), strict=True)):
+        yield np.array(line), np.array(normal), k not in plain
+
+
+def _face(corner: Array, slope: float, side: float, lowest: float) -> tuple[Array, Array]:
+    """Return where a face goes down from a corner: the upper end of the line along its foot at z = 0, and its lowest end."""
+    run = side / np.tan(slope)
+    upper, end = min(BAND * np.sin(slope), max(corner[1], 0.0)), min(lowest, corner[1])
+    return corner + (corner[1] - upper) * np.array([run, -1.0]), corner + (corner[1] - end) * np.array([run, -1.0])
 
 
 def _between(points: Array, normals: Array, low: float, high: float) -> tuple[Array, Array]:

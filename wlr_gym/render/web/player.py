@@ -190,7 +190,7 @@ class PageFloor:
         """Add what can be seen of a floor that is not flat from a place, as one mesh per colour."""
         assert stage.relief is not None
         found = stage.relief.surface(middle, [(area.low, area.high) for area in areas], _COARSENESS)
-        colours = [marks.floor_colour(stage.parameters), *(friction_colour(area.mu) for area in areas)]
+        colours = [marks.floor_colour(stage.parameters), *(friction_colour(area.mu) for area in areas), marks.EDGE]
         return [
             self._server.scene.add_mesh_trimesh(
                 f"{FLOOR}/surface_{k}", squared_mesh(found, faces, colour), cast_shadow=False, receive_shadow=False
