@@ -15,6 +15,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.cli.deploy import DeployOptions, robot_options
 from wlr_gym.cli.emulate import EmulateOptions, machine_of
+from wlr_gym.cli.options import FloorOption
 from wlr_gym.data import read_run
 from wlr_gym.data.comparison import compare, parse_plant
 from wlr_gym.data.excitations import Motion
@@ -24,6 +25,7 @@ from wlr_gym.data.replay import replay
 from wlr_gym.data.runs import floor_of, write_meta
 from wlr_gym.data.watch import RunRecording
 from wlr_gym.hardware.plant import RobotPlant
+from wlr_gym.learning.adaptation.driving import EmulatedRobot
 from wlr_gym.learning.training import settings_of
 from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants.base import RobotOptions
@@ -63,7 +65,7 @@ def kerb(content: Any) -> float:
 def test_every_command_that_simulates_takes_it():
     kinds = {name: cli.options_of(name) for name in cli.COMMANDS}
     kinds = {name: kind.get("", None) if isinstance(kind, dict) else kind for name, kind in kinds.items()}
-    taking = {name for name, kind in kinds.items() if kind is not None and issubclass(kind, cli.options.FloorOption)}
+    taking = {name for name, kind in kinds.items() if kind is not None and issubclass(kind, FloorOption)}
     assert taking == set(SIMULATING)
 
 
@@ -156,6 +158,14 @@ def test_logs_of_an_emulated_robot_say_its_floor(tmp_path):
     assert plant.loop.recorder.meta.floor == load_floor(STEP).drawn(3).content()
     plant.close()
     assert robot_options(DeployOptions("pid", floor="kerbs", emulated=True, seed=3), None).floor == load_floor("kerbs").drawn(3)
+
+
+def test_a_robot_that_is_adapted_to_stands_on_it():
+    floor = load_floor(STEP).drawn(3)
+    driven, plant = EmulatedRobot(ROBOT, floor=floor).start(None, seed=5)
+    assert driven.loop.recorder.meta.floor == floor.content()
+    assert float(plant.parameters["piece.height"][0, 0]) == kerb(floor.content())
+    driven.close()
 
 
 def test_the_floor_under_a_real_robot_is_not_drawn():

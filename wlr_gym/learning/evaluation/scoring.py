@@ -278,7 +278,7 @@ def accept(
         for name, better in card.comparison[MAIN].items():
             gain = better["tracking_error"]
             losses.append(Loss(_name(family), name, errors[subject.name], errors[name], -gain.mean, -gain.low))
-    inputs = fingerprint(environment, [policy, *against], chosen, robot)
+    inputs = fingerprint(environment, [policy, *against], chosen, robot, conditions.get("floor"))
     present = None if sensors is None else tuple(sensors)
     return Acceptance(str(policy), environment, episodes, blocks, present, largest_loss, inputs, tuple(losses))
 
@@ -297,8 +297,10 @@ def references_of(policy: Source, environment: str) -> tuple[str, ...]:
     return (controller, *([blind] if blind in shipped_names() and blind != str(policy) else []))
 
 
-def fingerprint(environment: str, policies: Iterable[Source], floors: Sequence[Any], robot: Any = None) -> str:
-    """Return the SHA-256 of what is played: the policies' content, the task, the robot and the randomisations."""
+def fingerprint(
+    environment: str, policies: Iterable[Source], floors: Sequence[Any], robot: Any = None, relief: Any = None
+) -> str:
+    """Return the SHA-256 of what is played: the policies' content, the task, the robot, the randomisations and their floor."""
     config = read_task(task_source_of(environment))
     own = load_robot(config.robot if robot is None else robot)
     played = {
@@ -307,6 +309,8 @@ def fingerprint(environment: str, policies: Iterable[Source], floors: Sequence[A
         "floors": [load_randomization(family, own).config.model_dump(mode="json") for family in floors],
         "robot": own.model_dump(mode="json"),
     }
+    if relief is not None:  # without one as before floors had relief
+        played["relief"] = load_floor(relief).content()
     return hashlib.sha256(json.dumps(played, sort_keys=True).encode()).hexdigest()
 
 

@@ -39,6 +39,7 @@ from wlr_gym.learning.evaluation.metrics import summarise
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.learning.ppo import networks
 from wlr_gym.learning.ppo.policy import MODEL_FILE, PpoConfig, PpoPolicy, network_kind, parse_settings, with_network_of
+from wlr_gym.physics.floor import FloorFriction, load_floor
 from wlr_gym.policy import Training, TrainingProgress, fed_environment, read_contract, write_contract
 from wlr_gym.robot import LEGS, WHEELS
 
@@ -401,7 +402,8 @@ SAME = ("backend", "plant", "robot", "floor", "effects", "precision", "control_p
 
 class HeldOutEpisodes:
     """Fixed episodes that neither training nor ``wlr evaluate`` has: the task as it is scored, with its own
-    randomisation, commands and length, on the robot and plant of the training.
+    randomisation, commands and length, on the robot, floor and plant of the training. Where the floor states friction, which
+    the task would draw, the randomisation is the training's.
 
     Args:
         environment: id.
@@ -409,7 +411,9 @@ class HeldOutEpisodes:
     """
 
     def __init__(self, environment: str, config: PpoConfig) -> None:
-        same = {name: config.environment[name] for name in SAME if name in config.environment}
+        states_friction = load_floor(config.environment.get("floor")).friction != FloorFriction()
+        kept = (*SAME, "randomization") if states_friction else SAME
+        same = {name: config.environment[name] for name in kept if name in config.environment}
         self.core = make_core(environment, config.evaluation_episodes, same | fed_environment(config.environment))
 
     def score(self, model: PPO) -> dict[str, float]:
