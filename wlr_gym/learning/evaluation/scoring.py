@@ -305,12 +305,13 @@ def fingerprint(
     own = load_robot(config.robot if robot is None else robot)
     played = {
         "policies": [identity(subject, config.name) for subject in read_subjects(list(policies))],
-        "task": config.model_dump(mode="json"),
+        "task": config.model_dump(mode="json", exclude={"floor"}),
         "floors": [load_randomization(family, own).config.model_dump(mode="json") for family in floors],
         "robot": own.model_dump(mode="json"),
     }
-    if relief is not None:  # without one as before floors had relief
-        played["relief"] = load_floor(relief).content()
+    floor = load_floor(config.floor if relief is None else relief)
+    if not floor.is_flat:  # of a plane nothing is said, as before there were other floors
+        played["relief"] = floor.content()
     return hashlib.sha256(json.dumps(played, sort_keys=True).encode()).hexdigest()
 
 
