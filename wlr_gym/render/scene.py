@@ -273,10 +273,8 @@ def legend(parameters: Parameters, view: View) -> list[str]:
     if view.slip:
         lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
     lines += [relief] if (relief := _relief(parameters)) else []
-    if view.forces:
-        lines.append(f"friction (green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
-    if view.loads:
-        lines.append(f"load (light green): 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
+    if arrows := ["friction (green)"] * view.forces + ["load (light green)"] * view.loads:
+        lines.append(f"{', '.join(arrows)}: 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
     if view.path:
         lines.append("path: pink; as commanded: dashed")
     return lines
