@@ -66,19 +66,21 @@ def families(parameters: Parameters) -> set[str]:
     return found | {"relief"} if found else found
 
 
-def wheel_profile(parameters: Parameters, robot: Robot) -> tuple[Array, float, float]:
-    """Return the radius of every wheel's core disc (N, 4), and its half width and rounding, m."""
-    half = 0.25 * robot.wheel.width
+def wheel_profile(parameters: Parameters, robot: Robot) -> tuple[Array, Array, Array]:
+    """Return the radius of every wheel's core disc, its half width and its rounding, each (N, 4), m.
+
+    Robots on a level floor have thin discs: as where no robot of the batch stands on relief.
+    """
+    on_relief = parameters["wave.height"].any(axis=1) | (parameters["bumps.height"] > 0.0)
+    on_relief = (on_relief | (parameters["piece.height"] > 0.0).any(axis=1))[:, None]
+    half = np.where(on_relief, 0.25 * robot.wheel.width, np.zeros((1, 4)))
     return parameters["wheel.radius"] - half, half, half
 
 
 def pack(parameters: Parameters, robot: Robot) -> dict[str, Array]:
     """Return the lanes RELIEF_LANES, each (N,)."""
-    core, half_width, rounding = wheel_profile(parameters, robot)
-    lanes: dict[str, Array] = {f"core_radius{i}": core[:, i] for i in range(4)}
-    everyone = np.ones(len(parameters))
-    lanes |= {f"core_half_width{i}": half_width * everyone for i in range(4)}
-    lanes |= {f"rounding{i}": rounding * everyone for i in range(4)}
+    profile = zip(_WHEEL_FIELDS, wheel_profile(parameters, robot), strict=True)
+    lanes = {f"{name}{i}": values[:, i] for name, values in profile for i in range(4)}
     return lanes | _pack_waves(parameters) | _pack_bumps(parameters) | _pack_pieces(parameters)
 
 
@@ -177,7 +179,8 @@ def support(profile: Profile, axle: Vector, normal: Vector) -> tuple[Value, Vect
     point move across the tread over a small angle where a cylinder's would jump from one edge to the other.
     """
     x = _dot(normal, axle)
-    in_plane = [normal[k] - x * axle[k] for k in range(3)]
+    # rounded: with the constant normal of a plane, signs would fold and another product be fused
+    in_plane = [ops.rounded(normal[k] - x * axle[k]) for k in range(3)]
     square = _dot(in_plane, in_plane) + 1e-18
     inverse = 1.0 / ops.sqrt(square)
     root = ops.sqrt(x * x + CROWN * CROWN)
@@ -243,7 +246,8 @@ def _bumps(lanes: Lanes, x: Value, y: Value) -> tuple[Value, Value, Value]:
         slope_x = slope_x + slopes_x[j] * line
         slope_y = slope_y + weights_x[j] * line_slope
     size = lanes["bump_height"] * lanes["bump_inverse_share"]
-    return size * total, (size * scale) * slope_x, (size * scale) * slope_y
+    # rounded as where waves are added, whichever they are: bits must not depend on the robots beside
+    return ops.rounded(size * total), ops.rounded((size * scale) * slope_x), ops.rounded((size * scale) * slope_y)
 
 
 def _quadratic(t: Value) -> tuple[Vector, Vector]:
@@ -255,8 +259,8 @@ def _quadratic(t: Value) -> tuple[Vector, Vector]:
 def touch_of_base(lanes: Lanes, centre: Vector, axle: Vector, profile: Profile, features: frozenset[str]) -> Touch:
     """Return where a wheel is nearest to the base: the normal under its centre, improved at the point that it finds."""
     if not features & {"waves", "bumps"}:
-        distance, reach = support(profile, axle, [0.0, 0.0, 1.0])
-        return Touch(distance - centre[2], [0.0, 0.0, 1.0], reach)
+        _, reach = support(profile, axle, [0.0, 0.0, 1.0])
+        return Touch(-(centre[2] + reach[2]), [0.0, 0.0, 1.0], reach)
     height, normal, reach = 0.0, _normal(*base_height(lanes, centre[0], centre[1], features)[1:]), [0.0] * 3
     for _ in range(REFINEMENTS):
         _, reach = support(profile, axle, normal)
@@ -387,16 +391,22 @@ def touches(lanes: Lanes, i: int, centre: Vector, axle: Vector, features: frozen
         features: families that are traced.
     """
     profile = profile_of(lanes, i)
-    base = touch_of_base(lanes, centre, axle, profile, features)
+    base = _rounded(touch_of_base(lanes, centre, axle, profile, features))
     if "piece" not in features:
         return [base]
     edges = [_edge_of(lanes, k, centre) for k in piece_numbers(features)]
     nearest = reduce(_nearer, edges)
-    on_piece = _touch_of_edge(nearest, axle, profile)
+    on_piece = _rounded(_touch_of_edge(nearest, axle, profile))
     first, second = _deeper(base, on_piece), _shallower(base, on_piece)
     if "pieces" in features:
-        second = _deeper(second, _touch_of_edge(_second_nearest(edges), axle, profile))
+        second = _deeper(second, _rounded(_touch_of_edge(_second_nearest(edges), axle, profile)))
+        first, second = _deeper(first, second), _shallower(first, second)
     return [first, second]
+
+
+def _rounded(touch: Touch) -> Touch:
+    """Round a touch as if it were chosen among several, so that bits do not depend on what the robots beside stand on."""
+    return Touch(ops.rounded(touch.depth), [ops.rounded(x) for x in touch.normal], [ops.rounded(x) for x in touch.reach])
 
 
 def _deeper(a: Touch, b: Touch) -> Touch:

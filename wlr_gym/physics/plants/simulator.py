@@ -186,15 +186,14 @@ class Simulator(ABC):
     def set_state(self, snapshot: Snapshot, rows: int | Sequence[int] | NDArray[Any] | None = None) -> Sensors:
         """Put robots into the state of a snapshot; see :meth:`wlr_gym.physics.plants.base.Plant.set_state`."""
         index = read_rows(rows, self._count)
-        stores = self._stores()
-        check_fit(snapshot, index, self._fits(), ["parameters", *stores])
+        check_fit(snapshot, index, self._fits(), ["parameters", *self._stores()])
         values = snapshot.arrays["parameters"]
         changed = (self.parameters.values[index] != values).any(axis=1)
         if changed.any():
             self.parameters.values[index] = values
             new = np.unique(index[changed])  # MuJoCo wants them in order
             self._use_parameters(new, Parameters(self.parameters.values[new]))
-        write_snapshot(snapshot, stores, index)
+        write_snapshot(snapshot, self._stores(), index)  # the new parameters may have moved the state to other arrays
         self._setpoints.set_delays(index, self.parameters)
         return self._readings
 

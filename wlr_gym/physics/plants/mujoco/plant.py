@@ -85,7 +85,8 @@ class MujocoPlant(Simulator):
         old, parameters = self._batch, self.parameters
         self._use_model(on_relief=True)
         self._batch.set_parameters(self._all, parameters)
-        self._batch.qpos[:], self._batch.qvel[:] = old.qpos, old.qvel
+        for name in CARRIED:
+            getattr(self._batch, name)[:] = getattr(old, name)
 
     @property
     def model(self) -> object:
@@ -267,6 +268,10 @@ def _add_force_sensor(spec: mujoco.MjSpec, wheel: str, floor: str) -> None:
     sensor.intprm = [1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), net_force, 1]
 
 
+#: What a step takes from the one before it, alike in both models: not what every step places anew.
+CARRIED = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")
+
+
 class RobotBatch:
     """``count`` robots in a :class:`mujoco.batch.Batch`.
 
@@ -374,9 +379,7 @@ class RobotBatch:
 
     def stores(self) -> dict[str, RowStore]:
         """Return what a step takes from the one before it."""
-        names = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")
-        stores: dict[str, RowStore] = {name: getattr(self, name) for name in names}
-        return stores | {f"contact{number}": values for number, values in enumerate(self.per_contact)}
+        return {name: getattr(self, name) for name in CARRIED}
 
     def model_of(self, robot: int) -> mujoco.MjModel:
         """Return a copy of the model with the numbers of one robot."""

@@ -1,0 +1,89 @@
+"""Robots in random states with random setpoints on a floor: whether every number stays finite, and which seed breaks it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wlr_gym.base.random import spawn_seeds
+from wlr_gym.physics.floor import load_floor
+from wlr_gym.physics.plants import make_plant
+from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
+from wlr_gym.robot import FIRST_WHEEL, Robot, load_robot
+from wlr_gym.robot.parameters import Parameters
+
+#: Robots at once, and control ticks until they are thrown anew.
+ROBOTS, TICKS = 64, 25
+
+
+@dataclass(frozen=True)
+class Fuzzed:
+    """What happened.
+
+    Attributes:
+        substeps: of robots, in all.
+        worst: how many robots had a number that is not finite. seed: of the first batch with one (None: none had).
+        fastest: m/s, of any body.
+    """
+
+    substeps: int
+    worst: int
+    seed: int | None
+    fastest: float
+
+
+def throw(robot: Robot, parameters: Parameters, rng: np.random.Generator) -> PlantState:
+    """Return robots in any attitude near z = 0, with any speeds."""
+    state, count = standing_state(robot, parameters), len(parameters)
+    state.position[:, 0] = rng.uniform(-0.2, 3.0, count)
+    state.position[:, 1] = rng.uniform(-0.3, 0.3, count)
+    state.position[:, 2] += rng.uniform(-0.05, 0.1, count)
+    tilt = rng.normal(size=(count, 4)) * [0.0, 1.0, 1.0, 1.0] * rng.choice([0.1, 1.0, 10.0], (count, 1)) + [1.0, 0.0, 0.0, 0.0]
+    state.quaternion[:] = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
+    state.linear_velocity_in_body[:] = rng.normal(size=(count, 3))
+    state.angular_velocity_in_body[:] = 3.0 * rng.normal(size=(count, 3))
+    state.joint_position[:, :FIRST_WHEEL] = rng.uniform(-3.2, 3.2, (count, FIRST_WHEEL))
+    state.joint_velocity[:] = np.repeat([3.0, 20.0], 4) * rng.normal(size=(count, 8))
+    state.reference_position[:] = state.joint_position
+    return state
+
+
+def fuzz(
+    floor: str, substeps: int, seed: int = 0, backend: str = "gibbs_appell", precision: str = "float64", threads: int = 1
+) -> Fuzzed:
+    """Throw robots on to a floor, drive them by random setpoints, and again, for so many substeps of robots in all.
+
+    Args:
+        floor: name or path.
+        substeps: at least so many.
+        seed: of everything that is drawn.
+        backend, precision, threads: of the simulator.
+    """
+    robot = load_robot()
+    options = PlantOptions(precision=precision, threads=threads)
+    plant: Any = make_plant(backend, robot, ROBOTS, options)
+    laid = load_floor(floor)
+    done, broken, first, fastest = 0, 0, None, 0.0
+    while done < substeps:
+        rng = np.random.default_rng([seed, done])
+        seeds = spawn_seeds(int(rng.integers(2**31)), ROBOTS)
+        parameters = Parameters.nominal(robot, ROBOTS)
+        laid.write(parameters, seeds)
+        parameters["ground.mu_x"] = parameters["ground.mu_y"] = rng.uniform(0.0, 1.5, (ROBOTS, 1))
+        state = throw(robot, parameters, rng)
+        plant.reset(seeds, parameters, state=state)
+        deepest = plant.contacts().depth.max(axis=1)
+        state.position[:, 2] += np.maximum(deepest, 0.0) - rng.uniform(-0.05, 0.003, ROBOTS)
+        plant.reset(seeds, parameters, state=state)
+        for _ in range(TICKS):
+            plant.step(np.hstack([rng.uniform(-3.2, 3.2, (ROBOTS, 4)), rng.uniform(-20.0, 20.0, (ROBOTS, 4))]))
+            values = plant.truth().values
+            fastest = max(fastest, float(np.abs(plant.truth().linear_velocity_in_body).max()))
+        lost = int((~np.isfinite(values)).any(axis=1).sum())
+        if lost and first is None:
+            first = done
+        broken += lost
+        done += ROBOTS * TICKS * options.substeps
+    return Fuzzed(done, broken, first, fastest)
