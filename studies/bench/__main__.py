@@ -35,6 +35,7 @@ MEASUREMENTS = {
     "import": "studies.bench.speed:measure_import",
     "start": "studies.bench.speed:measure_start",
     "batch": "studies.bench.speed:measure_batch",
+    "relief": "studies.bench.relief:measure_relief",
     "convergence": "studies.bench.speed:measure_convergence",
     "vision": "studies.bench.vision:measure_vision",
     "bus": "studies.bench.bus:measure_bus",
@@ -49,6 +50,7 @@ STUDIES = {
     "adapt": "studies.bench.adapt:AdaptStudyOptions",  # what adaptation wins back of what a hidden fault costs, docs/adapt.md
     "decide": "studies.bench.decide:DecideStudyOptions",  # wlr gap --until-decided, docs/gap.md
     "films": "studies.bench.lab_films:LabFilmsOptions",  # films of a lab that is not perfect, docs/vision.md
+    "fuzz": "studies.bench.fuzz:FuzzOptions",  # robots in random states on every floor
 }
 SCHEMA = 1
 
@@ -56,8 +58,9 @@ SCHEMA = 1
 @dataclass(frozen=True)
 class BenchOptions(JsonOption, ForceOption):
     what: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Measurements to make; default: engine, mujoco, env_step, ppo, import, start, batch, convergence. On request: learning,
-    bus, camera, perception, vision. Studies with options of their own, each with --help: gap, adapt, decide, films."""
+    """Measurements to make; default: engine, mujoco, env_step, ppo, import, start, batch, relief,
+    convergence. On request: learning,
+    bus, camera, perception, vision. Studies with options of their own, each with --help: gap, adapt, decide, films, fuzz."""
     save: Path | None = None
     """File (.json) for all numbers; the picture of the engine is written beside it."""
     rounds: Annotated[int, Interval(least=1)] = 5

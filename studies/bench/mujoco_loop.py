@@ -55,7 +55,11 @@ def register_backend() -> None:
 
 
 def build_servo_model(
-    robot: Robot, parameters: Parameters, physics_step: float = 0.001, contact: Contact = "default"
+    robot: Robot,
+    parameters: Parameters,
+    physics_step: float = 0.001,
+    contact: Contact = "default",
+    extend: Callable[[mujoco.MjSpec], None] = lambda spec: None,
 ) -> mujoco.MjModel:
     """Return the robot with its servos as actuators; ``ctrl[:4]`` leg angles, ``ctrl[4:]`` and ``ctrl[8:]`` wheel speeds.
 
@@ -63,8 +67,15 @@ def build_servo_model(
         robot, parameters: the robot; row 0 is used. Servo profiles must be off.
         physics_step: s.
         contact: of :data:`CONTACTS`.
+        extend: adds what else there is.
     """
-    model = build_model(robot, parameters, physics_step=physics_step, extend=_add_servos(robot, parameters))
+    add_servos = _add_servos(robot, parameters)
+
+    def add(spec: mujoco.MjSpec) -> None:
+        add_servos(spec)
+        extend(spec)
+
+    model = build_model(robot, parameters, physics_step=physics_step, extend=add)
     if contact in ("default", "stiff friction"):
         model.opt.impratio = 1.0 if contact == "default" else 100.0
         model.pair_solimp[:] = 0.9, 0.95, 0.001, 0.5, 2.0
@@ -143,7 +154,8 @@ class ServoBatch:
 
     def __init__(self, model: mujoco.MjModel, parameters: Parameters, threads: int = 1) -> None:
         self._batch = batch = Batch(model, len(parameters), threads)
-        batch.expand("pair_friction")[:, :, :2] = parameters["ground.mu_x"][:, :, None]
+        floors = model.npair // len(WHEELS)  # each with a pair for every wheel
+        batch.expand("pair_friction")[:, :, :2] = np.tile(parameters["ground.mu_x"], (1, floors))[:, :, None]
         self.position, self.velocity = batch.bind("qpos"), batch.bind("qvel")
         self._control, self._activation = batch.bind("ctrl"), batch.bind("act")
 

@@ -8,7 +8,7 @@ from energy import mechanical_energy
 from relief_statics import highest_kerb, wheel_loads
 from rig import BACKENDS, MASS, RADIUS, ROBOT, WEIGHT, G, drive, lock, make_plant
 
-from studies.climbing import KERB, Climber, climb_straight
+from studies.bench.climbing import KERB, Climber, climb_straight
 from wlr_gym.base.random import spawn_seeds
 from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.model.dynamics import inertial_constants, rotation_matrix

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rig import BACKENDS, HOME, ROBOT, drive, make_plant
 
-from studies.climbing import climb_by_two_poses, climb_one_by_one, perturb
-from studies.fuzz_floors import fuzz
+from studies.bench.climbing import climb_by_two_poses, climb_one_by_one, perturb
+from studies.bench.fuzz import fuzz
 from wlr_gym.base.random import spawn_seeds
 from wlr_gym.physics import plants
 from wlr_gym.physics.floor import load_floor
@@ -36,16 +36,17 @@ def _poses(backend, floor, step, seconds=4.0):
     return drive(plant, seconds, setpoints).position
 
 
-#: m: how far apart the simulators may be after a metre: at edges a step of 1 ms decides how hard a wheel is met.
-APART = {"flat": 0.001, "rough": 0.01, "gravel": 0.01, "kerbs": 0.02, "ramps": 0.005, "stairs": 0.02}
-
-
 @pytest.mark.parametrize("floor", PRESETS)
 def test_both_simulators_drive_over_a_preset_alike(floor):
+    """After a metre within 0.2 mm (measured: 0.04 mm), and no further than the error of their steps, told by halving them."""
     ours, theirs = (_poses(backend, floor, 1e-3) for backend in BACKENDS)
-    print("APART", floor, np.linalg.norm(ours - theirs, axis=1), ours[:, 0])
-    assert ours[:, 0].min() > 0.5
-    assert np.linalg.norm(ours - theirs, axis=1).max() < APART[floor]
+    halved = (_poses(backend, floor, 5e-4) for backend in BACKENDS)
+    apart, of_the_step = np.linalg.norm(ours - theirs, axis=1), np.zeros(len(ours))
+    for coarse, fine in zip((ours, theirs), halved, strict=True):
+        of_the_step += np.linalg.norm(coarse - fine, axis=1)
+    assert ours[:, 0].min() > 0.7
+    assert apart.max() < 2e-4
+    assert apart.max() < 3.0 * of_the_step.max() + 2e-6
 
 
 # ---- scripted climbs -------------------------------------------------------------------------------------------------
@@ -115,7 +116,7 @@ def test_bits_depend_on_no_neighbour_thread_or_place_in_the_batch(backend, preci
     assert np.isfinite(together).all()
     assert np.array_equal(_rollout(backend, range(COUNT), precision, threads=2), together)
     assert np.array_equal(_rollout(backend, range(COUNT)[::-1], precision)[::-1], together)
-    for alone in (0, 1, 2, 4, 28, 35):
+    for alone in (0, 4) if precision == "float32" else (0, 1, 2, 4, 28, 35):  # a kernel to compile for each kind
         assert np.array_equal(_rollout(backend, [alone], precision)[0], together[alone]), KINDS[alone % len(KINDS)]
 
 
@@ -208,8 +209,8 @@ def test_a_reset_of_some_leaves_the_others_alone(backend):
 
 @pytest.mark.parametrize("floor", PRESETS[1:])
 def test_random_states_and_setpoints_stay_finite(floor):
-    assert fuzz(floor, substeps=40_000, seed=1).worst == 0
+    assert fuzz(floor, substeps=40_000, seed=1).lost == 0
 
 
 def test_random_states_and_setpoints_stay_finite_in_single_precision():
-    assert fuzz("stairs", substeps=40_000, seed=2, precision="float32").worst == 0
+    assert fuzz("stairs", substeps=40_000, seed=2, precision="float32").lost == 0

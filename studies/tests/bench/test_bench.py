@@ -21,7 +21,7 @@ from wlr_gym.robot import load_robot
 @pytest.mark.parametrize(
     "name",
     [
-        *("engine", "mujoco", "env_step", "ppo", "learning", "import", "batch", "convergence"),
+        *("engine", "mujoco", "env_step", "ppo", "learning", "import", "batch", "relief", "convergence"),
         pytest.param("start", marks=pytest.mark.slow),  # compiles in an empty cache
     ],
 )

@@ -1,13 +1,17 @@
-"""Robots in random states with random setpoints on a floor: whether every number stays finite, and which seed breaks it."""
+"""Robots in random states with random setpoints on a floor: whether every number stays finite."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
 import numpy as np
 
+from wlr_gym.base.errors import Interval
 from wlr_gym.base.random import spawn_seeds
+from wlr_gym.cli import OK
+from wlr_gym.cli.options import JsonOption
+from wlr_gym.cli.terminal import print_json
 from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
@@ -24,13 +28,13 @@ class Fuzzed:
 
     Attributes:
         substeps: of robots, in all.
-        worst: how many robots had a number that is not finite. seed: of the first batch with one (None: none had).
+        lost: how many robots had a number that is not finite. first: substeps before the first batch with one (None: none had).
         fastest: m/s, of any body.
     """
 
     substeps: int
-    worst: int
-    seed: int | None
+    lost: int
+    first: int | None
     fastest: float
 
 
@@ -65,7 +69,7 @@ def fuzz(
     options = PlantOptions(precision=precision, threads=threads)
     plant: Any = make_plant(backend, robot, ROBOTS, options)
     laid = load_floor(floor)
-    done, broken, first, fastest = 0, 0, None, 0.0
+    done, lost, first, fastest = 0, 0, None, 0.0
     while done < substeps:
         rng = np.random.default_rng([seed, done])
         seeds = spawn_seeds(int(rng.integers(2**31)), ROBOTS)
@@ -79,11 +83,38 @@ def fuzz(
         plant.reset(seeds, parameters, state=state)
         for _ in range(TICKS):
             plant.step(np.hstack([rng.uniform(-3.2, 3.2, (ROBOTS, 4)), rng.uniform(-20.0, 20.0, (ROBOTS, 4))]))
-            values = plant.truth().values
             fastest = max(fastest, float(np.abs(plant.truth().linear_velocity_in_body).max()))
-        lost = int((~np.isfinite(values)).any(axis=1).sum())
-        if lost and first is None:
+        count = int((~np.isfinite(plant.truth().values)).any(axis=1).sum())
+        if count and first is None:
             first = done
-        broken += lost
+        lost += count
         done += ROBOTS * TICKS * options.substeps
-    return Fuzzed(done, broken, first, fastest)
+    return Fuzzed(done, lost, first, fastest)
+
+
+@dataclass(frozen=True)
+class FuzzOptions(JsonOption):
+    floors: tuple[str, ...] = ("flat", "rough", "gravel", "kerbs", "ramps", "stairs")
+    """Names or files."""
+    substeps: Annotated[int, Interval(least=1)] = 100_000_000
+    """Of robots, on every floor."""
+    precision: str = "float64"
+    """float64 or float32."""
+    threads: Annotated[int, Interval(least=1)] = 1
+    """Of the simulator."""
+    seed: int = 0
+    """Of everything that is drawn."""
+
+
+def run(options: FuzzOptions) -> int:
+    """Throw robots on to floors in random states; say how many were lost to numbers that are not finite."""
+    found = {}
+    for floor in options.floors:
+        fuzzed = fuzz(floor, options.substeps, options.seed, precision=options.precision, threads=options.threads)
+        found[floor] = asdict(fuzzed)
+        place = "" if fuzzed.first is None else f", first in the batch after {fuzzed.first} substeps"
+        if not options.json:
+            print(f"{floor}: {fuzzed.substeps} substeps, {fuzzed.lost} robots lost{place}; {fuzzed.fastest:.0f} m/s at most")
+    if options.json:
+        print_json(found)
+    return OK if not any(one["lost"] for one in found.values()) else 1
