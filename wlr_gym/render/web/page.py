@@ -158,7 +158,7 @@ class ViewControls:
         """What to show now."""
         friction, slip, forces = (bool(box.value) for box in (self._friction, self._slip, self._forces))
         camera = _CAMERAS[self._camera.value]
-        return replace(self._first, camera=camera, friction=friction, slip=slip, forces=forces)
+        return replace(self._first, camera=camera, friction=friction, slip=slip, forces=forces, loads=forces)
 
 
 def plot_panel(server: viser.ViserServer) -> Any:
