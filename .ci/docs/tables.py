@@ -24,6 +24,7 @@ from studies.bench.adapt import read_lines
 from studies.bench.decide import markdown as markdown_of_decisions
 from studies.bench.gap import markdown, score_answers
 from studies.paper.verdicts import verdict_table
+from wlr_gym.base.paths import config_names
 from wlr_gym.data.excitations import EXCITATIONS
 from wlr_gym.data.format import COLUMNS, Column
 from wlr_gym.envs.registry import ENVIRONMENTS
@@ -43,6 +44,7 @@ from wlr_gym.learning.evaluation.scoring import acceptance_rows, read_acceptance
 from wlr_gym.physics.effects import EFFECTS
 from wlr_gym.physics.effects.effect import EffectParameter
 from wlr_gym.physics.effects.library import coordinates, places
+from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants.forces import FEATURES
 from wlr_gym.robot import JOINTS, load_robot
 
@@ -170,6 +172,18 @@ def parameter_text(name: str, parameter: EffectParameter) -> str:
     low, high = parameter.prior
     text = f"{name} {parameter.unit} [{low:.3g}, {high:.3g}]"
     return f"({text})" if parameter.optional else text
+
+
+def floor_table() -> list[str]:
+    """Return the floors that ship, and what of each a seed draws."""
+    rows = []
+    for floor in map(load_floor, config_names("floor")):
+        drawn = [
+            f"`{place}`" + ("" if isinstance(span, str) else f" {span[0]:g} to {span[1]:g}")
+            for place, span in floor.randomise.items()
+        ]
+        rows.append((f"`{floor.name}`", floor.summary, ", ".join(drawn) or "-"))
+    return _table(("name", "what it is", "drawn by the seed"), rows)
 
 
 def keyword_table() -> list[str]:
@@ -324,6 +338,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "columns": column_table,
     "motions": motion_table,
     "keywords": keyword_table,
+    "floors": floor_table,
     "terms": shared_tables,
     **{title: partial(task_tables, title) for title in ("Velocity", "Path", "Posture", "Slope")},
     "nominal": partial(randomization_table, "nominal"),
