@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import sys
 import tempfile
@@ -41,6 +42,8 @@ FLOORS = {
     "ramps": ("side", 0.66, 19),
     "stairs": ("side", 1.02, 141),
 }
+#: Control periods from one picture of the climb to the next.
+EVERY = 8
 #: Environment steps of a leg sweep that are shown.
 SHOWN = (190, 345, 525)
 #: Pixels; of a still with text.
@@ -132,6 +135,33 @@ def floors(path: Path) -> None:
         picture = floor_portrait(robot, floor, View(size, camera, text=False), (x, 0.0), seed)
         panels.append(np.vstack([banner(size[0], f"{name}: {floor.summary}", 22), picture]))
     _write(path, np.vstack([np.hstack(panels[:3]), np.hstack(panels[3:])]))
+
+
+def one_wheel_at_a_time(path: Path) -> None:
+    """A kerb of two wheel radii, climbed in the engine by the script of ``studies.bench.climbing``, filmed."""
+    from studies.bench.climbing import KERB, ONE_BY_ONE, ONE_BY_ONE_START, REAR_GAP, Climber
+    from wlr_gym.render import Scene, write_video
+    from wlr_gym.render.scene import banner
+
+    robot = load_robot()
+    view = View((480, 260), "side", text=False, slip=False, loads=True)
+    scene, pictures, ticks = Scene(robot, view), [], itertools.count()
+
+    class Filmed(Climber):
+        def _step(self) -> None:
+            super()._step()
+            if next(ticks) % EVERY == 0:
+                now = self.plant.truth(), self.plant.parameters
+                pictures.append(scene.draw(*now, look_at=(KERB - 0.04, 0.0), contacts=self.plant.contacts))
+
+    climber = Filmed("gibbs_appell", robot, 0.07, 0.3, legs=ONE_BY_ONE_START)
+    for legs, way, seconds in ONE_BY_ONE:
+        rear_gap = KERB - climber.wheels()[:, 2:, 0].max(axis=1) - robot.wheel.radius
+        climber.move(legs, rear_gap - REAR_GAP if way is None else way, seconds)
+    climber.hold(1.0)
+    scene.close()
+    title = banner(view.size[0], "a kerb of 70 mm, friction 0.3; green: loads; twice as fast as it was", 22)
+    write_video(path.with_suffix(".webp"), [np.vstack([title, one]) for one in pictures], fps=2.0 * 50.0 / EVERY)
 
 
 def _patch(number: int, mu: float, x: tuple[float, float]) -> dict[str, float]:
@@ -235,6 +265,7 @@ FIGURES: dict[str, Callable[[Path], None]] = {
         environment_slope,
         scene,
         floors,
+        one_wheel_at_a_time,
         vision_slip,
     )
 }
