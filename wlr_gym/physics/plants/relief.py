@@ -140,7 +140,7 @@ def _pack_pieces(parameters: Parameters) -> dict[str, Array]:
 
 
 @dataclass(frozen=True)
-class Profile:
+class WheelProfile:
     """Cross-section of a wheel: radius of its core disc, half its width, and the rounding of its edges, m."""
 
     radius: Value
@@ -163,16 +163,16 @@ class Touch:
     reach: Vector
 
 
-def profile_of(lanes: Lanes, i: int) -> Profile:
+def profile_of(lanes: Lanes, i: int) -> WheelProfile:
     """Return the cross-section of wheel ``i``."""
-    return Profile(lanes[f"core_radius{i}"], lanes[f"core_half_width{i}"], lanes[f"rounding{i}"])
+    return WheelProfile(lanes[f"core_radius{i}"], lanes[f"core_half_width{i}"], lanes[f"rounding{i}"])
 
 
 def _dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def support(profile: Profile, axle: Vector, normal: Vector) -> tuple[Value, Vector]:
+def support(profile: WheelProfile, axle: Vector, normal: Vector) -> tuple[Value, Vector]:
     """Return how far a wheel reaches against ``normal`` (m), and the vector from its centre to the point that does.
 
     S(n) = rho sqrt(1 - x^2) + b (sqrt(x^2 + e^2) - e) + rc with x = n . axle, and the point is -dS/dn. The crown e lets the
@@ -256,7 +256,7 @@ def _quadratic(t: Value) -> tuple[Vector, Vector]:
     return [0.5 * rest * rest, 0.5 + t * rest, 0.5 * t * t], [-rest, rest - t, t]
 
 
-def touch_of_base(lanes: Lanes, centre: Vector, axle: Vector, profile: Profile, features: frozenset[str]) -> Touch:
+def touch_of_base(lanes: Lanes, centre: Vector, axle: Vector, profile: WheelProfile, features: frozenset[str]) -> Touch:
     """Return where a wheel is nearest to the base: the normal under its centre, improved at the point that it finds."""
     if not features & {"waves", "bumps"}:
         _, reach = support(profile, axle, [0.0, 0.0, 1.0])
@@ -347,7 +347,7 @@ def _within(u: Value, v: Value, steepest: tuple[Value, ...]) -> tuple[Value, Val
     return ops.where_positive(beyond, 0.0, u), ops.where_positive(beyond, 1.0, v)
 
 
-def _touch_of_edge(edge: _Edge, axle: Vector, profile: Profile) -> Touch:
+def _touch_of_edge(edge: _Edge, axle: Vector, profile: WheelProfile) -> Touch:
     """Return where a wheel is nearest to an edge: the normal between face and top along which they are furthest apart.
 
     f(angle) = C . n - S(n) - r is concave there; Newton's steps start at the direction of the wheel's centre.
