@@ -22,6 +22,7 @@ from wlr_gym.physics.plants.gibbs_appell import kernel as engine
 from wlr_gym.physics.plants.gibbs_appell.kernel import outputs
 from wlr_gym.physics.plants.gibbs_appell.plant import TILES_AT_A_TIME, GibbsAppellPlant
 from wlr_gym.physics.plants.mujoco import kernel as mujoco
+from wlr_gym.physics.plants.mujoco.step import ON_RELIEF
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT
 from wlr_gym.robot import JOINTS, WHEEL_SLICE, WHEELS
 from wlr_gym.robot.parameters import Parameters
@@ -237,7 +238,8 @@ def test_golden_rollout():
 
 
 PACKAGE = Path(wlr_gym.__file__).parent
-FAMILIES = frozenset({"drive", "backlash", "ground", "compliance", "rolling_resistance", "forces"})
+RELIEF = ("relief", "waves", "bumps", "piece", "pieces")
+FAMILIES = frozenset({"drive", "backlash", "ground", "compliance", "rolling_resistance", "forces", *RELIEF})
 
 
 def called_files(function):
@@ -257,7 +259,7 @@ def called_files(function):
 
 @pytest.mark.parametrize(
     ("kernel", "source"),
-    [(engine, lambda: engine.kernel_source(FAMILIES, "float64", 8)), (mujoco, mujoco.kernel_source)],
+    [(engine, lambda: engine.kernel_source(FAMILIES, "float64", 8)), (mujoco, lambda: mujoco.kernel_source(ON_RELIEF))],
     ids=["gibbs_appell", "mujoco"],
 )
 def test_the_key_holds_every_module_of_the_trace(kernel, source):
