@@ -167,6 +167,15 @@ def test_of_ramps_planks_and_stairs_a_wheel_touches_the_two_that_brute_force_fin
     assert (second.depth[~touching] < 1e-7).all()
 
 
+def test_a_wheel_far_inside_a_kerb_is_pushed_out_of_its_top():
+    """Its centre below the top: not out of the face, which is further away."""
+    centre = np.array([[0.5, 0.0, 0.02], [0.02, 0.0, 0.025], [-0.01, 0.0, 0.01]])
+    parameters, axle = parameters_of(3, KERB), np.tile([0.0, 1.0, 0.0], (3, 1))
+    found = touches(parameters, centre, axle)[0]
+    assert found.depth == pytest.approx([RADIUS + 0.01, RADIUS + 0.005, RADIUS - 0.01], abs=1e-9)
+    assert columns(found.normal, 3) == pytest.approx(np.array([[0, 0, 1], [0, 0, 1], [-1, 0, 0]]), abs=1e-9)
+
+
 @pytest.mark.parametrize(("floor", "degrees"), [(WAVES, 0.5), (BUMPS, 0.5), (KERB, 0.01)], ids=["waves", "bumps", "kerb"])
 def test_depth_grows_along_the_normal(floor, degrees):
     """A wheel's contact is a potential's force: the normal is the slope of the depth."""

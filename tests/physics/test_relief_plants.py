@@ -209,7 +209,10 @@ def test_a_reset_of_some_leaves_the_others_alone(backend):
 
 @pytest.mark.parametrize("floor", PRESETS[1:])
 def test_random_states_and_setpoints_stay_finite(floor):
-    assert fuzz(floor, substeps=40_000, seed=1).lost == 0
+    """No contact throws a robot: it is thrown at some metres per second, and falls from 0.1 m."""
+    fuzzed = fuzz(floor, substeps=40_000, seed=0)
+    assert fuzzed.lost == 0
+    assert fuzzed.fastest < 10.0
 
 
 def test_random_states_and_setpoints_stay_finite_in_single_precision():

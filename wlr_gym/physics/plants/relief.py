@@ -342,8 +342,9 @@ def _edge_of(lanes: Lanes, k: int, centre: Vector) -> _Edge:
 def _within(u: Value, v: Value, steepest: tuple[Value, ...]) -> tuple[Value, Value]:
     """Limit a direction to the normals between a face and the top."""
     below = steepest[1] * u - steepest[0] * v  # positive: below the face's normal
+    # positive: behind straight up, and nearer to it than to the face's normal (inside a piece a direction may be beyond both)
+    beyond = ops.minimum(-u, v - (steepest[0] * u + steepest[1] * v))
     u, v = ops.where_positive(below, steepest[0], u), ops.where_positive(below, steepest[1], v)
-    beyond = -u  # positive: beyond straight up
     return ops.where_positive(beyond, 0.0, u), ops.where_positive(beyond, 1.0, v)
 
 
