@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -258,22 +258,37 @@ class Floor(SettingsModel):
     # ---- what cannot be ----
 
     def check(self, robot: Robot) -> None:
-        """Refuse a floor on which a robot cannot be simulated, or whose start is inside a piece, at all ends of what is drawn.
+        """Refuse a floor on which a robot cannot be simulated, or whose start is inside a piece, wherever it may be drawn.
 
         Raises:
             InputError: with the number, and what was expected.
         """
-        for share in (np.zeros(1), np.full(1, 1.0 - 1e-9)):
+        if 0.25 * robot.wheel.width >= robot.wheel.radius:
+            raise InputError(
+                f"floor '{self.name}': robot '{robot.name}': its wheels are {robot.wheel.width:g} m wide, their radius is "
+                f"{robot.wheel.radius:g} m: expected less than four times the radius"
+            )
+        for shares in self._tried():
             parameters = Parameters.nominal(robot, 1)
-            self._write(parameters, {place: self._between(place, share) for place in self.randomise})
+            drawn = zip(self.randomise, shares, strict=True)
+            self._write(parameters, {place: self._between(place, np.full(1, share)) for place, share in drawn})
             parameters.validate()
             self._check_curvature(parameters, robot)
             self._check_pieces(parameters, robot)
 
+    def _tried(self) -> Iterator[Sequence[float]]:
+        """Yield shares of the ranges that are drawn from: ends and places between; of many ranges, ends and a sample."""
+        last, count = 1.0 - 1e-9, len(self.randomise)
+        if count <= 3:
+            yield from itertools.product((0.0, 0.25, 0.5, 0.75, last), repeat=count)
+            return
+        yield from ([0.0] * count, [last] * count)
+        yield from np.random.default_rng(0).choice([0.0, 0.5, last], (100, count)).tolist()
+
     def _check_curvature(self, parameters: Parameters, robot: Robot) -> None:
         number = 2.0 * np.pi / parameters["wave.length"][0]
         curvature = float((parameters["wave.height"][0] * number**2).sum())
-        curvature += float(2.0 * parameters["bumps.height"][0] / parameters["bumps.spacing"][0] ** 2)
+        curvature += float(2.5 * parameters["bumps.height"][0] / parameters["bumps.spacing"][0] ** 2)
         product = curvature * robot.wheel.radius
         if product > LARGEST_CURVATURE:
             raise InputError(
@@ -287,6 +302,7 @@ class Floor(SettingsModel):
         pieces = [{name: float(parameters[f"piece.{name}"][0, k]) for name in _SHAPE} for k in there]
         reach = math.hypot(robot.hip_position.x, robot.hip_position.y) + robot.wheel.radius
         for number, piece in enumerate(pieces, 1):
+            _check_edges(f"floor '{self.name}': piece {number}", piece)
             foot, end = _along(piece, piece)
             if foot < reach and end > -reach and not (foot <= -reach and end >= reach):
                 raise InputError(
@@ -294,7 +310,7 @@ class Floor(SettingsModel):
                     f"(0, 0): expected {reach:.3g} m between the start and a face"
                 )
         for (first, low), (second, high) in itertools.combinations(enumerate(pieces, 1), 2):
-            if math.cos(low["heading"] - high["heading"]) < 1.0 - 1e-9:
+            if abs(math.cos(low["heading"] - high["heading"])) < 1.0 - 1e-9:
                 continue  # they cross somewhere; a wheel touches the two that are deepest
             (foot, end), (other_foot, other_end) = _along(low, low), _along(high, low)
             stacked = high["height"] > low["height"] and other_foot >= foot
@@ -333,11 +349,23 @@ def _shapes(piece: Kerb | Ramp | Stairs, where: str, of: Drawn) -> Iterator[dict
     yield shape
 
 
+def _check_edges(where: str, piece: Mapping[str, float]) -> None:
+    radius, insets = piece["edge_radius"], sum(math.tan(0.5 * piece[slope]) for slope in ("front_slope", "rear_slope"))
+    if radius > piece["height"]:
+        raise InputError(f"{where}: edge_radius = {radius:g} m: expected at most the height, {piece['height']:g} m")
+    if radius * insets > piece["length"]:
+        raise InputError(
+            f"{where}: edge_radius = {radius:g} m: its top is {piece['length']:g} m deep: expected {radius * insets:.3g} m or more, "
+            "or a smaller radius"
+        )
+
+
 def _along(piece: Mapping[str, float], other: Mapping[str, float]) -> tuple[float, float]:
     """Return where a piece begins and ends along the heading of another, from the floor's origin, m."""
     foot = piece["x"] * math.cos(other["heading"]) + piece["y"] * math.sin(other["heading"])
     faces = sum(piece["height"] / math.tan(piece[slope]) for slope in ("front_slope", "rear_slope"))
-    return foot, foot + piece["length"] + faces
+    end = foot + math.copysign(piece["length"] + faces, math.cos(piece["heading"] - other["heading"]))
+    return min(foot, end), max(foot, end)
 
 
 def _numbers(content: Any, place: str = "") -> Iterator[tuple[str, float]]:

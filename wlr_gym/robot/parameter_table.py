@@ -209,7 +209,7 @@ TABLE: tuple[ParameterSpec, ...] = (
     fixed("bumps.height", "m", low=0, high=1, doc="of the highest bump; 0 = none"),
     fixed("bumps.spacing", "m", at=0.1, low=0.005, high=10, doc="between the lattice's points"),
     fixed("bumps.share", "-", at=1.0, low=0.01, high=1, doc="share of the points that are raised"),
-    fixed("bumps.seed", "-", low=0, high=83520, doc="whole number: which bumps"),
+    fixed("bumps.seed", "-", low=0, high=1038360, doc="whole number: which bumps"),
     # A piece has a flat top and two faces (pi/2: upright); its edges run across its heading without an end.
     fixed("piece.x", "m", PIECES, low=-1e3, high=1e3, doc="foot of the front face"),
     fixed("piece.y", "m", PIECES, low=-1e3, high=1e3, doc="foot of the front face"),

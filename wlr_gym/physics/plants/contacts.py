@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.codegen import ops
-from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
+from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.model.dynamics import rotation_matrix
 from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import Contacts, Plant, Truth
@@ -79,6 +79,7 @@ class Contact:
         hip, leg, rim: from the body's origin to the hip, on to the axle, and on to the point of the wheel that is deepest, m.
         axes: see :func:`axes_on`.
         depth: how far that point is in the floor, m; None: as far as it is below z = 0.
+        place: what it touches, see :class:`wlr_gym.physics.plants.relief.Touch`.
     """
 
     number: int
@@ -87,6 +88,7 @@ class Contact:
     rim: Vector
     axes: tuple[Vector, Vector, Vector, Value]
     depth: Value | None = None
+    place: Value = 1.0
 
     @property
     def wheel(self) -> int:
@@ -146,9 +148,33 @@ def contacts_of(
     centre = [lanes[f"p{a}"] + dot(rows[k], [hip[m] + leg[m] for m in range(3)]) for k, a in enumerate(AXES)]
     found = relief.touches(lanes, i, centre, [row[1] for row in rows], features)
     return [
-        Contact(i + 4 * k, hip, leg, to_body(rows, touch.reach), axes_on(to_body(rows, touch.normal)), touch.depth)
+        Contact(i + 4 * k, hip, leg, to_body(rows, touch.reach), axes_on(to_body(rows, touch.normal)), touch.depth, touch.place)
         for k, touch in enumerate(found)
     ]
+
+
+def remembered(lanes: Lanes, contacts: Sequence[Contact], names: Sequence[str]) -> Out:
+    """Return what two contacts of a wheel keep from the last step, and their places.
+
+    The deeper contact is the first. Where the two have changed places, so does what they remember; a new place has nothing to
+    remember.
+
+    Args:
+        lanes: with those called ``names`` and ``place`` and the contact's number.
+        contacts: of one wheel.
+        names: of what is kept.
+    """
+    out: Out = {}
+    if len(contacts) == 1:
+        return out
+    for own, other in (contacts, contacts[::-1]):
+        stays = 0.5 - ops.absolute(own.place - lanes[f"place{own.number}"])
+        comes = 0.5 - ops.absolute(own.place - lanes[f"place{other.number}"])
+        for name in names:
+            moved = ops.where_positive(comes, lanes[f"{name}{other.number}"], 0.0)
+            out[f"{name}{own.number}"] = ops.where_positive(stays, lanes[f"{name}{own.number}"], moved)
+        out[f"place{own.number}"] = own.place
+    return out
 
 
 def contact_numbers(i: int, features: frozenset[str]) -> list[int]:

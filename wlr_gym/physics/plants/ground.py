@@ -41,7 +41,8 @@ _LEAST_MU = 1e-9
 
 def pack(parameters: Parameters) -> dict[str, Array]:
     """Return the lanes GROUND_LANES, each (N,); ``anisotropy`` is ground.mu_y over mu_x (1 where mu_x is 0)."""
-    grip, creep_speed = parameters["wheel.grip"], parameters["ground.creep_speed"]
+    grip = parameters["wheel.grip"]
+    creep_speed = np.where(parameters["ground.slip_compliance"] > 0.0, 0.0, parameters["ground.creep_speed"])
     mu_x, mu_y = parameters["ground.mu_x"], parameters["ground.mu_y"]
     mass = parameters["body.mass"] + parameters["leg.mass"].sum(axis=1) + parameters["wheel.mass"].sum(axis=1)
     load = parameters["gravity"] * mass / 4

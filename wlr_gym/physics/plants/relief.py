@@ -29,14 +29,17 @@ from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-#: How often the normal on a smooth base, and the angle of the normal on a piece's edge, are improved.
+#: How often the normal on a smooth base is improved.
 REFINEMENTS = 2
+#: Newton's steps over the angle of the normal on a piece's edge.
+EDGE_STEPS = 3
 #: Crown of the tread: about so many radians wide is the flip of the contact from one edge to the other (see :func:`support`).
 CROWN = 0.05
 #: Where pieces are that are not there: far below (m).
 NOWHERE = -10.0
-#: Modulus of the permutation that draws bumps: (34 k + 1) k mod 289 visits every number once, and is exact in single precision.
-PERMUTED = 289
+#: Modulus of the permutation that draws bumps: a prime p of which p - 1 is no multiple of 3, so that k^3 mod p visits every
+#: number once; small enough for single precision.
+PERMUTED = 1019
 #: Largest product of the base's curvature and a wheel's radius: up to here the contact is exact to 30 um.
 LARGEST_CURVATURE = 0.25
 
@@ -156,11 +159,13 @@ class Touch:
         depth: how far it is in the floor, m; negative: how far away.
         normal: of the floor there, upwards; floor frame.
         reach: from the wheel's centre to its point that is deepest, m; floor frame.
+        place: what it touches: 1 = the base, from 2 on the pieces.
     """
 
     depth: Value
     normal: Vector
     reach: Vector
+    place: Value = 1.0
 
 
 def profile_of(lanes: Lanes, i: int) -> WheelProfile:
@@ -213,9 +218,8 @@ def base_height(lanes: Lanes, x: Value, y: Value, features: frozenset[str]) -> t
 
 
 def _permuted(k: Value) -> Value:
-    """(34 k + 1) k modulo :data:`PERMUTED`, of a whole number below that; exact in either precision."""
-    value = (34.0 * k + 1.0) * k
-    return value - PERMUTED * ops.floor((value + 0.5) * (1.0 / PERMUTED))
+    """k^3 modulo :data:`PERMUTED`, of a whole number below that; exact in either precision."""
+    return _below_modulus(_below_modulus(k * k) * k)
 
 
 def _below_modulus(k: Value) -> Value:
@@ -233,12 +237,13 @@ def _bumps(lanes: Lanes, x: Value, y: Value) -> tuple[Value, Value, Value]:
     slope_x: Value = 0.0
     slope_y: Value = 0.0
     for j in range(3):
-        in_column = _permuted(_below_modulus(first_column + (float(j) + lanes["bump_seed_x"])))
+        shuffled = _permuted(_below_modulus(first_column + (float(j) + lanes["bump_seed_x"])))
+        in_column = _permuted(_below_modulus(shuffled + lanes["bump_seed_y"]))
         line: Value = 0.0
         line_slope: Value = 0.0
         for k in range(3):
-            number = _below_modulus(in_column + (first_row + (float(k) + lanes["bump_seed_y"])))
-            drawn = _permuted(_permuted(number)) * (1.0 / (PERMUTED - 1))
+            number = _permuted(_below_modulus(in_column + (first_row + float(k))))
+            drawn = _permuted(_below_modulus(number + 7.0)) * (1.0 / (PERMUTED - 1))
             height = ops.maximum(drawn - lanes["bump_least"], 0.0)
             line = line + weights_y[k] * height
             line_slope = line_slope + slopes_y[k] * height
@@ -288,6 +293,7 @@ class _Edge:
         steepest: normal (u, v) of the face below the edge; the other limit is straight up.
         normal: direction (u, v) from the inner corner to the centre, within those limits.
         radius: of the edge, m.
+        place: of the piece, see :class:`Touch`.
     """
 
     gap: Value
@@ -296,6 +302,7 @@ class _Edge:
     steepest: tuple[Value, Value]
     normal: tuple[Value, Value]
     radius: Value
+    place: Value
 
 
 def _choose(condition: Value, a: _Edge, b: _Edge) -> _Edge:
@@ -311,6 +318,7 @@ def _choose(condition: Value, a: _Edge, b: _Edge) -> _Edge:
         pick(a.steepest, b.steepest),
         pick(a.normal, b.normal),
         ops.where_positive(condition, a.radius, b.radius),
+        ops.where_positive(condition, a.place, b.place),
     )
 
 
@@ -336,7 +344,8 @@ def _edge_of(lanes: Lanes, k: int, centre: Vector) -> _Edge:
     normal = _within(u * inverse, v * inverse, steepest)
     radius = lanes[f"piece_edge_radius{k}"]
     gap = u * normal[0] + v * normal[1] - radius
-    return _Edge(gap, (u, v), (turned * across[0], turned * across[1]), (steepest[0], steepest[1]), normal, radius)
+    outwards = (turned * across[0], turned * across[1])
+    return _Edge(gap, (u, v), outwards, (steepest[0], steepest[1]), normal, radius, k + 2.0)
 
 
 def _within(u: Value, v: Value, steepest: tuple[Value, ...]) -> tuple[Value, Value]:
@@ -351,14 +360,15 @@ def _within(u: Value, v: Value, steepest: tuple[Value, ...]) -> tuple[Value, Val
 def _touch_of_edge(edge: _Edge, axle: Vector, profile: WheelProfile) -> Touch:
     """Return where a wheel is nearest to an edge: the normal between face and top along which they are furthest apart.
 
-    f(angle) = C . n - S(n) - r is concave there; Newton's steps start at the direction of the wheel's centre.
+    f(angle) = C . n - S(n) - r is concave there; Newton's steps start at the direction of the wheel's centre. Where the normal
+    comes near to the axle f has a kink that they cannot find: the direction of the axle is tried as well.
     """
     cu, cv = edge.centre
     axle_u = axle[0] * edge.across[0] + axle[1] * edge.across[1]
     axle_v = axle[2]
     rho, b = profile.radius, profile.half_width
     u, v = edge.normal
-    for _ in range(REFINEMENTS):
+    for _ in range(EDGE_STEPS):
         x = axle_u * u + axle_v * v
         y = axle_v * u - axle_u * v  # change of x with the angle
         square = ops.maximum(1.0 - x * x, 1e-6)
@@ -373,9 +383,15 @@ def _touch_of_edge(edge: _Edge, axle: Vector, profile: WheelProfile) -> Touch:
         u, v = u - turn * v, v + turn * u
         inverse = 1.0 / ops.sqrt(u * u + v * v)
         u, v = _within(u * inverse, v * inverse, edge.steepest)
-    normal = [u * edge.across[0], u * edge.across[1], v]
-    distance, reach = support(profile, axle, normal)
-    return Touch(distance + edge.radius - (cu * u + cv * v), normal, reach)
+    facing = ops.where_positive(axle_u * cu + axle_v * cv, 1.0, -1.0)
+    facing = facing / ops.sqrt(axle_u * axle_u + axle_v * axle_v + 1e-18)
+    aside = _within(facing * axle_u, facing * axle_v, edge.steepest)
+    found: list[Touch] = []
+    for out, up in ((u, v), aside):
+        normal = [out * edge.across[0], out * edge.across[1], up]
+        distance, reach = support(profile, axle, normal)
+        found.append(Touch(distance + edge.radius - (cu * out + cv * up), normal, reach, edge.place))
+    return _shallower(*found)
 
 
 # ---- both ------------------------------------------------------------------------------------------------------------
@@ -407,7 +423,8 @@ def touches(lanes: Lanes, i: int, centre: Vector, axle: Vector, features: frozen
 
 def _rounded(touch: Touch) -> Touch:
     """Round a touch as if it were chosen among several, so that bits do not depend on what the robots beside stand on."""
-    return Touch(ops.rounded(touch.depth), [ops.rounded(x) for x in touch.normal], [ops.rounded(x) for x in touch.reach])
+    vectors = ([ops.rounded(x) for x in vector] for vector in (touch.normal, touch.reach))
+    return Touch(ops.rounded(touch.depth), *vectors, touch.place)
 
 
 def _deeper(a: Touch, b: Touch) -> Touch:
@@ -424,7 +441,8 @@ def _choose_touch(condition: Value, a: Touch, b: Touch) -> Touch:
         [ops.where_positive(condition, x, y) for x, y in zip(one, other, strict=True)]
         for one, other in ((a.normal, b.normal), (a.reach, b.reach))
     )
-    return Touch(ops.where_positive(condition, a.depth, b.depth), normal, reach)
+    depth, place = (ops.where_positive(condition, x, y) for x, y in ((a.depth, b.depth), (a.place, b.place)))
+    return Touch(depth, normal, reach, place)
 
 
 def _second_nearest(edges: Sequence[_Edge]) -> _Edge:

@@ -48,7 +48,9 @@ def settle(robot: Robot, parameters: Parameters, state: Any) -> None:
         return
     lanes = relief.pack(parameters, robot) | _given(parameters, state)
     w, _, _, z = state.quaternion.T
-    lanes |= {"pz": state.position[:, 2], "yaw": 2.0 * np.arctan2(z, w)}
+    height = relief.floor_height(lanes, state.position[:, 0], state.position[:, 1], features)
+    height = height + np.mean([parameters["wheel.radius"][:, i] - lanes[f"axle_z{i}"] for i in _CORNERS], axis=0)
+    lanes |= {"pz": height, "yaw": 2.0 * np.arctan2(z, w)}
     count = len(parameters)
     values = np.stack([lanes.get(name, np.zeros(count)) for name in _LANES], axis=1)
     tag = "_".join(["standing", *sorted(features)])

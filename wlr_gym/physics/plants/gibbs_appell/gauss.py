@@ -6,6 +6,7 @@ which :mod:`wlr_gym.physics.plants.gibbs_appell.gauss` then solves.
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -21,6 +22,7 @@ from wlr_gym.physics.plants.contacts import (
     contact_place,
     contacts_of,
     dot,
+    remembered,
     rolling_contact,
     rotation_rows,
     slip_velocity,
@@ -29,6 +31,10 @@ from wlr_gym.physics.plants.contacts import (
 )
 from wlr_gym.physics.plants.gibbs_appell.kinematics import ASSEMBLY, PLATFORM, joints_of
 from wlr_gym.robot import FIRST_WHEEL, JOINTS
+
+#: What a contact keeps from step to step.
+_KEPT = ("normal", "last_gap_rate", "friction_x", "friction_y", "multiplier")
+_KEPT_BY_TREAD = ("shear_x", "shear_y")
 
 
 @dataclass
@@ -81,6 +87,9 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
             corner.leg_wheel * leg_rate + corner.wheel_wheel * wheel_rate - step * corner.wheel_bias,
         ]
         corner.contacts = contacts_of(lanes, i, rows, level, corner.trig, features)
+        kept = remembered(lanes, corner.contacts, _KEPT + (_KEPT_BY_TREAD if "brush" in features else ()))
+        out |= {name: value for name, value in kept.items() if name.startswith(("place", "multiplier", "shear"))}
+        lanes = ChainMap(kept, lanes)  # pyright: ignore[reportArgumentType]  # nothing writes to them
         for contact in corner.contacts:
             _push_of_floor(lanes, contact, [*v, *w], step, momentum, own, out)
         damping = _push_of_motors(lanes, i, voltages, joints, step, features, momentum, own, out)

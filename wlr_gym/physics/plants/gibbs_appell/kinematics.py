@@ -31,6 +31,7 @@ STATE: tuple[str, ...] = (
     *(f"friction_{a}{c}" for c in CONTACTS for a in "xy"),
     *(f"multiplier{c}" for c in CONTACTS),
     *(f"shear_{a}{c}" for c in CONTACTS for a in "xy"),
+    *(f"place{c}" for c in CONTACTS),
     *(f"gear_friction{j}" for j in range(8)),
     *(f"rolling_friction{i}" for i in CORNERS),
     *(f"gyro_{a}" for a in AXES),

@@ -41,7 +41,7 @@ _PLACE = {
         ("wxyz", ("q{}",)),
         ("xy", ("rounding_p{}",)),
         (range(4), ("leg_angle{}", "leg_rate{}", "last_leg_rate{}", "wheel_angle{}", "wheel_rate{}", "last_wheel_rate{}")),
-        (range(4), ("turns{}", "zero_angle{}", "zero_rest{}")),
+        (range(4), ("turns{}", "zero_angle{}", "zero_rest{}", "place{}")),
         (range(8), ("reference_position{}", "reference_velocity{}", "rotor_lead{}", "rotor_rate{}")),
         (range(1), ("supply_drop",)),
     )
@@ -219,6 +219,7 @@ class GibbsAppellPlant(Simulator):
             "last_wheel_rate{}": wheel_rate,
             "reference_position{}": reference,
             "reference_velocity{}": state.reference_velocity[rows],
+            "place{}": np.ones((rows.size, 4)),
             "rotor_rate{}": (state.joint_velocity if state.rotor_rate is None else state.rotor_rate)[rows],
         }
         if state.rotor_lead is not None:

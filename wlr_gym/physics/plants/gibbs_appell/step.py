@@ -151,7 +151,9 @@ def _strained_tread(lanes: Lanes, c: int, step: Value) -> Out:
     out: Out = {}
     for k, (a, slip) in enumerate(zip("xy", _slip_after(lanes, c), strict=True)):
         stuck = (lanes[f"shear_{a}{c}"] + step * slip) * (lanes[f"held{c}"] * inverse)
-        out[f"shear_{a}{c}"] = ops.where_positive(slides, -(impulse[k] * (1.0 / step)) * inverse, stuck)
+        strained = ops.where_positive(slides, -(impulse[k] * (1.0 / step)) * inverse, stuck)
+        touches = ops.minimum(lanes[f"bound{c}"], lanes[f"tread{c}"])
+        out[f"shear_{a}{c}"] = ops.where_positive(touches, strained, 0.0)
     return out
 
 
@@ -214,8 +216,9 @@ def _clearance(lanes: Lanes, rows: list[Vector], features: frozenset[str]) -> Va
         reach = [ops.absolute(n[k]) * half[k] for k in range(3)]
         return lanes["pz"] - reach[0] - reach[1] - reach[2]
     least: Value = 1e3
+    lower = ops.where_positive(n[2], -half[2], half[2])
     for x, y in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
-        corner = [lanes[f"p{a}"] + dot(rows[k], [x * half[0], y * half[1], -half[2]]) for k, a in enumerate(AXES)]
+        corner = [lanes[f"p{a}"] + dot(rows[k], [x * half[0], y * half[1], lower]) for k, a in enumerate(AXES)]
         least = ops.minimum(least, corner[2] - relief.floor_height(lanes, corner[0], corner[1], features))
     return least
 

@@ -128,6 +128,7 @@ class MujocoPlant(Simulator):
             "gyro_{}": (w, "xyz"),
             "acceleration_{}": (still, "xyz"),
         }
+        groups["place{}"] = (np.ones((rows.size, 4)), range(4))
         if state.rotor_lead is not None:
             groups["rotor_lead{}"] = (state.rotor_lead[rows], range(8))
         if state.supply_drop is not None:

@@ -39,6 +39,7 @@ from wlr_gym.physics.plants.contacts import (
     contacts_of,
     cross,
     dot,
+    remembered,
     rolling_contact,
     rotation_rows,
     slip_velocity,
@@ -79,6 +80,7 @@ STATE: tuple[str, ...] = (
     *(f"acceleration_{a}" for a in AXES),
     *(f"own_force_{a}{c}" for c in CONTACTS for a in "xy"),
     *(f"shear_{a}{c}" for c in CONTACTS for a in "xy"),
+    *(f"place{c}" for c in CONTACTS),
     *(f"rolling_torque{i}" for i in CORNERS),
     *(f"old_spin{i}" for i in CORNERS),
     *(f"old_{v}{a}" for v in "uw" for a in AXES),
@@ -152,6 +154,9 @@ def before(lanes: Lanes, time: Value, step: Value, features: frozenset[str] = FE
         _push_joint(lanes, j, voltages[j], joint, pushed, step, applied, out)
     for i in CORNERS:
         contacts = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
+        kept = remembered(lanes, contacts, ("own_force_x", "own_force_y", "shear_x", "shear_y"))
+        out |= {name: value for name, value in kept.items() if name.startswith("place")}
+        lanes = over(kept, lanes)
         pushed = [_push_contact(lanes, contact, rows, step, applied, out) for contact in contacts]
         normal, swing, spin = (reduce(add, each) for each in zip(*pushed, strict=True))
         _turn_wheel(lanes, i, normal, swing, spin, step, applied, out)
@@ -277,7 +282,9 @@ def _place_sphere(lanes: Lanes, contact: Contact, gap: Value, rise: Value, out: 
     """
     c, i, (n, _, _, scale) = contact.number, contact.wheel, contact.axes
     sine, cosine = ops.sin_cos(lanes[f"leg_angle{i}"] + lanes[f"wheel_angle{i}"])
-    reach = lanes[f"radius{i}"] * scale  # scale = 1/cos(tilt)
+    reach = lanes[f"radius{i}"]
+    if contact.depth is None:
+        reach = reach * scale  # scale = 1/cos(tilt)
     level = [scale * ((1.0 if k == 1 else 0.0) - n[1] * n[k]) for k in range(3)]  # the axle's direction, laid on the floor
     axis = [math.cos(CAPSULE_LEAN) * level[k] + math.sin(CAPSULE_LEAN) * n[k] for k in range(3)]
     centre = [CAPSULE_HALF_LENGTH * x for x in axis]
@@ -291,6 +298,8 @@ def _place_sphere(lanes: Lanes, contact: Contact, gap: Value, rise: Value, out: 
         out[f"geom_{a}{c}"] = value
     x, y, z = _to_wheel(axis, sine, cosine)
     w = ops.sqrt(0.5 + 0.5 * z)  # the shortest turn from z to the axis, whose y component keeps it away from -z
+    if contact.depth is not None:
+        w = ops.maximum(w, 1e-6)
     half = 0.5 / w
     out |= {f"geom_qw{c}": w, f"geom_qx{c}": -(y * half), f"geom_qy{c}": x * half}
 
