@@ -211,7 +211,7 @@ def test_names_of_floors_are_told():
     [
         (
             {"base": {"kind": "bumps", "height": 0.05, "spacing": 0.08}},
-            "its curvature reaches 15.6 1/m, 0.53 over the wheels' radius: expected at most 0.25 over 0.034 m",
+            "its curvature reaches 19.5 1/m, 0.66 over the wheels' radius: expected at most 0.25 over 0.034 m",
         ),
         ({"base": {"kind": "waves", "waves": [{"height": 0.1, "length": 0.5}]}}, "its curvature reaches 15.8 1/m"),
         (

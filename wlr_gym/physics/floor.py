@@ -355,8 +355,8 @@ def _check_edges(where: str, piece: Mapping[str, float]) -> None:
         raise InputError(f"{where}: edge_radius = {radius:g} m: expected at most the height, {piece['height']:g} m")
     if radius * insets > piece["length"]:
         raise InputError(
-            f"{where}: edge_radius = {radius:g} m: its top is {piece['length']:g} m deep: expected {radius * insets:.3g} m or more, "
-            "or a smaller radius"
+            f"{where}: edge_radius = {radius:g} m: expected a top of {radius * insets:.3g} m or more, which is "
+            f"{piece['length']:g} m, or a smaller radius"
         )
 
 
