@@ -90,10 +90,10 @@ def drawn_height(column: int, row: int, seed: int, share: float) -> float:
     """Return the height of a lattice point as a share of the highest, in whole numbers."""
 
     def permuted(k: int) -> int:
-        return (34 * k + 1) * k % 289
+        return k**3 % 1019
 
-    number = (permuted((column + seed % 289) % 289) + row + seed // 289) % 289
-    return max(permuted(permuted(number)) / 288 - (1 - share), 0.0) / share
+    in_column = permuted(permuted(column) + seed % 1019)
+    return max(permuted(permuted(in_column + permuted(row + seed // 1019)) + seed // 1019) / 1018 - (1 - share), 0.0) / share
 
 
 def bump_height(parameters: Parameters, x: Array, y: Array) -> Array:

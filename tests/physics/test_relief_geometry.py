@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ from wlr_gym.physics.plants import relief
 
 #: Floors at the largest curvature that is allowed, 0.25 over the radius.
 LARGEST = relief.LARGEST_CURVATURE / RADIUS
-BUMPS = {"bumps.spacing": 0.08, "bumps.height": 0.5 * LARGEST * 0.08**2, "bumps.seed": 1234.0}
+BUMPS = {"bumps.spacing": 0.08, "bumps.height": 0.4 * LARGEST * 0.08**2, "bumps.seed": 1234.0}
 STONES = {"bumps.spacing": 0.04, "bumps.height": 0.005, "bumps.share": 0.2, "bumps.seed": 77.0}
 CORRUGATED = {"wave.length": [0.3, 0.25], "wave.heading": 0.3, "wave.phase": [0.4, 1.1]}
 WAVES = CORRUGATED | {"wave.height": [0.6 * LARGEST / (2 * np.pi / 0.3) ** 2, 0.4 * LARGEST / (2 * np.pi / 0.25) ** 2]}
@@ -91,6 +92,18 @@ def test_an_edge_is_touched_where_the_densest_directions_say():
     depth = _on_piece(parameters, centre, axle).depth
     dense = [-piece_distance(parameters, k, 0, centre[k], axle[k]) for k in range(count)]
     assert np.abs(depth - dense).max() < 1e-7
+
+
+def test_a_wheel_along_a_kerb_does_not_touch_it_from_afar():
+    """The normal nears the axle, where the separation has a kink: at most 0.7 mm too deep, never too shallow."""
+    rng, count = np.random.default_rng(11), 300
+    parameters, axle = parameters_of(count, KERB), turns(rng, count, 0.37, 0.2) @ [1.0, 0.0, 0.0]
+    away = rng.uniform(0.0, 0.02, count)
+    centre = np.stack([-(HALF_WIDTH + ROUNDING + away), rng.uniform(-0.2, 0.2, count), np.full(count, RADIUS)], axis=1)
+    depth = _on_piece(parameters, centre, axle).depth
+    dense = np.array([-piece_distance(parameters, k, 0, centre[k], axle[k]) for k in range(count)])
+    assert np.abs(depth - dense).max() < 7e-4
+    assert (depth > dense - 1e-9).all()
 
 
 def test_an_edge_is_as_far_away_as_mujoco_says_of_a_cylinder_and_a_box():
@@ -246,6 +259,21 @@ def test_lattice_points_are_evenly_drawn_and_seeds_have_nothing_in_common():
     fields = [field.ravel() for field in drawn.values()]
     apart = np.corrcoef(fields) - np.eye(len(fields))
     assert np.abs(apart).max() < 0.1
+
+
+@pytest.mark.parametrize("other", [6, 5 + 1019, 5 + 1020])
+def test_no_seed_is_another_one_shifted(other):
+    first, second = (np.array([[drawn_height(c, r, seed, 1.0) for r in range(40)] for c in range(40)]) for seed in (5, other))
+    for shift in itertools.product(range(-3, 4), repeat=2):
+        shifted = np.roll(second, shift, (0, 1))[4:-4, 4:-4].ravel()
+        assert abs(np.corrcoef(first[4:-4, 4:-4].ravel(), shifted)[0, 1]) < 0.2
+
+
+def test_a_field_does_not_nearly_repeat():
+    field = np.array([[drawn_height(c, r, 1234, 1.0) for r in range(60)] for c in range(60)])
+    for shift in range(1, 40):
+        assert abs(np.corrcoef(field[shift:].ravel(), field[:-shift].ravel())[0, 1]) < 0.12
+        assert abs(np.corrcoef(field[:, shift:].ravel(), field[:, :-shift].ravel())[0, 1]) < 0.12
 
 
 def test_the_share_of_stones_is_what_was_asked_for():

@@ -153,7 +153,7 @@ def contacts_of(
     ]
 
 
-def remembered(lanes: Lanes, contacts: Sequence[Contact], names: Sequence[str]) -> Out:
+def remembered(lanes: Lanes, contacts: Sequence[Contact], names: Sequence[str], load: str) -> Out:
     """Return what two contacts of a wheel keep from the last step, and their places.
 
     The deeper contact is the first. Where the two have changed places, so does what they remember; a new place has nothing to
@@ -163,13 +163,14 @@ def remembered(lanes: Lanes, contacts: Sequence[Contact], names: Sequence[str]) 
         lanes: with those called ``names`` and ``place`` and the contact's number.
         contacts: of one wheel.
         names: of what is kept.
+        load: name of the contact's normal force; what carried none has nothing to remember at another place.
     """
     out: Out = {}
     if len(contacts) == 1:
         return out
     for own, other in (contacts, contacts[::-1]):
         stays = 0.5 - ops.absolute(own.place - lanes[f"place{own.number}"])
-        comes = 0.5 - ops.absolute(own.place - lanes[f"place{other.number}"])
+        comes = ops.minimum(0.5 - ops.absolute(own.place - lanes[f"place{other.number}"]), lanes[f"{load}{other.number}"])
         for name in names:
             moved = ops.where_positive(comes, lanes[f"{name}{other.number}"], 0.0)
             out[f"{name}{own.number}"] = ops.where_positive(stays, lanes[f"{name}{own.number}"], moved)

@@ -233,17 +233,18 @@ def _bumps(lanes: Lanes, x: Value, y: Value) -> tuple[Value, Value, Value]:
     first_column, first_row = ops.floor(column), ops.floor(row)
     weights_x, slopes_x = _quadratic(column - first_column)
     weights_y, slopes_y = _quadratic(row - first_row)
+    in_rows = [_permuted(_below_modulus(first_row + (float(k) + lanes["bump_seed_y"]))) for k in range(3)]
     total: Value = 0.0
     slope_x: Value = 0.0
     slope_y: Value = 0.0
     for j in range(3):
-        shuffled = _permuted(_below_modulus(first_column + (float(j) + lanes["bump_seed_x"])))
-        in_column = _permuted(_below_modulus(shuffled + lanes["bump_seed_y"]))
+        shuffled = _permuted(_below_modulus(first_column + float(j)))
+        in_column = _permuted(_below_modulus(shuffled + lanes["bump_seed_x"]))
         line: Value = 0.0
         line_slope: Value = 0.0
         for k in range(3):
-            number = _permuted(_below_modulus(in_column + (first_row + float(k))))
-            drawn = _permuted(_below_modulus(number + 7.0)) * (1.0 / (PERMUTED - 1))
+            number = _permuted(_below_modulus(in_column + in_rows[k]))
+            drawn = _permuted(_below_modulus(number + lanes["bump_seed_y"])) * (1.0 / (PERMUTED - 1))
             height = ops.maximum(drawn - lanes["bump_least"], 0.0)
             line = line + weights_y[k] * height
             line_slope = line_slope + slopes_y[k] * height
@@ -384,8 +385,9 @@ def _touch_of_edge(edge: _Edge, axle: Vector, profile: WheelProfile) -> Touch:
         inverse = 1.0 / ops.sqrt(u * u + v * v)
         u, v = _within(u * inverse, v * inverse, edge.steepest)
     facing = ops.where_positive(axle_u * cu + axle_v * cv, 1.0, -1.0)
-    facing = facing / ops.sqrt(axle_u * axle_u + axle_v * axle_v + 1e-18)
-    aside = _within(facing * axle_u, facing * axle_v, edge.steepest)
+    aside_u, aside_v = facing * axle_u + 1e-6 * u, facing * axle_v + 1e-6 * v  # an axle along the edge has no such direction
+    inverse = 1.0 / ops.sqrt(aside_u * aside_u + aside_v * aside_v + 1e-30)
+    aside = _within(aside_u * inverse, aside_v * inverse, edge.steepest)
     found: list[Touch] = []
     for out, up in ((u, v), aside):
         normal = [out * edge.across[0], out * edge.across[1], up]

@@ -87,7 +87,7 @@ def kick_setup(lanes: Lanes, time: Value, step: Value, features: frozenset[str])
             corner.leg_wheel * leg_rate + corner.wheel_wheel * wheel_rate - step * corner.wheel_bias,
         ]
         corner.contacts = contacts_of(lanes, i, rows, level, corner.trig, features)
-        kept = remembered(lanes, corner.contacts, _KEPT + (_KEPT_BY_TREAD if "brush" in features else ()))
+        kept = remembered(lanes, corner.contacts, _KEPT + (_KEPT_BY_TREAD if "brush" in features else ()), "normal")
         out |= {name: value for name, value in kept.items() if name.startswith(("place", "multiplier", "shear"))}
         lanes = ChainMap(kept, lanes)  # pyright: ignore[reportArgumentType]  # nothing writes to them
         for contact in corner.contacts:

@@ -154,7 +154,7 @@ def before(lanes: Lanes, time: Value, step: Value, features: frozenset[str] = FE
         _push_joint(lanes, j, voltages[j], joint, pushed, step, applied, out)
     for i in CORNERS:
         contacts = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
-        kept = remembered(lanes, contacts, ("own_force_x", "own_force_y", "shear_x", "shear_y"))
+        kept = remembered(lanes, contacts, ("own_force_x", "own_force_y", "shear_x", "shear_y"), "force_z")
         out |= {name: value for name, value in kept.items() if name.startswith("place")}
         lanes = over(kept, lanes)
         pushed = [_push_contact(lanes, contact, rows, step, applied, out) for contact in contacts]
