@@ -37,9 +37,8 @@ SUBSTEPS = PlantOptions().substeps
 PRECISIONS = ("float32", "float64")
 #: An overhead below 30 % of MuJoCo's own time.
 LEAST_RATIO = 1.0 / 1.3
-#: Live arrays that the plant writes before a MuJoCo step, and the state that the step reads.
-_INPUTS = ("applied", "armature", "gear_bound", "pair_friction", "pair_margin", "geom_size", "geom_pos", "geom_quat")
-_STATE = ("qpos", "qvel", "warmstart")
+#: Live arrays of the state that a MuJoCo step reads, and of what the plant writes before it, beside those of the contacts.
+_READ = ("qpos", "qvel", "warmstart", "applied", "armature", "gear_bound")
 START = (
     "import gymnasium, wlr_gym; env = gymnasium.make('{}'); env.reset(seed=0); env.step(env.action_space.sample()); env.close()"
 )
@@ -146,15 +145,16 @@ def _steps_alone(count: int, ticks: int) -> Contender:
     """Bare ``Batch.step`` on the plant's own model: a tick starts from a state of the plant's drive and keeps its forces."""
     plant, setpoints = MujocoPlant(load_robot(), count), random_setpoints(ticks, count)
     batch = plant._batch  # the peer is what the plant is made of
+    live: list[Array] = [*(getattr(batch, name) for name in _READ), *batch.per_contact]
     states: list[list[Array]] = []
     for row in setpoints:
         plant.step(row)
-        states.append([getattr(batch, name).copy() for name in (*_STATE, *_INPUTS)])
+        states.append([values.copy() for values in live])
 
     def drive() -> None:
         for state in states:
-            for name, value in zip((*_STATE, *_INPUTS), state, strict=True):
-                getattr(batch, name)[...] = value
+            for values, value in zip(live, state, strict=True):
+                values[...] = value
             for _ in range(SUBSTEPS):
                 batch.step()
 

@@ -66,7 +66,7 @@ def test_the_task_may_name_it():
         ({"floor": "stair"}, r"unknown floor config 'stair' \(did you mean 'stairs'\?\)"),
         ({"floor": 3}, "floor = 3: expected a name, a path, a mapping or a Floor"),
         ({"floor": {"pieces": [{"kind": "kerb", "at": [0.1, 0.0], "height": 0.02}]}}, "piece 1: it lies from 0.1 to"),
-        ({"floor": {"base": {"kind": "bumps", "height": 0.1, "spacing": 0.1}}}, "curvature reaches 20 1/m"),
+        ({"floor": {"base": {"kind": "bumps", "height": 0.1, "spacing": 0.1}}}, "curvature reaches 25 1/m"),
         ({"floor": "kerbs", "backend": "dynamixel", "hardware": {"emulated": True}}, "a real robot is what it is"),
         (
             {"floor": {"friction": {"mu": 0.4}}, "randomization": "nominal"},

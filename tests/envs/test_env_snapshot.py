@@ -144,7 +144,7 @@ def walk(found: Any, place: str, seen: set[int]) -> Iterator[tuple[str, Any]]:
 #: What a step writes before it reads it, or an address.
 SCRATCH = (
     ".plant._table", ".plant._generalised", ".plant._force_inputs", ".plant._batch.contact", ".plant._batch.constraint",
-    ".observer._work",
+    ".plant._batch.per_contact", ".plant._batch._size", ".plant._batch._pos", ".plant._batch._quat", ".observer._work",
 )  # fmt: skip
 
 

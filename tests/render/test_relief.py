@@ -187,7 +187,7 @@ def test_the_camera_goes_up_with_the_floor(new_scene, robot):
 
 def test_legend_says_how_high_the_floor_is(robot, parameters):
     assert not any("mm" in line for line in legend(parameters, PLAIN))
-    assert "bumps up to 20 mm" in legend(on(robot, "rough"), PLAIN)
+    assert "bumps up to 18 mm" in legend(on(robot, "rough"), PLAIN)
     both = legend(parameters, View(forces=True, loads=True))
     assert "friction (green), load (light green): 0.1 m = 4 N" in both
     assert "waves ±20 mm, pieces up to 50 mm" in legend(on(robot, KERB | WAVES), PLAIN)
