@@ -170,7 +170,7 @@ def _patch(number: int, mu: float, x: tuple[float, float]) -> dict[str, float]:
 
 
 def _drawn(views: list[View], parameters: dict[str, float], asked: dict[str, float], steps: int) -> list[Picture]:
-    """Return pictures of a robot at 0.1 m/s after so many steps."""
+    """Return pictures of a robot at 0.1 m/s after some steps."""
     from wlr_gym.render import Scene
 
     core, policy = make_player("WLR-Velocity-v0", "pid", 1, {"randomization": "none"})

@@ -57,11 +57,11 @@ def throw(robot: Robot, parameters: Parameters, rng: np.random.Generator) -> Pla
 def fuzz(
     floor: str, substeps: int, seed: int = 0, backend: str = "gibbs_appell", precision: str = "float64", threads: int = 1
 ) -> Fuzzed:
-    """Throw robots on to a floor, drive them by random setpoints, and again, for so many substeps of robots in all.
+    """Throw robots on to a floor, drive them by random setpoints, and again, for a number of substeps of all robots together.
 
     Args:
         floor: name or path.
-        substeps: at least so many.
+        substeps: of all robots together, at least.
         seed: of everything that is drawn.
         backend, precision, threads: of the simulator.
     """

@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 
 FLOORS = ("rough", "gravel", "kerbs", "ramps", "stairs")
 ROBOTS = 512
-#: A step on relief takes at most so many times as long as one on a level floor.
+#: Largest time of a step on relief over that of one on a level floor.
 MOST = 2.2
-#: The engine on kerbs is at least so many times as fast as MuJoCo, which has them as boxes.
+#: Least speed of the engine on kerbs over that of MuJoCo, which has them as boxes.
 LEAST = 30.0
 #: Kerbs of both: foot, height and length of their tops, m.
 KERBS = ((0.6, 0.01, 0.3), (1.5, 0.015, 0.4), (2.4, 0.02, 1.0))
