@@ -425,8 +425,8 @@ def touches(lanes: Lanes, i: int, centre: Vector, axle: Vector, features: frozen
 
 def _rounded(touch: Touch) -> Touch:
     """Round a touch as if it were chosen among several, so that bits do not depend on what the robots beside stand on."""
-    vectors = ([ops.rounded(x) for x in vector] for vector in (touch.normal, touch.reach))
-    return Touch(ops.rounded(touch.depth), *vectors, touch.place)
+    normal, reach = ([ops.rounded(x) for x in vector] for vector in (touch.normal, touch.reach))
+    return Touch(ops.rounded(touch.depth), normal, reach, touch.place)
 
 
 def _deeper(a: Touch, b: Touch) -> Touch:
