@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.physics.model.dynamics import rotation_matrix
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import PlantOptions, standing_state
+from wlr_gym.physics.plants.base import PlantOptions, settle, standing_state
 from wlr_gym.physics.plants.simulator import Simulator
-from wlr_gym.physics.plants.standing import settle
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, spec_of
 from wlr_gym.robot.parameters import Parameters

@@ -7,9 +7,8 @@ from standing import PLAIN, truth_of
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants import PlantOptions, make_plant
-from wlr_gym.physics.plants.base import PlantState, standing_state
+from wlr_gym.physics.plants.base import PlantState, settle, standing_state
 from wlr_gym.physics.plants.contacts import contacts_of_plant
-from wlr_gym.physics.plants.standing import settle
 from wlr_gym.render import stage as marks
 from wlr_gym.render.scene import floor_portrait, legend
 from wlr_gym.render.stage import Stage

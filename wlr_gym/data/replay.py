@@ -29,9 +29,8 @@ from wlr_gym.data.sensors import channel_noise, channels, sensed_columns
 from wlr_gym.physics.effects import Patch, Source, apply_patch, load_patch
 from wlr_gym.physics.floor import FloorSource, lay_floor
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth
+from wlr_gym.physics.plants.base import Plant, PlantOptions, PlantState, Sensors, Truth, settle
 from wlr_gym.physics.plants.sensors import rotation
-from wlr_gym.physics.plants.standing import settle
 from wlr_gym.robot import LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
 

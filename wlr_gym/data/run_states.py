@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.runs import Run
-from wlr_gym.physics.plants.base import PlantState, standing_state
+from wlr_gym.physics.plants.base import PlantState, settle, standing_state
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
-from wlr_gym.physics.plants.standing import settle
 from wlr_gym.physics.servo import reference_per_effort, reference_per_rate
 from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters

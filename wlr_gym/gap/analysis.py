@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def finite(value: Any) -> Any:
-    """JSON has no NaN: a number that is none becomes null."""
+    """JSON has no NaN: it is written as null."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -27,8 +27,7 @@ from PIL import Image, ImageDraw, ImageFont
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.physics.floor import Floor
-from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, standing_state
-from wlr_gym.physics.plants.standing import settle
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, settle, standing_state
 from wlr_gym.render import stage as marks
 from wlr_gym.render.stage import Area, ContactsOf, Mark, Stage, Trail
 from wlr_gym.render.view import (

@@ -260,7 +260,7 @@ def squares_picture() -> NDArray[np.uint8]:
 
 
 def _add_meshes(spec: mujoco.MjSpec, room: int) -> None:
-    """Add meshes whose numbers :func:`_fill_meshes` replaces; the first has room for grids of so many lines each way."""
+    """Add meshes whose numbers :func:`_fill_meshes` replaces; the first has room for a grid of ``room`` lines a side."""
     for name in MESHES:
         lines = np.arange(float(room if name == MESHES[0] else 2))
         grid = np.stack(np.meshgrid(lines, lines, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)

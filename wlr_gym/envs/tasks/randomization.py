@@ -21,9 +21,7 @@ from wlr_gym.base.random import stream_numbers, uniforms
 from wlr_gym.base.settings import Layer, SettingsModel, layers_of, overlay, parse_config, read_config
 from wlr_gym.envs.tasks.entries import DISTRIBUTION_KEYS, Entry, EventConfig, Sampler, elements_of, entries_of
 from wlr_gym.envs.tasks.identified import identified_events
-from wlr_gym.physics.plants import relief
-from wlr_gym.physics.plants.base import PlantState, standing_state
-from wlr_gym.physics.plants.standing import settle
+from wlr_gym.physics.plants.base import PlantState, settle, standing_state
 from wlr_gym.robot import LEG_SLICE, LEGS, Robot
 from wlr_gym.robot.parameter_table import ELEMENTS, XYZ
 from wlr_gym.robot.parameters import HIGH, LOW, Parameters
@@ -295,8 +293,7 @@ class Randomization:
         state.joint_position[:, LEG_SLICE] = state.reference_position[:, LEG_SLICE] = angles
         state.quaternion[:, 0], state.quaternion[:, 3] = np.cos(0.5 * offsets[:, 4]), np.sin(0.5 * offsets[:, 4])
         state.linear_velocity_in_body[:], state.angular_velocity_in_body[:] = offsets[:, 5:8], offsets[:, 8:11]
-        if relief.families(parameters):
-            settle(self.robot, parameters, state)
+        settle(self.robot, parameters, state)
         return state
 
 

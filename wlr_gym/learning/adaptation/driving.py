@@ -41,8 +41,7 @@ from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.effects import Patch, apply_patch
 from wlr_gym.physics.floor import Floor, floor_noted, lay_floor, load_floor
 from wlr_gym.physics.plants import make_plant
-from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantOptions, RobotOptions, standing_state
-from wlr_gym.physics.plants.standing import settle
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantOptions, RobotOptions, settle, standing_state
 from wlr_gym.policy import environment_for, make_policy
 from wlr_gym.robot import Robot, robot_hash
 from wlr_gym.robot.parameters import Parameters

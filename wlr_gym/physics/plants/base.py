@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import LARGEST_NOISE_SEED, InputError, require_seed, unknown_name
 from wlr_gym.base.snapshot import Snapshot
 from wlr_gym.physics.plants import relief
-from wlr_gym.physics.plants.standing import settle
+from wlr_gym.physics.plants.standing import settle_on_relief
 from wlr_gym.robot import JOINTS, LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameter_table import XYZ
 from wlr_gym.robot.parameters import Parameters
@@ -293,9 +293,17 @@ def standing_state(robot: Robot, parameters: Parameters, leg_angle: float | None
     state = PlantState(
         position, quaternion, zeros, zeros.copy(), joints, np.zeros((count, 8)), joints.copy(), np.zeros((count, 8))
     )
-    if relief.families(parameters):
-        settle(robot, parameters, state)
+    settle(robot, parameters, state)
     return state
+
+
+def settle(robot: Robot, parameters: Parameters, state: PlantState) -> None:
+    """Put standing robots (N) on their wheels where the floor is not flat: height, pitch and roll; place and heading stay.
+
+    ``state`` is changed in place; on a plane it stays as it is.
+    """
+    if features := relief.families(parameters):
+        settle_on_relief(robot, parameters, state, frozenset(features))
 
 
 @dataclass(frozen=True)

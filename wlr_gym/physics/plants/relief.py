@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 REFINEMENTS = 2
 #: Newton's steps over the angle of the normal on a piece's edge.
 EDGE_STEPS = 3
-#: Crown of the tread: about so many radians wide is the flip of the contact from one edge to the other (see :func:`support`).
+#: Crown of the tread, about the angle (rad) over which the contact moves from one of its edges to the other (see
+#: :func:`support`).
 CROWN = 0.05
 #: Where pieces are that are not there: far below (m).
 NOWHERE = -10.0

@@ -35,17 +35,15 @@ _GIVEN = (
 _LANES = (*_POSE, *_ATTITUDE, *_GIVEN, *relief.RELIEF_LANES)
 
 
-def settle(robot: Robot, parameters: Parameters, state: Any) -> None:
-    """Put standing robots on their wheels where the floor is not flat: height, pitch and roll; place and heading stay.
+def settle_on_relief(robot: Robot, parameters: Parameters, state: Any, features: frozenset[str]) -> None:
+    """Put standing robots on their wheels: height, pitch and roll; place and heading stay.
 
     Args:
         robot: theirs.
         parameters: (N).
         state: (N) :class:`wlr_gym.physics.plants.base.PlantState`, changed in place.
+        features: families of relief that the robots stand on.
     """
-    features = frozenset(relief.families(parameters))
-    if not features:
-        return
     lanes = relief.pack(parameters, robot) | _given(parameters, state)
     w, _, _, z = state.quaternion.T
     height = relief.floor_height(lanes, state.position[:, 0], state.position[:, 1], features)
