@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rig import ROBOT
 
+from wlr_gym.physics import maps
 from wlr_gym.physics.plants import relief
 from wlr_gym.robot.parameters import Parameters
 
@@ -112,6 +113,27 @@ def _bell(t: Array) -> Array:
     """The convolution of three unit boxes."""
     t = np.abs(t)
     return np.where(t < 0.5, 0.75 - t**2, np.where(t < 1.5, 0.5 * (1.5 - t) ** 2, 0.0))
+
+
+def enter_grid(heights: Array) -> int:
+    """Make a grid known whose surface goes through heights (rows, columns; the first row with the smallest y)."""
+    return maps.enter_heights(maps.map_text(heights[::-1]))
+
+
+def grid_height(parameters: Parameters, x: Array, y: Array) -> Array:
+    """Return the height of the grid of row 0, m: a sum of bells on the middles of cells, the outermost ones repeated."""
+    number, scale, cell, at_x, at_y, turn = (
+        float(parameters[f"grid.{name}"][0]) for name in ("number", "scale", "cell", "x", "y", "heading")
+    )
+    weights = relief.map_of(number)
+    rows, columns = weights.shape
+    along, across = np.cos(turn) * (x - at_x) + np.sin(turn) * (y - at_y), np.cos(turn) * (y - at_y) - np.sin(turn) * (x - at_x)
+    column, row = along / cell + (columns - 1) / 2, across / cell + (rows - 1) / 2
+    total = np.zeros_like(x)
+    for j in range(int(np.floor(column.min())) - 1, int(np.ceil(column.max())) + 2):
+        for k in range(int(np.floor(row.min())) - 1, int(np.ceil(row.max())) + 2):
+            total += weights[np.clip(k, 0, rows - 1), np.clip(j, 0, columns - 1)] * _bell(column - j) * _bell(row - k)
+    return scale * total
 
 
 def piece_distance(

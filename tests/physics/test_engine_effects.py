@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from energy import audit, stored
 from rig import (
+    BACKENDS,
     HOME,
     LEGS_DOWN,
     MASS,
@@ -26,6 +27,7 @@ from rig import (
     wheels_off,
 )
 
+from wlr_gym.physics import maps
 from wlr_gym.physics.plants.base import PlantOptions, Truth
 from wlr_gym.physics.plants.forces import make_force
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
@@ -317,6 +319,30 @@ def test_patch_acts_under_each_wheel_from_its_edge_on():
         inside.append((x[0] > edge).sum())
     assert {0, 2, 4} <= set(inside)  # front wheels enter first
     assert inside[0] == 0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_map_of_friction_acts_under_each_wheel_cell_by_cell(backend):
+    """Under patches; beyond the map the floor has its own friction."""
+    across, cell = np.array([0.2, 0.7, 0.4, 0.3]), 0.15
+    on_map = {"friction_map.number": maps.enter_map(np.tile(across, (3, 1)) / 2.0), "friction_map.cell": cell}
+    on_map |= {"friction_map.x": 0.2, "friction_map.scale": 2.0}
+    plant = make_plant(
+        2, [lock, floor(0.6), on_map, patch(0, 0.1, (0.45, 0.48))], thrown(2.0), period=1e-3, step=2.5e-4, backend=backend
+    )
+    seen = set()
+    for values in record(plant, 0.4):
+        truth = Truth(values)
+        x = truth.position[:, :1] + ROBOT.hip_position.x * np.array([1.0, 1.0, -1.0, -1.0])
+        column = np.floor((x - 0.2) / cell).astype(int) + 2
+        expected = np.where((column < 0) | (column > 3), 0.6, across[np.clip(column, 0, 3)])
+        expected = np.where((x > 0.45) & (x < 0.48), 0.1, expected)
+        edges = np.append(0.2 + cell * np.arange(-2, 3), [0.45, 0.48])
+        clear = (np.abs(x[..., None] - edges) > 4e-3).all(axis=-1)
+        np.testing.assert_allclose(np.where(clear, truth.effective_friction[:, ::2], expected), expected, rtol=1e-12)
+        np.testing.assert_allclose(np.where(clear, friction_used(truth), expected), expected, rtol=5e-3)
+        seen |= set(expected[clear].tolist())
+    assert seen == {0.6, 0.1, *across}
 
 
 def test_sliding_slows_by_what_the_floor_under_it_gives():

@@ -2,15 +2,19 @@
 
 import math
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from matplotlib.image import imsave
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.paths import config_names
-from wlr_gym.physics.floor import SEEDS, Floor, floor_noted, lay_floor, load_floor
+from wlr_gym.physics import maps
+from wlr_gym.physics.floor import SEEDS, Floor, Grid, floor_noted, lay_floor, load_floor
+from wlr_gym.physics.plants import relief
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameter_table import ELEMENTS
 from wlr_gym.robot.parameters import Parameters
@@ -115,6 +119,115 @@ def test_friction_is_written():
     }
 
 
+# ---- maps ------------------------------------------------------------------------------------------------------------
+
+HILLS = np.round(np.random.default_rng(0).uniform(-0.005, 0.005, (12, 9)), 6)
+
+
+def _save(folder: Path, kind: str) -> Path:
+    """Save heights, a picture of them as shares of 10 mm, black for the lowest."""
+    path = folder / f"hills.{kind}"
+    if kind == "npy":
+        np.save(path, HILLS)
+    elif kind == "csv":
+        np.savetxt(path, HILLS, delimiter=",")
+    else:
+        imsave(path, (HILLS + 0.005) / 0.01, cmap="gray", vmin=0.0, vmax=1.0)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npy", "csv", "png"])
+def test_a_grid_is_read_from_a_file_beside_the_floors_own_and_kept(tmp_path, kind):
+    _save(tmp_path, kind)
+    content = {"base": {"kind": "grid", "file": f"hills.{kind}", "cell": 0.1, "scale": 0.01 if kind == "png" else 1.0}}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
+    floor = load_floor(tmp_path / "mine.yaml", ROBOT)
+    (tmp_path / f"hills.{kind}").unlink()
+    again = load_floor(yaml.safe_load(yaml.safe_dump(floor.content())), ROBOT)
+    assert again == floor
+    parameters = laid(again, 0)
+    x, y = np.meshgrid(0.1 * (np.arange(9) - 4.0), 0.1 * (5.5 - np.arange(12)))  # the first row has the largest y
+    height, *_ = relief.base_height(relief.pack(parameters, ROBOT), x, y, frozenset({"grid"}))
+    expected = HILLS + 0.005 if kind == "png" else HILLS
+    assert np.abs(height - expected).max() < (6e-5 if kind == "png" else 2e-6)
+
+
+def test_random_heights_follow_from_their_seed():
+    def base(seed: int) -> dict[str, Any]:
+        return {"kind": "grid", "cell": 0.05, "random": {"seed": seed, "height": 0.004, "length": 0.4, "size": [4.0, 3.0]}}
+
+    floors = [load_floor({"base": base(seed)}, ROBOT) for seed in (0, 0, 1)]
+    first, same, other = (relief.map_of(laid(floor, 0)["grid.number"][0]) for floor in floors)
+    assert np.array_equal(first, same)
+    assert not np.array_equal(first, other)
+    assert first.shape == (60, 80)
+    grid = floors[0].base
+    assert isinstance(grid, Grid)
+    assert float(maps.map_values(grid.text()).std()) == pytest.approx(0.004, rel=1e-3)
+    assert "data" not in floors[0].content()["base"]
+
+
+def test_the_place_of_a_grid_is_drawn():
+    base = {"kind": "grid", "cell": 0.05, "random": {"height": 0.004, "length": 0.4}}
+    floor = load_floor({"base": base, "randomise": {"base.at.0": [-2.0, 2.0], "base.scale": [0.5, 1.0]}}, ROBOT)
+    parameters = laid(floor, 1, 2)
+    assert np.ptp(parameters["grid.number"]) == 0.0
+    assert np.ptp(parameters["grid.x"]) > 0.0
+    np.testing.assert_array_equal(parameters.values[1], lay_floor(floor.drawn(2), NOMINAL).values[0])
+
+
+def test_a_map_of_friction_is_written(tmp_path):
+    np.savetxt(tmp_path / "mu.csv", [[0.2, 0.4], [0.6, 0.8]], delimiter=",")
+    content = {"file": str(tmp_path / "mu.csv"), "cell": 0.5, "at": [1.0, 0.5], "heading": 0.1}
+    floor = load_floor({"friction": {"map": content}}, ROBOT)
+    parameters = laid(floor, 0)
+    assert np.allclose(relief.map_of(parameters["friction_map.number"][0]), [[0.6, 0.8], [0.2, 0.4]])
+    assert [parameters[f"friction_map.{name}"][0] for name in ("cell", "x", "y", "heading", "scale")] == [0.5, 1.0, 0.5, 0.1, 1]
+    assert set(floor.elements().values()) == {"friction.map"}
+    assert not floor.is_flat
+
+
+def test_a_map_that_no_floor_brought_is_told():
+    with pytest.raises(InputError, match="map 12345: is not known here: expected a floor that holds it"):
+        relief.map_of(12345.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (np.zeros(3), r"has shape \(3,\): expected rows and columns"),
+        (np.zeros((300, 300)), "has 300 x 300 cells: expected at most 65536"),
+        ([[0.0, np.nan]], "holds nan: expected finite numbers"),
+        (np.eye(9), "its curvature reaches .*: expected at most 0.25 over 0.034 m"),
+    ],
+)
+def test_grids_that_cannot_be(tmp_path, values, words):
+    np.save(tmp_path / "map.npy", values)
+    with pytest.raises(InputError, match=words):
+        load_floor({"base": {"kind": "grid", "file": str(tmp_path / "map.npy"), "cell": 0.05}}, ROBOT)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"file": "nowhere.npy"}, "nowhere.npy: there is no such file"),
+        ({"file": "map.nyp"}, r"'.nyp' is no kind of map \(did you mean '.npy'\?\)"),
+        ({}, "has neither 'file' nor 'data': expected the file of a map"),
+        ({"data": "3x3_nonsense"}, "data = '3x3_nonsense'...: is no map"),
+        ({"random": {"height": 0.01, "length": 0.5, "size": [90.0, 90.0]}}, "1800 x 1800 cells of 0.05 m: expected at most"),
+    ],
+)
+def test_grids_that_say_nothing_sensible(content, words):
+    with pytest.raises(InputError, match=words):
+        load_floor({"base": {"kind": "grid", "cell": 0.05, **content}})
+
+
+def test_friction_that_cannot_be(tmp_path):
+    np.save(tmp_path / "mu.npy", [[0.2, 6.0]])
+    with pytest.raises(InputError, match=r"friction.map: its friction is 0.2 to 6: expected \[0, 5\]"):
+        load_floor({"friction": {"map": {"file": str(tmp_path / "mu.npy"), "cell": 0.5}}}, ROBOT)
+
+
 # ---- draws -----------------------------------------------------------------------------------------------------------
 
 
@@ -193,6 +306,13 @@ def test_what_the_file_leaves_out_can_be_drawn():
                 "randomise": {"pieces.0.count": [1, 3]},
             },
             "randomise: 'pieces.0.count': how many steps there are cannot be drawn",
+        ),
+        (
+            {
+                "base": {"kind": "grid", "cell": 0.1, "random": {"height": 0.01, "length": 0.5}},
+                "randomise": {"base.random.seed": "each_episode"},
+            },
+            "randomise: 'base.random.seed': heights cannot be drawn; expected base.at.0",
         ),
     ],
 )

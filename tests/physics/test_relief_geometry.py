@@ -15,6 +15,8 @@ from relief_rig import (
     bump_height,
     columns,
     drawn_height,
+    enter_grid,
+    grid_height,
     parameters_of,
     piece_distance,
     reach,
@@ -25,6 +27,7 @@ from relief_rig import (
 )
 from rig import RADIUS, ROBOT
 
+from wlr_gym.physics import maps
 from wlr_gym.physics.plants import relief
 
 #: Floors at the largest curvature that is allowed, 0.25 over the radius.
@@ -33,7 +36,15 @@ BUMPS = {"bumps.spacing": 0.08, "bumps.height": 0.4 * LARGEST * 0.08**2, "bumps.
 STONES = {"bumps.spacing": 0.04, "bumps.height": 0.005, "bumps.share": 0.2, "bumps.seed": 77.0}
 CORRUGATED = {"wave.length": [0.3, 0.25], "wave.heading": 0.3, "wave.phase": [0.4, 1.1]}
 WAVES = CORRUGATED | {"wave.height": [0.6 * LARGEST / (2 * np.pi / 0.3) ** 2, 0.4 * LARGEST / (2 * np.pi / 0.25) ** 2]}
-HEIGHTS = {"waves": (WAVES, wave_height), "bumps": (BUMPS, bump_height), "stones": (STONES, bump_height)}
+#: Heights at random, as sharp as they may be: 80 x 60 cells, turned and moved.
+RANDOM = enter_grid(np.random.default_rng(8).uniform(0.0, 0.01, (60, 80)))
+GRID = {
+    "grid.number": RANDOM, "grid.cell": 0.06, "grid.x": 0.3, "grid.y": -0.2, "grid.heading": 0.7,
+    "grid.scale": LARGEST * 0.06**2 / maps.sharpest(RANDOM),
+}  # fmt: skip
+HEIGHTS = {
+    "waves": (WAVES, wave_height), "bumps": (BUMPS, bump_height), "stones": (STONES, bump_height), "grid": (GRID, grid_height),
+}  # fmt: skip
 KERB = {"piece.x[piece_1]": 0.0, "piece.height[piece_1]": 0.03, "piece.edge_radius[piece_1]": 0.003}
 
 
@@ -189,7 +200,9 @@ def test_a_wheel_far_inside_a_kerb_is_pushed_out_of_its_top():
     assert columns(found.normal, 3) == pytest.approx(np.array([[0, 0, 1], [0, 0, 1], [-1, 0, 0]]), abs=1e-9)
 
 
-@pytest.mark.parametrize(("floor", "degrees"), [(WAVES, 0.5), (BUMPS, 0.5), (KERB, 0.01)], ids=["waves", "bumps", "kerb"])
+@pytest.mark.parametrize(
+    ("floor", "degrees"), [(WAVES, 0.5), (BUMPS, 0.5), (GRID, 0.5), (KERB, 0.01)], ids=["waves", "bumps", "grid", "kerb"]
+)
 def test_depth_grows_along_the_normal(floor, degrees):
     """A wheel's contact is a potential's force: the normal is the slope of the depth."""
     count, small, rng = 200, 1e-6, np.random.default_rng(4)
@@ -217,8 +230,9 @@ def test_depth_grows_along_the_normal(floor, degrees):
 
 
 def _heights(values, x, y, dtype: Any = np.float64):
-    lanes = {name: value.astype(dtype) for name, value in relief.pack(parameters_of(1, values), ROBOT).items()}
-    return relief.base_height(lanes, x.astype(dtype), y.astype(dtype), frozenset({"relief", "bumps"}))
+    parameters = parameters_of(1, values)
+    lanes = {name: value.astype(dtype) for name, value in relief.pack(parameters, ROBOT).items()}
+    return relief.base_height(lanes, x.astype(dtype), y.astype(dtype), frozenset(relief.families(parameters)))
 
 
 def test_bumps_are_bells_on_the_points_of_a_lattice():
@@ -237,12 +251,13 @@ def test_single_precision_draws_the_same_bumps():
     assert np.abs(height - single).max() < 1e-6
 
 
-def test_slopes_of_bumps_are_those_of_their_height():
+@pytest.mark.parametrize("floor", [BUMPS, GRID], ids=["bumps", "grid"])
+def test_slopes_are_those_of_the_height(floor):
     rng, small = np.random.default_rng(7), 1e-6
     x, y = rng.uniform(-3.0, 3.0, (2, 500))
-    _, slope_x, slope_y = _heights(BUMPS, x, y)
+    _, slope_x, slope_y = _heights(floor, x, y)
     for slope, dx, dy in ((slope_x, small, 0.0), (slope_y, 0.0, small)):
-        rise = (_heights(BUMPS, x + dx, y + dy)[0] - _heights(BUMPS, x - dx, y - dy)[0]) / (2 * small)
+        rise = (_heights(floor, x + dx, y + dy)[0] - _heights(floor, x - dx, y - dy)[0]) / (2 * small)
         assert np.abs(rise - slope).max() < 1e-7
 
 
@@ -279,3 +294,60 @@ def test_a_field_does_not_nearly_repeat():
 def test_the_share_of_stones_is_what_was_asked_for():
     raised = [drawn_height(c, r, 77, 0.2) > 0 for c in range(100) for r in range(100)]
     assert np.mean(raised) == pytest.approx(0.2, abs=0.01)
+
+
+# ---- grids -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_grid_goes_through_its_heights_and_on_level():
+    heights = np.random.default_rng(9).uniform(-0.01, 0.02, (5, 7))
+    values = {"grid.number": enter_grid(heights), "grid.cell": 0.1}
+    x, y = np.meshgrid(0.1 * (np.arange(7) - 3.0), 0.1 * (np.arange(5) - 2.0))
+    assert np.abs(_heights(values, x, y)[0] - heights).max() < 1e-6  # to which they are kept
+    turned = values | {"grid.heading": np.pi / 2, "grid.x": 1.0, "grid.scale": 2.0}  # a quarter turn: along y
+    assert np.abs(_heights(turned, 1.0 - y, x)[0] - 2.0 * heights).max() < 2e-6
+    beyond, *slopes = _heights(values, np.array([0.4, 5.0]), np.array([0.3, 4.0]))
+    assert np.ptp(beyond) == 0.0
+    assert not np.any(slopes)
+
+
+def test_a_wheel_on_a_level_grid_is_as_deep_everywhere():
+    """To the last bit that a height of 0.3 m has."""
+    count, rng = 400, np.random.default_rng(10)
+    parameters = parameters_of(count, {"grid.number": enter_grid(np.full((40, 40), 0.3)), "grid.cell": 0.05})
+    centre = np.append(rng.uniform(-1.2, 1.2, (count, 2)), np.full((count, 1), RADIUS + 0.3 - 1e-3), axis=1)
+    found = touches(parameters, centre, np.tile([0.0, 1.0, 0.0], (count, 1)))[0]
+    assert np.abs(found.depth - 1e-3).max() < 1e-15
+    assert (columns(found.normal, count) == [0.0, 0.0, 1.0]).all()
+
+
+def test_a_grid_of_a_wave_is_that_wave():
+    """0.5 m long, its cells 25 mm wide: height within 8 um of 10 mm, slope within 3e-3 of 0.13; contacts with it."""
+    wave = {"wave.height": [0.01, 0.0], "wave.length": 0.5, "wave.heading": 0.3}
+    side = 0.025 * (np.arange(120) - 59.5)
+    x, y = (np.asarray(grid, np.float64) for grid in np.meshgrid(side, side))
+    sampled = {"grid.number": enter_grid(wave_height(parameters_of(1, wave), x, y)), "grid.cell": 0.025}
+    count, rng = 300, np.random.default_rng(12)
+    centre = np.append(rng.uniform(-1.2, 1.2, (count, 2)), np.full((count, 1), RADIUS), axis=1)
+    axle = turns(rng, count, np.pi, 0.2)[:, :, 1]
+    of_wave, of_grid = (touches(parameters_of(count, floor), centre, axle)[0] for floor in (wave, sampled))
+    assert np.abs(of_wave.depth - of_grid.depth).max() < 8e-6
+    assert np.abs(columns(of_wave.normal, count) - columns(of_grid.normal, count)).max() < 3e-3
+
+
+def test_the_sharpest_place_of_a_grid_is_found():
+    """A dense search finds none sharper, and nearly as sharp ones."""
+    side, small = np.linspace(-0.35, 0.35, 281), 1e-4
+    weights = np.random.default_rng(13).uniform(0.0, 0.01, (6, 6))
+    values = {"grid.number": maps.enter_map(weights), "grid.cell": 0.1}
+    x, y = (grid.ravel() for grid in np.meshgrid(side, side))
+
+    def bend(dx, dy):
+        return [
+            (_heights(values, x + dx, y + dy)[k] - _heights(values, x - dx, y - dy)[k]) / (2 * small) for k in (1, 2)
+        ]  # fmt: skip
+
+    (xx, xy), (_, yy) = bend(small, 0.0), bend(0.0, small)
+    dense = (0.5 * np.abs(xx + yy) + np.hypot(0.5 * (xx - yy), xy)).max()
+    sharpest = maps.sharpest(maps.enter_map(weights)) / 0.1**2
+    assert 0.97 * sharpest < dense < 1.001 * sharpest

@@ -6,6 +6,7 @@ from standing import PLAIN, truth_of
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.floor import load_floor
+from wlr_gym.physics.maps import map_text
 from wlr_gym.physics.plants import PlantOptions, make_plant
 from wlr_gym.physics.plants.base import PlantState, settle, standing_state
 from wlr_gym.physics.plants.contacts import contacts_of_plant
@@ -20,6 +21,9 @@ RAMP = {"pieces": [{"kind": "ramp", "at": [0.6, 0.0], "slope": 0.2, "height": 0.
 #: On its foot stand the front wheels, on the plane the rear ones.
 BEFORE_RAMP = 0.5
 KERB = {"pieces": [{"kind": "kerb", "at": [0.4, 0.0], "height": 0.05}]}
+HILLS = {"base": {"kind": "grid", "cell": 0.2, "heading": 0.5, "random": {"height": 0.02, "length": 0.8, "size": [6.0, 6.0]}}}
+#: Ice near on the left, rubber on the rest of the map.
+CHECKED = {"friction": {"map": {"data": map_text(np.array([[0.1, 0.9], [0.9, 0.9]])), "cell": 0.25, "at": [0.4, 0.0]}}}
 WAVES = {"base": {"kind": "waves", "waves": [{"height": 0.02, "length": 0.8}]}}
 PATCH = {"friction": {"patches": [{"mu": 0.1, "x": [0.3, 0.7], "y": [-0.4, 0.1]}]}}
 
@@ -56,7 +60,7 @@ def corners(surface, faces):
 # ---- triangles ----
 
 
-@pytest.mark.parametrize("floor", ["rough", "gravel", "kerbs", "ramps", "stairs", WAVES, KERB | PATCH | WAVES])
+@pytest.mark.parametrize("floor", ["rough", "gravel", "kerbs", "ramps", "stairs", WAVES, HILLS | CHECKED, KERB | PATCH | WAVES])
 def test_from_above_the_triangles_are_the_floor_that_wheels_touch(robot, floor):
     relief = Relief(robot, on(robot, floor))
     found = relief.surface(np.zeros(2), [((0.3, -0.4), (0.7, 0.1))])
@@ -174,6 +178,20 @@ def test_friction_colours_the_top_of_a_kerb(new_scene, robot):
         assert (blue > red + 60) == is_ice
 
 
+@pytest.mark.parametrize("floor", [{}, HILLS])
+def test_a_map_of_friction_is_seen_as_colours(new_scene, robot, floor):
+    """Also where the floor is flat: ice is blue, and nothing is where friction is not shown."""
+    parameters = on(robot, floor | CHECKED)
+    for shown in (True, False):
+        scene = new_scene(View(size=(640, 480), camera="top", text=False, friction=shown))
+        picture = scene.draw(truth_of(parameters, position=[[0.0, 0.0, -5.0]]), parameters)
+        for place, is_ice in (((0.28, 0.12), True), ((0.28, -0.12), False), ((0.5, 0.12), False), ((0.05, 0.12), False)):
+            column, row = np.rint(scene.pixels([*place, 0.0])).astype(int)
+            red, _, blue = picture[row, column].astype(int)
+            assert (blue > red + 60) == (is_ice and shown)
+    assert "mapped 0.10 to 0.90" in legend(parameters, PLAIN)[0]
+
+
 def test_the_camera_goes_up_with_the_floor(new_scene, robot):
     scene = new_scene(View(size=(320, 240), camera="side", text=False))
     high = on(robot, {"pieces": [{"kind": "kerb", "at": [0.4, 0.0], "height": 0.3}]})
@@ -189,6 +207,7 @@ def test_legend_says_how_high_the_floor_is(robot, parameters):
     assert "bumps up to 18 mm" in legend(on(robot, "rough"), PLAIN)
     both = legend(parameters, View(forces=True, loads=True))
     assert "friction (green), load (light green): 0.1 m = 4 N" in both
+    assert any(line.startswith("grid up to ") for line in legend(on(robot, HILLS), PLAIN))
     assert "waves ±20 mm, pieces up to 50 mm" in legend(on(robot, KERB | WAVES), PLAIN)
 
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
+from llvmlite import binding as llvm
 from llvmlite import ir
 from numba import njit, types
 from numba.core.caching import FunctionCache
@@ -73,7 +75,8 @@ def straight_line(text: str, names: str, kinds: Sequence[Any]) -> tuple[Any, Cal
 
     Args:
         text: one assignment a line, to a name or to ``pointer[index]``, of numbers: ``+ - * /``, ``fma(a, b, c)``, ``abs(a)``,
-            ``select(a > b, c, d)``, ``np.floor(a)``, ``F(number)``, and of ``math``: sqrt, exp, tanh, atan2.
+            ``select(a > b, c, d)``, ``np.floor(a)``, ``F(number)``, ``element(low, middle, high, index)`` (a float64 number at
+            an index of the array at an address, its 16 lowest bits first), and of ``math``: sqrt, exp, tanh, atan2.
         names: the intrinsic's parameters, ``"w k step"``.
         kinds: their numba types: pointers (``numbers_of``), integers for indices, and numbers in the pointers' precision.
     """
@@ -84,9 +87,17 @@ def straight_line(text: str, names: str, kinds: Sequence[Any]) -> tuple[Any, Cal
         lowering = _Lowering(context, builder, number, dict(zip(names.split(), values, strict=True)))
         for statement in ast.parse(text).body:
             lowering.assign(statement)
+        if lowering.elements:
+            lowering.separate()
         return context.get_dummy_value()
 
     return types.none(*wanted), generate
+
+
+@cache
+def _look_at_many_places() -> None:
+    """Let LLVM tell apart what more than 250 places in memory hold; where it does not, it takes them all for one."""
+    llvm.set_option("wlr_gym", "-alias-set-saturation-threshold=100000")
 
 
 class _Lowering:
@@ -97,13 +108,25 @@ class _Lowering:
         self.builder = builder
         self.number = number
         self.known = known
+        self.elements: list[Any] = []
+        self.others: list[Any] = []
+
+    def separate(self) -> None:
+        """Tell LLVM that elements lie apart from all else that is read or written: it would go robot by robot otherwise."""
+        _look_at_many_places()
+        module = self.builder.module
+        domain = module.add_metadata([ir.MetaDataString(module, "wlr_gym")])
+        scopes = module.add_metadata([module.add_metadata([ir.MetaDataString(module, "elements"), domain])])
+        for instructions, kind in ((self.elements, "alias.scope"), (self.others, "noalias")):
+            for instruction in instructions:
+                instruction.set_metadata(kind, scopes)
 
     def assign(self, statement: ast.stmt) -> None:
         match statement:
             case ast.Assign(targets=[ast.Name(id=name)], value=value):
                 self.known[name] = self.value(value)
             case ast.Assign(targets=[ast.Subscript() as target], value=value):
-                self.builder.store(self.value(value), self.address(target))
+                self.others.append(self.builder.store(self.value(value), self.address(target)))
             case _:
                 raise TypeError(f"straight_line: not an assignment: {ast.unparse(statement)}")
 
@@ -125,7 +148,8 @@ class _Lowering:
             case ast.Constant(value=value):
                 return self.context.get_constant(self.number, value)
             case ast.Subscript():
-                return self.builder.load(self.address(node))
+                self.others.append(found := self.builder.load(self.address(node)))
+                return found
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
                 return self.context.get_constant(self.number, -value)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -146,6 +170,8 @@ class _Lowering:
                 return self.builder.fma(*arguments)
             case "select":
                 return self.builder.select(*arguments)
+            case "element":
+                return self.element(*arguments)
         if name in _LIBRARY:
             function = self.context.get_function(_LIBRARY[name], self.number(*[self.number] * len(arguments)))
             return function(self.builder, arguments)
@@ -153,6 +179,17 @@ class _Lowering:
             raise TypeError(f"straight_line: unknown function: {name}")
         function = self.builder.module.declare_intrinsic(_FUNCTIONS[name], (self.context.get_value_type(self.number),))
         return self.builder.call(function, arguments)
+
+    def element(self, *arguments: Any) -> Any:
+        """Read a number by address and index."""
+        *parts, index = (self.builder.fptosi(value, ir.IntType(64)) for value in arguments)
+        address = parts[0]
+        for k, part in enumerate(parts[1:], 1):
+            address = self.builder.or_(address, self.builder.shl(part, ir.Constant(ir.IntType(64), 16 * k)))
+        array = self.builder.inttoptr(address, ir.DoubleType().as_pointer())
+        found = self.builder.load(self.builder.gep(array, [index]))
+        self.elements.append(found)
+        return found if self.number is types.float64 else self.builder.fptrunc(found, self.context.get_value_type(self.number))
 
 
 # ---- what numba lacks: fused multiply-add, choice without a branch, arrays by address, whole vector registers --------

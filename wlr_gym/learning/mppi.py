@@ -98,7 +98,8 @@ class Mppi:
         self._owner = np.repeat(np.arange(core.count), self.config.samples)
         self._imagined = _imagined(core, len(self._owner))
         self._nominal = Parameters.nominal(core.task.robot).values
-        floor = np.array([name.startswith(("ground.", "patch.", "wave.", "bumps.", "piece.")) for name in ELEMENTS])
+        kinds = ("ground.", "patch.", "friction_map.", "wave.", "bumps.", "grid.", "piece.")
+        floor = np.array([name.startswith(kinds) for name in ELEMENTS])
         self._known = np.where(floor, "floor" in self.config.knows, "robot" in self.config.knows)
         knots = -(-self.config.horizon // self.config.hold)
         self._plan = np.zeros((core.count, knots, len(JOINTS)))

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from wlr_gym.base.errors import InputError, nearest
+from wlr_gym.base.paths import named_in
 from wlr_gym.base.random import stream_numbers, uniforms
 from wlr_gym.base.settings import ORDERED, SettingsModel, parse_config, read_config
-from wlr_gym.physics.plants.relief import LARGEST_CURVATURE
+from wlr_gym.physics.plants.relief import LARGEST_CURVATURE, map_of
 from wlr_gym.robot import Robot
-from wlr_gym.robot.parameter_table import ELEMENTS, PATCHES, PIECES, SPECS, WAVES
+from wlr_gym.robot.parameter_table import ELEMENTS, PATCHES, PIECES, SPECS, WAVES, range_in_words
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -74,6 +75,61 @@ class Bumps(SettingsModel):
     seed: int = Field(default=0, ge=0, lt=SEEDS)
 
 
+class Map(SettingsModel):
+    """Numbers in square cells, seen from above: columns along x, the first row with the largest y.
+
+    Attributes:
+        cell: width, m.
+        file: CSV, NPY or PNG (0 for black to 1 for white); relative to the floor's own file. Read once, by :func:`load_floor`.
+        data: what was in it; in the content of every floor with a map.
+        at: its middle, m. heading: of its x axis, rad. scale: factor on its numbers.
+    """
+
+    cell: Length
+    file: str = ""
+    data: str = ""
+    at: Place = (0.0, 0.0)
+    heading: float = 0.0
+    scale: float = Field(default=1.0, ge=0.0)
+
+    def text(self) -> str:
+        """Return its numbers as text, see :mod:`wlr_gym.physics.maps`."""
+        return self.data
+
+    @model_validator(mode="after")
+    def _there(self) -> Map:
+        from wlr_gym.physics.maps import map_values
+
+        if not self.text():
+            raise ValueError("has neither 'file' nor 'data': expected the file of a map")
+        map_values(self.text())
+        return self
+
+
+class RandomHeights(SettingsModel):
+    """Gaussian heights: seed, root mean square (m), length over which they are correlated (m), size along x and y (m)."""
+
+    seed: int = Field(default=0, ge=0)
+    height: float = Field(ge=0.0)
+    length: Length
+    size: tuple[Length, Length] = (10.0, 10.0)
+
+
+class Grid(Map):
+    """A smooth surface through heights (m) in the middles of cells, from a file or random; beyond them it goes on level."""
+
+    kind: Literal["grid"]
+    random: RandomHeights | None = None
+
+    def text(self) -> str:
+        """Return its heights as text."""
+        if self.data or self.random is None:
+            return self.data
+        from wlr_gym.physics.maps import random_heights
+
+        return random_heights(cell=self.cell, **self.random.model_dump())
+
+
 class Kerb(SettingsModel):
     """A piece with upright faces: a kerb or step where it has no end, a plank where it has a depth along its heading (m)."""
 
@@ -123,13 +179,14 @@ class FrictionPatch(SettingsModel):
 
 
 class FloorFriction(SettingsModel):
-    """Friction of the floor (None: the robot's), and patches of another; later ones win."""
+    """Friction of the floor (None: the robot's), a map of another (that of the cell), and patches over it; later ones win."""
 
     mu: float | None = Field(default=None, ge=0.0)
+    map: Map | None = None
     patches: list[FrictionPatch] = Field(default=[], max_length=len(PATCHES))
 
 
-Base = Annotated[Plane | Waves | Bumps, Field(discriminator="kind")]
+Base = Annotated[Plane | Waves | Bumps | Grid, Field(discriminator="kind")]
 Piece = Annotated[Kerb | Ramp | Stairs, Field(discriminator="kind")]
 
 
@@ -167,6 +224,9 @@ class Floor(SettingsModel):
             raise InputError(
                 f"randomise: '{place}': no number of this floor{nearest(place, numbers)}; it has {', '.join(numbers)}"
             )
+        if ".random." in place:
+            places = "base.at.0, base.at.1, base.heading or base.scale"
+            raise InputError(f"randomise: '{place}': heights cannot be drawn; expected {places}")
         if (drawn == EACH_EPISODE) != place.endswith(".seed"):
             wanted = f"'{EACH_EPISODE}'" if place.endswith(".seed") else "[low, high]"
             raise InputError(f"randomise: {place} = {drawn!r}: expected {wanted}")
@@ -203,7 +263,8 @@ class Floor(SettingsModel):
         """Return the elements of the parameter table that it states, each with the part of the floor that states it."""
         blank = Parameters(np.full((1, len(ELEMENTS)), np.nan))
         self.write(blank, np.zeros(1, np.uint64))
-        parts = {"wave": "base", "bumps": "base", "piece": "pieces", "patch": "friction.patches", "ground": "friction.mu"}
+        parts = {"wave": "base", "bumps": "base", "grid": "base", "piece": "pieces", "ground": "friction.mu"}
+        parts |= {"patch": "friction.patches", "friction_map": "friction.map"}
         return {ELEMENTS[k]: parts[ELEMENTS[k].partition(".")[0]] for k in np.flatnonzero(np.isfinite(blank.values[0]))}
 
     def _draw(self, seeds: NDArray[np.uint64]) -> dict[str, Array]:
@@ -237,6 +298,11 @@ class Floor(SettingsModel):
         if self.friction.mu is not None:
             for name in ("ground.mu_x", "ground.mu_y"):
                 parameters[name].T[:] = of("friction.mu", self.friction.mu)
+        if self.friction.map is not None:
+            from wlr_gym.physics.maps import enter_friction
+
+            parameters["friction_map.number"] = enter_friction(self.friction.map.text())
+            _write_map(parameters, "friction_map", self.friction.map, "friction.map", of)
         for number, patch in enumerate(self.friction.patches):
             where = f"friction.patches.{number}"
             parameters["patch.mu"][:, number] = of(f"{where}.mu", patch.mu)
@@ -254,6 +320,11 @@ class Floor(SettingsModel):
             case Bumps() as bumps:
                 for field in ("height", "spacing", "share", "seed"):
                     parameters[f"bumps.{field}"][:] = of(f"base.{field}", getattr(bumps, field))
+            case Grid() as grid:
+                from wlr_gym.physics.maps import enter_heights
+
+                parameters["grid.number"] = enter_heights(grid.text())
+                _write_map(parameters, "grid", grid, "base", of)
 
     # ---- what cannot be ----
 
@@ -275,6 +346,7 @@ class Floor(SettingsModel):
             parameters.validate()
             self._check_curvature(parameters, robot)
             self._check_pieces(parameters, robot)
+            self._check_friction_map(parameters)
 
     def _tried(self) -> Iterator[Sequence[float]]:
         """Yield shares of the ranges that are drawn from: ends and places between; of many ranges, ends and a sample."""
@@ -289,12 +361,27 @@ class Floor(SettingsModel):
         number = 2.0 * np.pi / parameters["wave.length"][0]
         curvature = float((parameters["wave.height"][0] * number**2).sum())
         curvature += float(2.5 * parameters["bumps.height"][0] / parameters["bumps.spacing"][0] ** 2)
+        if isinstance(self.base, Grid):
+            from wlr_gym.physics.maps import sharpest
+
+            size = float(parameters["grid.scale"][0] / parameters["grid.cell"][0] ** 2)
+            curvature = size * sharpest(int(parameters["grid.number"][0]))
         product = curvature * robot.wheel.radius
         if product > LARGEST_CURVATURE:
             raise InputError(
                 f"floor '{self.name}': base: its curvature reaches {curvature:.3g} 1/m, {product:.2g} over the wheels' radius: "
                 f"expected at most {LARGEST_CURVATURE:g} over {robot.wheel.radius:g} m; a sharper base touches a wheel at "
                 "several places at once: lower it, stretch it, or make it a piece"
+            )
+
+    def _check_friction_map(self, parameters: Parameters) -> None:
+        if self.friction.map is None:
+            return
+        spec, friction = SPECS["patch.mu"], parameters["friction_map.scale"][0] * map_of(parameters["friction_map.number"][0])
+        if friction.min() < spec.low or friction.max() > spec.high:
+            raise InputError(
+                f"floor '{self.name}': friction.map: its friction is {friction.min():g} to {friction.max():g}: "
+                f"expected {range_in_words(spec.low, spec.high, spec.unit)}"
             )
 
     def _check_pieces(self, parameters: Parameters, robot: Robot) -> None:
@@ -319,6 +406,13 @@ class Floor(SettingsModel):
                     f"floor '{self.name}': pieces {first} and {second} overlap, from {max(foot, other_foot):.3g} to "
                     f"{min(end, other_end):.3g} m along their heading: expected the later one higher and on top of the earlier"
                 )
+
+
+def _write_map(parameters: Parameters, kind: str, map_: Map, where: str, of: Drawn) -> None:
+    for field in ("scale", "cell", "heading"):
+        parameters[f"{kind}.{field}"] = of(f"{where}.{field}", getattr(map_, field))
+    for k, axis in enumerate("xy"):
+        parameters[f"{kind}.{axis}"] = of(f"{where}.at.{k}", map_.at[k])
 
 
 #: Returns the number at a dotted place of a floor: what was drawn for it (N), else what the file says.
@@ -408,10 +502,22 @@ def load_floor(source: FloorSource, robot: Robot | None = None, where: str = "fl
         floor = source
     else:
         data, place = (dict(source), where) if isinstance(source, Mapping) else read_config("floor", source or "flat")
-        floor = parse_config(Floor, data, place)
+        floor = parse_config(Floor, _with_maps(data, place), place)
     if robot is not None:
         floor.check(robot)
     return floor
+
+
+def _with_maps(data: Any, place: str) -> Any:
+    """Return a floor's content with what is in the files of its maps, where it does not have that yet."""
+    data = copy.deepcopy(data)
+    holders = (data.get("base"), (data.get("friction") or {}).get("map")) if isinstance(data, dict) else ()
+    for held in holders:
+        if isinstance(held, dict) and isinstance(held.get("file"), str | Path) and not held.get("data"):
+            from wlr_gym.physics.maps import read_map
+
+            held |= {"data": read_map(named_in(place, held["file"])), "file": str(held["file"])}
+    return data
 
 
 def lay_floor(floor: Floor, parameters: Parameters) -> Parameters:

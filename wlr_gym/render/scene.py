@@ -28,6 +28,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.physics.floor import Floor
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, settle, standing_state
+from wlr_gym.physics.plants.relief import map_of
 from wlr_gym.render import stage as marks
 from wlr_gym.render.stage import Area, ContactsOf, Mark, Stage, Trail
 from wlr_gym.render.view import (
@@ -251,7 +252,7 @@ class Scene:
 
 def marks_of(stage: Stage, floor: list[Area], view: View) -> list[Mark]:
     """Return all that is drawn besides the robot, posed in ``stage``."""
-    drawn = marks.ground(stage, floor)
+    drawn = marks.ground(stage, floor, friction=view.friction)
     if view.friction:
         drawn += marks.spots(stage)
     if view.forces:
@@ -268,6 +269,9 @@ def legend(parameters: Parameters, view: View) -> list[str]:
     mu = 0.5 * (parameters["ground.mu_x"][0] + parameters["ground.mu_y"][0])
     low, high = f"{mu.min():.2f}", f"{mu.max():.2f}"
     floor = f"floor µ {low}" if low == high else f"floors µ {low} to {high}"
+    if parameters["friction_map.number"][0]:
+        mapped = parameters["friction_map.scale"][0] * map_of(parameters["friction_map.number"][0])
+        floor += f", mapped {mapped.min():.2f} to {mapped.max():.2f}"
     lines = [f"{floor}, squares 0.2 m" if view.friction else "squares 0.2 m"]
     if view.slip:
         lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
@@ -286,6 +290,8 @@ def _relief(parameters: Parameters) -> str:
         "bumps up to ": parameters["bumps.height"][0],
         "pieces up to ": parameters["piece.height"][0].max(),
     }
+    if parameters["grid.number"][0]:
+        heights["grid up to "] = parameters["grid.scale"][0] * map_of(parameters["grid.number"][0]).max()
     return ", ".join(f"{what}{1e3 * height:.3g} mm" for what, height in heights.items() if height > 0.0)
 
 

@@ -39,8 +39,9 @@ SPOKES = 3
 SQUARE = 0.2  # m; width of the floor's squares
 DARK_SQUARE, SQUARE_LINE = 0.90, 0.62  # brightness of every second one, and of the lines between them
 EDGE = (0.36, 0.37, 0.38)  # lines along the edges of pieces
-#: Meshes of a floor that is not flat: of the bare floor, of areas of other friction, and of the edges of pieces.
-MESHES = tuple(f"surface_{number}" for number in range(2 + len(PATCHES)))
+#: Meshes of a floor that is not flat: of the bare floor, of areas of other friction, of levels of its map, and of edges of
+#: pieces.
+MESHES = tuple(f"surface_{number}" for number in range(2 + len(PATCHES) + surface.LEVELS))
 # Colours (red, green, blue, opacity), 0 to 1.
 METAL = (0.72, 0.74, 0.78, 1.0)
 DARK = (0.16, 0.17, 0.19, 1.0)
@@ -425,16 +426,29 @@ class Mesh:
 Mark = Squares | Area | Mesh | Spot | Arrow
 
 
-def ground(stage: Stage, floor: Sequence[Area]) -> list[Mark]:
-    """Return the floor around the robot, with its squares; ``floor`` are the areas whose colours are to be seen."""
+def ground(stage: Stage, floor: Sequence[Area], *, friction: bool = True) -> list[Mark]:
+    """Return the floor around the robot, with its squares; ``floor`` are the areas, whose colours ``friction`` shows."""
     if stage.relief is None:
-        return [squares(stage), *floor]
-    material, colours = int(stage.model.material("shade").id), [floor_colour(stage.parameters)] * (len(MESHES) - 1)
-    for k, area in enumerate(stage.areas if floor else (), 1):
-        colours[k] = friction_colour(area.mu)
+        return [squares(stage), *(floor if friction else ())]
+    *colours, _ = surface_colours(stage, stage.areas, friction=friction)
+    colours += colours[:1] * (len(MESHES) - 1 - len(colours))
+    material = int(stage.model.material("shade").id)
     numbers = [int(stage.model.mesh(name).id) for name in MESHES]
     drawn = [Mesh(number, colour, material) for number, colour in zip(numbers, (*colours, EDGE), strict=True)]
     return [mesh for mesh in drawn if stage.model.mesh_facenum[mesh.number]]
+
+
+def surface_colours(stage: Stage, areas: Sequence[Area], *, friction: bool) -> list[Colour]:
+    """Return the colours of a surface's faces: of the bare floor, of areas and levels where ``friction`` is shown, of edges."""
+    levels = [] if stage.relief is None else friction_share(stage.parameters) * stage.relief.levels
+    bare, others = floor_colour(stage.parameters), [*(area.mu for area in areas), *levels]
+    return [bare, *(friction_colour(float(mu)) if friction else bare for mu in others), EDGE]
+
+
+def friction_share(parameters: Parameters) -> float:
+    """Return the mean of one robot's friction along heading and axle over that along the heading."""
+    mu_x, mu_y = parameters["ground.mu_x"][0].mean(), parameters["ground.mu_y"][0].mean()
+    return float(0.5 * (1.0 + (mu_y / mu_x if mu_x > 0 else 1.0)))
 
 
 def squares(stage: Stage) -> Squares:
@@ -448,9 +462,7 @@ def areas(parameters: Parameters, around: Array) -> list[Area]:
 
     The colour is that of the friction along the heading and the axle on average (along the axle: times mu_y/mu_x).
     """
-    found = []
-    mu_x, mu_y = parameters["ground.mu_x"][0].mean(), parameters["ground.mu_y"][0].mean()
-    share = 0.5 * (1.0 + (mu_y / mu_x if mu_x > 0 else 1.0))
+    found, share = [], friction_share(parameters)
     for index in range(len(PATCHES)):
         box = [parameters[f"patch.{side}"][0, index] for side in ("x_min", "x_max", "y_min", "y_max")]
         if not (box[0] < box[1] and box[2] < box[3]):
@@ -458,7 +470,7 @@ def areas(parameters: Parameters, around: Array) -> list[Area]:
         low = np.maximum([box[0], box[2]], around[:2] - REACH)
         high = np.minimum([box[1], box[3]], around[:2] + REACH)
         if (low < high).all():
-            mu = float(parameters["patch.mu"][0, index]) * float(share)
+            mu = float(parameters["patch.mu"][0, index]) * share
             found.append(Area((float(low[0]), float(low[1])), (float(high[0]), float(high[1])), mu, LAYER * (index + 1)))
     return found
 

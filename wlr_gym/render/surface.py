@@ -1,4 +1,4 @@
-"""A floor that is not flat, as triangles around a place: for drawing only, never for contact.
+"""A floor that is not flat, or has a map of friction, as triangles around a place: for drawing only, never for contact.
 
 The base is a grid whose lines lie closer near the place; pieces are their profiles, extruded. What wheels touch:
 :mod:`wlr_gym.physics.plants.relief`.
@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.physics.plants import relief
+from wlr_gym.physics.plants import ground, relief
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -25,10 +25,11 @@ Rectangle = tuple[tuple[float, float], tuple[float, float]]
 REACH = 15.0  # m; the floor is drawn this far around the robot; farther away there is fog
 #: m from the place -> distance of the base's lines up to there, over the smallest.
 BANDS = ((0.6, 1), (1.2, 2), (2.4, 6), (6.0, 20), (REACH, 80))
-#: The smallest distance of lines: of the length of a wave, of the spacing of bumps; and its limits, m.
-WAVE_LINES, BUMP_LINES = 1.0 / 24.0, 1.0 / 4.0
+#: The smallest distance of lines: of the length of a wave, of the spacing of bumps, of the cells of maps; and its limits, m.
+WAVE_LINES, BUMP_LINES, GRID_LINES, FRICTION_LINES = 1.0 / 24.0, 1.0 / 4.0, 1.0 / 4.0, 1.0 / 2.0
 FINEST, WIDEST = 0.0125, 0.05
 LIT = 3.0  # times as steep as it is, the base is lit, so that low bumps are seen
+LEVELS = 8  # so many colours has a map of friction at most
 STEP = 0.2  # m; the place moves in such steps, so that a moving robot seldom needs another surface
 ARC = 4  # strips of a rounded edge
 BAND = 0.006  # m; width of the lines along the edges and feet of pieces
@@ -41,6 +42,7 @@ SHAPING = (
     *(f"bumps.{field}" for field in ("height", "spacing", "share", "seed")),
     *(f"piece.{field}" for field in ("x", "y", "heading", "height", "length", "front_slope", "rear_slope", "edge_radius")),
     *(f"patch.{field}" for field in ("mu", "x_min", "x_max", "y_min", "y_max")),
+    *(f"{map_}.{field}" for map_ in ("grid", "friction_map") for field in ("number", "scale", "cell", "x", "y", "heading")),
 )
 
 
@@ -51,8 +53,8 @@ class Surface:
     Attributes:
         vertices: (V, 3) m.
         normals: (V, 3) unit vectors out of the floor, for its light; see :data:`LIT`.
-        faces: triangles (F, 3) of vertices, counter-clockwise from outside: of the bare floor, of each area, and of the lines
-            along the edges of pieces.
+        faces: triangles (F, 3) of vertices, counter-clockwise from outside: of the bare floor, of each area, of each level of
+            the map of friction (:attr:`Relief.levels`), and of the lines along the edges of pieces.
     """
 
     vertices: Array
@@ -61,7 +63,7 @@ class Surface:
 
 
 class Relief:
-    """One robot's floor that is not flat.
+    """One robot's floor that is not flat, or has a map of friction.
 
     Args:
         robot: its wheels.
@@ -71,14 +73,22 @@ class Relief:
     def __init__(self, robot: Robot, parameters: Parameters) -> None:
         self._parameters = Parameters(parameters.values.copy())
         self._features = frozenset(relief.families(parameters))
-        self._lanes = relief.pack(self._parameters, robot)
+        self._lanes = relief.pack(self._parameters, robot) | relief.pack_map(self._parameters, "friction_map")
+        grid, friction = (self._map(kind) for kind in ("grid", "friction_map"))
         #: m; the base is nowhere deeper.
-        self.lowest: float = -float(self._parameters["wave.height"].sum()) - BURIED
+        self.lowest: float = min(float(grid.min(initial=0.0)), 0.0) - float(self._parameters["wave.height"].sum()) - BURIED
+        found = np.unique(friction)
+        #: Friction of the colours of its map.
+        self.levels: Array = found if len(found) <= LEVELS else np.linspace(found[0], found[-1], LEVELS)
+
+    def _map(self, kind: str) -> Array:
+        return float(self._parameters[f"{kind}.scale"][0]) * relief.map_of(self._parameters[f"{kind}.number"][0])
 
     @staticmethod
     def of(robot: Robot, parameters: Parameters) -> Relief | None:
-        """Return the floor of one robot; None = it is flat."""
-        return Relief(robot, parameters) if relief.families(parameters) else None
+        """Return the floor of one robot; None = it is flat, and has no map of friction."""
+        is_plain = not relief.families(parameters) and not parameters["friction_map.number"].any()
+        return None if is_plain else Relief(robot, parameters)
 
     def height(self, x: Array, y: Array) -> Array:
         """Return the height (m) at places (m) of base and pieces."""
@@ -98,7 +108,7 @@ class Relief:
             areas: rectangles that have triangles of their own; of those that overlap, the last one has them.
             coarseness: of the base's grid; 1 = fine.
         """
-        parts, edges = [self._base(around, areas, coarseness)], 1 + len(areas)
+        parts, edges = [self._base(around, areas, coarseness)], 1 + len(areas) + len(self.levels)
         for number in np.flatnonzero(self._parameters["piece.height"][0] > 0.0):
             for strip, is_edge in self._strips(int(number), around):
                 parts += [_part(*one) for one in ([(edges, strip)] if is_edge else _cut(strip, areas))]
@@ -115,21 +125,32 @@ class Relief:
         height, slope_x, slope_y = (np.broadcast_to(value, len(grid)) for value in values)
         normals = np.stack([-LIT * slope_x, -LIT * slope_y, np.ones(len(grid))], axis=1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        owner = np.zeros((len(x) - 1, len(y) - 1), np.int64)
+        owner = self._levels_at(_middles(x), _middles(y))
+        owner[owner > 0] += len(areas)
         for number, (low, high) in enumerate(areas, 1):
             inside = [(middles > low[axis]) & (middles < high[axis]) for axis, middles in enumerate((_middles(x), _middles(y)))]
             owner[np.ix_(*inside)] = number
         corner = np.arange(len(grid), dtype=np.int32).reshape(len(x), len(y))
         a, b, c, d = corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]
         triangles = np.stack([np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)], axis=2)
-        faces = [triangles[owner == number].reshape(-1, 3) for number in range(1 + len(areas))]
+        faces = [triangles[owner == number].reshape(-1, 3) for number in range(1 + len(areas) + len(self.levels))]
         return Surface(np.column_stack([grid, height]), normals, faces)
+
+    def _levels_at(self, x: Array, y: Array) -> NDArray[np.int64]:
+        """Return at a grid of places 1 + the number of the nearest level of the map of friction, 0 beyond it."""
+        if not len(self.levels):
+            return np.zeros((len(x), len(y)), np.int64)
+        inside, mu = ground.friction_of_map(self._lanes, x[:, None], y)
+        return np.where(inside > 0.0, 1 + np.abs(mu[..., None] - self.levels).argmin(axis=-1), 0)
 
     def _finest(self) -> float:
         """Return the smallest distance of the base's lines, m; of a plane the whole reach."""
         lengths = [*(WAVE_LINES * self._parameters["wave.length"][0][self._parameters["wave.height"][0] > 0.0])]
         if self._parameters["bumps.height"][0] > 0.0:
             lengths.append(BUMP_LINES * float(self._parameters["bumps.spacing"][0]))
+        for kind, share in (("grid", GRID_LINES), ("friction_map", FRICTION_LINES)):
+            if self._parameters[f"{kind}.number"][0]:
+                lengths.append(share * float(self._parameters[f"{kind}.cell"][0]))
         return float(np.clip(min(lengths), FINEST, WIDEST)) if lengths else REACH
 
     # ---- pieces ----

@@ -51,6 +51,8 @@ WAVES = ("wave_1", "wave_2")
 PIECES = tuple(f"piece_{number}" for number in range(1, 9))
 SLOPE = ("pitch", "roll")
 ANGLES = ("roll", "pitch", "yaw")
+#: Largest number of a map: 48 bits.
+LARGEST_MAP = 2**48 - 1
 INERTIA_LABELS = ("xx", "yy", "zz", "xy", "xz", "yz")
 #: Nominal values of rows that need more than one path.
 LEVEL_ACROSS = ("ground.slope", 0.0)
@@ -200,7 +202,14 @@ TABLE: tuple[ParameterSpec, ...] = (
     fixed("patch.x_max", "m", PATCHES, low=-1e3, high=1e3, doc="no patch where x_max <= x_min"),
     fixed("patch.y_min", "m", PATCHES, low=-1e3, high=1e3, doc="area of the patch, floor frame"),
     fixed("patch.y_max", "m", PATCHES, low=-1e3, high=1e3, doc="no patch where y_max <= y_min"),
-    # Relief of the floor: height = sum of wave.height sin(2 pi distance/wave.length + phase) + bumps, and pieces on top.
+    # Cells with a friction of their own along the heading, under the patches.
+    fixed("friction_map.number", "-", low=0, high=LARGEST_MAP, doc="which map of friction; 0 = none"),
+    fixed("friction_map.scale", "-", at=1.0, low=0, high=100, doc="factor on its friction"),
+    fixed("friction_map.cell", "m", at=0.05, low=1e-3, high=100, doc="width of its square cells"),
+    fixed("friction_map.x", "m", low=-1e3, high=1e3, doc="middle of the map"),
+    fixed("friction_map.y", "m", low=-1e3, high=1e3, doc="middle of the map"),
+    fixed("friction_map.heading", "rad", low=-10, high=10, doc="of the map's x axis, from the floor's"),
+    # Relief of the floor: height = sum of wave.height sin(2 pi distance/wave.length + phase) + bumps + grid, and pieces on top.
     fixed("wave.height", "m", WAVES, low=0, high=1, doc="half of crest to trough; 0 = no wave"),
     fixed("wave.length", "m", WAVES, at=1.0, low=0.01, high=1e3, doc="crest to crest"),
     fixed("wave.heading", "rad", WAVES, low=-10, high=10, doc="direction across the crests, from the floor's x axis"),
@@ -210,6 +219,13 @@ TABLE: tuple[ParameterSpec, ...] = (
     fixed("bumps.spacing", "m", at=0.1, low=0.005, high=10, doc="between the lattice's points"),
     fixed("bumps.share", "-", at=1.0, low=0.01, high=1, doc="share of the points that are raised"),
     fixed("bumps.seed", "-", low=0, high=1038360, doc="whole number: which bumps"),
+    # Heights in the middles of cells, with a smooth surface through them; beyond the outermost it goes on level.
+    fixed("grid.number", "-", low=0, high=LARGEST_MAP, doc="which map of heights; 0 = none"),
+    fixed("grid.scale", "-", at=1.0, low=0, high=100, doc="factor on its heights"),
+    fixed("grid.cell", "m", at=0.05, low=1e-3, high=100, doc="width of its square cells"),
+    fixed("grid.x", "m", low=-1e3, high=1e3, doc="middle of the map"),
+    fixed("grid.y", "m", low=-1e3, high=1e3, doc="middle of the map"),
+    fixed("grid.heading", "rad", low=-10, high=10, doc="of the map's x axis, from the floor's"),
     # A piece has a flat top and two faces (pi/2: upright); its edges run across its heading without an end.
     fixed("piece.x", "m", PIECES, low=-1e3, high=1e3, doc="foot of the front face"),
     fixed("piece.y", "m", PIECES, low=-1e3, high=1e3, doc="foot of the front face"),

@@ -107,7 +107,8 @@ def load_module(tag: str, source: str | Callable[[], str], message: str = "", ke
 
 
 _BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
-_CALLS = {"exp": "math.exp", "tanh": "math.tanh", "floor": "np.floor", "sqrt": "math.sqrt", "arctan2": "math.atan2"}
+_CALLS = {"exp": "math.exp", "tanh": "math.tanh", "floor": "np.floor", "sqrt": "math.sqrt", "arctan2": "math.atan2",
+          "element": "element"}  # fmt: skip
 
 
 def emit(

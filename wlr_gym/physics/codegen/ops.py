@@ -5,7 +5,8 @@ On nodes it builds an expression graph in which common sub-expressions are share
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import ctypes
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import factorial
 from typing import Any
 
@@ -189,6 +190,30 @@ def rounded(x: Value) -> Value:
 def floor(x: Value) -> Value:
     """Largest whole number not above ``x``."""
     return _apply("floor", np.floor, x)
+
+
+#: An address in memory is handed on in parts that are exact in either precision.
+ADDRESS_PARTS = 3
+_PART = 2**16
+
+
+def address_of(array: Any) -> list[int]:
+    """Return where an array lies in memory, in :data:`ADDRESS_PARTS` parts of 16 bits, the lowest first."""
+    return [array.ctypes.data // _PART**k % _PART for k in range(ADDRESS_PARTS)]
+
+
+def element(address: Sequence[Value], index: Value) -> Value:
+    """Number of a float64 array by its index, a whole number; nothing checks it. ``address``: :func:`address_of` the array."""
+    return _apply("element", _element, *address, index)
+
+
+def _element(low: Value, middle: Value, high: Value, index: Value) -> Value:
+    address, place = np.broadcast_arrays(low + _PART * (middle + _PART * np.asarray(high, np.float64)), index)
+    found, place = np.empty(place.shape), place.astype(np.intp)
+    for one in np.unique(address):
+        here = address == one
+        found[here] = np.ctypeslib.as_array((ctypes.c_double * (place[here].max() + 1)).from_address(int(one)))[place[here]]
+    return found.astype(np.result_type(index))[()]
 
 
 def _polynomial(x: Value, coefficients: tuple[float, ...]) -> Value:

@@ -2,8 +2,8 @@
 
 Scalar source over lanes (see :mod:`wlr_gym.physics.plants.drive`), traced by each simulator into its own kernel. :func:`pack`
 fills the parameter lanes from the table, :func:`pack_body` those of what else acts on a robot from without. Families of
-effects that change what is traced: ``ground`` (patches, weakening), ``compliance``, ``rolling_resistance`` and ``brush``;
-without the first friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
+effects that change what is traced: ``ground`` (patches, weakening), ``friction_map`` (with it), ``compliance``,
+``rolling_resistance`` and ``brush``; without the first friction is a constant of each wheel, ``mu_x{i}`` and ``mu_y{i}``.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value
 from wlr_gym.physics.model.dynamics import gravity_in_floor
+from wlr_gym.physics.plants.relief import map_lanes, map_value, pack_map, place_in_map
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
@@ -33,6 +34,7 @@ _PATCH_NUMBERS = range(len(PATCHES))
 #: Parameter lanes of the ground: four per wheel quantity, and the patches.
 GROUND_LANES: tuple[str, ...] = (
     *(f"{name}{i}" for name in WHEEL_LANES for i in range(4)),
+    *map_lanes("friction_map"),
     *(f"patch_{name}{k}" for name in _PATCH_FIELDS for k in _PATCH_NUMBERS),
 )
 #: Smallest friction coefficient that is divided by.
@@ -67,6 +69,7 @@ def pack(parameters: Parameters) -> dict[str, Array]:
         "inverse_rest_load": np.repeat(1.0 / np.maximum(load, 1e-3)[:, None], 4, axis=1),
     }
     lanes = {f"{name}{i}": wheel[name][:, i] for name in WHEEL_LANES for i in range(4)}
+    lanes |= pack_map(parameters, "friction_map")
     return lanes | {f"patch_{name}{k}": parameters[f"patch.{name}"][:, k] for name in _PATCH_FIELDS for k in _PATCH_NUMBERS}
 
 
@@ -104,8 +107,10 @@ def families(parameters: Parameters) -> set[str]:
     has_patch = (parameters["patch.x_max"] > parameters["patch.x_min"]) & (
         parameters["patch.y_max"] > parameters["patch.y_min"]
     )
+    has_map = parameters["friction_map.number"].any()
     present = {
-        "ground": has_patch.any() or (parameters["ground.kinetic_ratio"] != 1.0).any(),
+        "ground": has_patch.any() or has_map or (parameters["ground.kinetic_ratio"] != 1.0).any(),
+        "friction_map": has_map,
         "compliance": parameters["ground.creep_speed"].any() or parameters["ground.flattening"].any(),
         "rolling_resistance": parameters["ground.rolling_resistance"].any(),
         "brush": parameters["ground.slip_compliance"].any(),
@@ -126,8 +131,9 @@ class Friction:
 def friction(lanes: Lanes, i: int, x: Value, y: Value, slip_speed: Value, features: frozenset[str]) -> Friction:
     """Return the friction under wheel ``i`` whose contact point stands at (x, y) (m, floor frame) and slips at a speed (m/s).
 
-    mu_x = grip * (mu of the last patch that holds the point, else ground.mu_x), mu_y = mu_x * ground.mu_y/ground.mu_x, both
-    times kinetic_ratio + (1 - kinetic_ratio) exp(-slip speed/weakening_speed). Tyre creep is not in it.
+    mu_x = grip * (mu of the last patch that holds the point, else of the map's cell, else ground.mu_x),
+    mu_y = mu_x * ground.mu_y/ground.mu_x, both times
+    kinetic_ratio + (1 - kinetic_ratio) exp(-slip speed/weakening_speed). Tyre creep is not in it.
     """
     mu_x, mu_y = lanes[f"mu_x{i}"], lanes[f"mu_y{i}"]
     inverse_x, inverse_y = lanes[f"inverse_mu_x{i}"], lanes[f"inverse_mu_y{i}"]
@@ -135,6 +141,10 @@ def friction(lanes: Lanes, i: int, x: Value, y: Value, slip_speed: Value, featur
         return Friction(mu_x, mu_y, inverse_x, inverse_y)
     is_inside: Value = -1.0
     patch_mu: Value = mu_x
+    if "friction_map" in features:
+        inside, mapped = friction_of_map(lanes, x, y)
+        is_inside = ops.where_positive(inside, 1.0, is_inside)
+        patch_mu = ops.where_positive(inside, lanes[f"grip{i}"] * mapped, patch_mu)
     for k in _PATCH_NUMBERS:
         margin_x = ops.minimum(x - lanes[f"patch_x_min{k}"], lanes[f"patch_x_max{k}"] - x)
         margin_y = ops.minimum(y - lanes[f"patch_y_min{k}"], lanes[f"patch_y_max{k}"] - y)
@@ -148,6 +158,14 @@ def friction(lanes: Lanes, i: int, x: Value, y: Value, slip_speed: Value, featur
     left = 1.0 - lanes[f"kinetic_drop{i}"] * (1.0 - ops.decay(slip_speed * lanes[f"inverse_weakening_speed{i}"]))
     inverse_left = 1.0 / ops.maximum(left, _LEAST_MU)
     return Friction(patch_mu * left, mu_y * left, inverse_x * inverse_left, inverse_y * inverse_left)
+
+
+def friction_of_map(lanes: Lanes, x: Value, y: Value) -> tuple[Value, Value]:
+    """Return how far inside the map of friction a place (m, floor frame) is, in cells, and the friction of its cell."""
+    column, row = place_in_map(lanes, "friction_map", x, y)
+    columns, rows = lanes["friction_map_columns"], lanes["friction_map_rows"]
+    inside = ops.minimum(ops.minimum(column, columns - column), ops.minimum(row, rows - row))
+    return inside, lanes["friction_map_scale"] * map_value(lanes, "friction_map", ops.floor(column), ops.floor(row))
 
 
 def creep_share(lanes: Lanes, i: int, slip_speed: Value) -> tuple[Value, Value]:

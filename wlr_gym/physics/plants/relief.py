@@ -1,4 +1,4 @@
-"""Where a wheel touches a floor that is not flat, defined once for every simulator: waves, bumps, and convex pieces.
+"""Where a wheel touches a floor that is not flat, defined once for every simulator: waves, bumps, grids, and convex pieces.
 
 A wheel is a disc with a rounded tread: a core disc of radius ``rho`` and half width ``b``, grown by ``rc`` on every side, so
 that its radius is ``rho + rc`` and its width ``2 (b + rc)``. The floor is a smooth base z = h(x, y), on which pieces stand:
@@ -8,12 +8,13 @@ A wheel touches at two places at most: those of the base and of the two nearest 
 top of a piece are one place, whose normal turns from one to the other without a jump. Everything is scalar source over lanes
 (see :mod:`wlr_gym.physics.plants.drive`) in the floor frame, without branches.
 
-Families that change what is traced: ``relief`` (any of the following), ``waves``, ``bumps``, ``piece`` (the first piece),
-``pieces`` (all of them).
+Families that change what is traced: ``relief`` (any of the following), ``waves``, ``bumps``, ``grid``, ``piece`` (the first
+piece), ``pieces`` (all of them).
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -21,6 +22,7 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value, Vector
 from wlr_gym.robot import Robot
@@ -43,16 +45,29 @@ NOWHERE = -10.0
 PERMUTED = 1019
 #: Largest product of the base's curvature and a wheel's radius: up to here the contact is exact to 30 um.
 LARGEST_CURVATURE = 0.25
+#: Families of smooth bases.
+BASES = frozenset({"waves", "bumps", "grid"})
 
 _WAVE_FIELDS = ("height", "slope_x", "slope_y", "phase", "steepness_x", "steepness_y")
 _BUMP_FIELDS = ("height", "inverse_spacing", "seed_x", "seed_y", "least", "inverse_share")
 _PIECE_FIELDS = ("x", "y", "z", "across_x", "across_y", "span", "front_u", "front_v", "rear_u", "rear_v", "edge_radius")
+_MAP_FIELDS = (
+    *(f"address{k}" for k in range(ops.ADDRESS_PARTS)), "columns", "rows", "x", "y", "along_x", "along_y", "scale"
+)  # fmt: skip
 _WHEEL_FIELDS = ("core_radius", "core_half_width", "rounding")
+
+
+def map_lanes(kind: str) -> tuple[str, ...]:
+    """Return the lanes of a map, ``grid`` or ``friction_map``: see :func:`pack_map`."""
+    return tuple(f"{kind}_{name}" for name in _MAP_FIELDS)
+
+
 #: Parameter lanes of the relief.
 RELIEF_LANES: tuple[str, ...] = (
     *(f"{name}{i}" for name in _WHEEL_FIELDS for i in range(4)),
     *(f"wave_{name}{k}" for name in _WAVE_FIELDS for k in range(len(WAVES))),
     *(f"bump_{name}" for name in _BUMP_FIELDS),
+    *map_lanes("grid"),
     *(f"piece_{name}{k}" for name in _PIECE_FIELDS for k in range(len(PIECES))),
 )
 
@@ -63,6 +78,7 @@ def families(parameters: Parameters) -> set[str]:
     present = {
         "waves": parameters["wave.height"].any(),
         "bumps": parameters["bumps.height"].any(),
+        "grid": parameters["grid.number"].any(),
         "piece": pieces.any(),
         "pieces": pieces[1:].any(),
     }
@@ -75,8 +91,8 @@ def wheel_profile(parameters: Parameters, robot: Robot) -> tuple[Array, Array, A
 
     Robots on a level floor have thin discs: as where no robot of the batch stands on relief.
     """
-    on_relief = parameters["wave.height"].any(axis=1) | (parameters["bumps.height"] > 0.0)
-    on_relief = (on_relief | (parameters["piece.height"] > 0.0).any(axis=1))[:, None]
+    shapes = ("wave.height", "bumps.height", "grid.number", "piece.height")
+    on_relief = np.any([parameters[name].reshape(len(parameters), -1).any(axis=1) for name in shapes], axis=0)[:, None]
     half = np.where(on_relief, 0.25 * robot.wheel.width, np.zeros((1, 4)))
     return parameters["wheel.radius"] - half, half, half
 
@@ -85,7 +101,8 @@ def pack(parameters: Parameters, robot: Robot) -> dict[str, Array]:
     """Return the lanes RELIEF_LANES, each (N,)."""
     profile = zip(_WHEEL_FIELDS, wheel_profile(parameters, robot), strict=True)
     lanes = {f"{name}{i}": values[:, i] for name, values in profile for i in range(4)}
-    return lanes | _pack_waves(parameters) | _pack_bumps(parameters) | _pack_pieces(parameters)
+    shapes = _pack_waves(parameters) | _pack_bumps(parameters) | pack_map(parameters, "grid") | _pack_pieces(parameters)
+    return lanes | shapes
 
 
 def _pack_waves(parameters: Parameters) -> dict[str, Array]:
@@ -138,6 +155,61 @@ def _pack_pieces(parameters: Parameters) -> dict[str, Array]:
         "edge_radius": radius,
     }
     return {f"piece_{name}{k}": fields[name][:, k] for name in _PIECE_FIELDS for k in range(len(PIECES))}
+
+
+# ---- maps: numbers in square cells ---------------------------------------------------------------------------------
+
+
+#: Maps of this process by their number in the parameter table: rows along y, columns along x; they are never given back, since
+#: kernels read them where they lie. Robots without one have number 0, a map without cells whose address may be read.
+_MAPS: dict[int, Array] = {0: np.zeros((1, 1))[:0, :0]}
+
+
+def enter_map(values: Array) -> int:
+    """Make a map (rows, columns) known to this process, and return its number, which follows from what is in it."""
+    kept = np.array(values, np.float64, order="C")
+    number = int(hashlib.sha256(f"{kept.shape}".encode() + kept.tobytes()).hexdigest()[:12], 16)
+    kept.flags.writeable = False
+    _MAPS.setdefault(number, kept)
+    return number
+
+
+def map_of(number: float) -> Array:
+    """Return a map (rows, columns) by its number.
+
+    Raises:
+        InputError: no floor with that map has been loaded in this process.
+    """
+    if int(number) not in _MAPS:
+        raise InputError(f"map {int(number)}: is not known here: expected a floor that holds it to be loaded and laid first")
+    return _MAPS[int(number)]
+
+
+def pack_map(parameters: Parameters, kind: str) -> dict[str, Array]:
+    """Return the lanes of :func:`map_lanes`, each (N,): where its numbers lie in memory, its size, place, turn and scale."""
+    numbers, each = np.unique(parameters[f"{kind}.number"], return_inverse=True)
+    maps = [map_of(number) for number in numbers]
+    heading, cell = parameters[f"{kind}.heading"], parameters[f"{kind}.cell"]
+    address, size = (np.array(found, np.float64) for found in ([*map(ops.address_of, maps)], [one.shape for one in maps]))
+    columns = [*address[each].T, *size[each, ::-1].T, parameters[f"{kind}.x"], parameters[f"{kind}.y"]]
+    columns += [np.cos(heading) / cell, np.sin(heading) / cell, parameters[f"{kind}.scale"]]
+    return dict(zip(map_lanes(kind), columns, strict=True))
+
+
+def place_in_map(lanes: Lanes, kind: str, x: Value, y: Value) -> tuple[Value, Value]:
+    """Return column and row of a place (m, floor frame) in a map: whole numbers at the edges of cells, 0 at the first."""
+    dx, dy = x - lanes[f"{kind}_x"], y - lanes[f"{kind}_y"]
+    along_x, along_y = lanes[f"{kind}_along_x"], lanes[f"{kind}_along_y"]
+    column = (dx * along_x + dy * along_y) + 0.5 * lanes[f"{kind}_columns"]
+    return column, (dy * along_x - dx * along_y) + 0.5 * lanes[f"{kind}_rows"]
+
+
+def map_value(lanes: Lanes, kind: str, column: Value, row: Value) -> Value:
+    """Return the number in a cell (whole numbers); beyond the map that of the nearest."""
+    column = ops.maximum(ops.minimum(column, lanes[f"{kind}_columns"] - 1.0), 0.0)  # in this order also of what is not finite
+    row = ops.maximum(ops.minimum(row, lanes[f"{kind}_rows"] - 1.0), 0.0)
+    address = [lanes[f"{kind}_address{k}"] for k in range(ops.ADDRESS_PARTS)]
+    return ops.element(address, row * lanes[f"{kind}_columns"] + column)
 
 
 # ---- the wheel -------------------------------------------------------------------------------------------------------
@@ -215,6 +287,9 @@ def base_height(lanes: Lanes, x: Value, y: Value, features: frozenset[str]) -> t
     if "bumps" in features:
         bump, rise_x, rise_y = _bumps(lanes, x, y)
         height, slope_x, slope_y = height + bump, slope_x + rise_x, slope_y + rise_y
+    if "grid" in features:
+        rise, rise_x, rise_y = _grid(lanes, x, y)
+        height, slope_x, slope_y = height + rise, slope_x + rise_x, slope_y + rise_y
     return height, slope_x, slope_y
 
 
@@ -257,6 +332,26 @@ def _bumps(lanes: Lanes, x: Value, y: Value) -> tuple[Value, Value, Value]:
     return ops.rounded(size * total), ops.rounded((size * scale) * slope_x), ops.rounded((size * scale) * slope_y)
 
 
+def _grid(lanes: Lanes, x: Value, y: Value) -> tuple[Value, Value, Value]:
+    """Biquadratic B-spline over the map of heights, whose numbers are the spline's weights in the middles of cells."""
+    column, row = place_in_map(lanes, "grid", x, y)
+    first_column, first_row = ops.floor(column), ops.floor(row)
+    weights_x, slopes_x = _quadratic(column - first_column)
+    weights_y, slopes_y = _quadratic(row - first_row)
+    middle = map_value(lanes, "grid", first_column, first_row)  # taken off, so that a level map is level to the last bit
+    total: Value = 0.0
+    along: Value = 0.0
+    across: Value = 0.0
+    for k in range(3):
+        heights = [map_value(lanes, "grid", first_column + (j - 1.0), first_row + (k - 1.0)) - middle for j in range(3)]
+        line = weights_x[0] * heights[0] + weights_x[1] * heights[1] + weights_x[2] * heights[2]
+        slope = slopes_x[0] * heights[0] + slopes_x[1] * heights[1] + slopes_x[2] * heights[2]
+        total, along, across = total + weights_y[k] * line, along + weights_y[k] * slope, across + slopes_y[k] * line
+    scale, along_x, along_y = lanes["grid_scale"], lanes["grid_along_x"], lanes["grid_along_y"]
+    slope_x, slope_y = scale * (along * along_x - across * along_y), scale * (along * along_y + across * along_x)
+    return ops.rounded(scale * (middle + total)), ops.rounded(slope_x), ops.rounded(slope_y)  # rounded: see _bumps
+
+
 def _quadratic(t: Value) -> tuple[Vector, Vector]:
     """Weights of three neighbours in a quadratic B-spline at a fraction ``t`` of a cell, and their slopes."""
     rest = 1.0 - t
@@ -265,7 +360,7 @@ def _quadratic(t: Value) -> tuple[Vector, Vector]:
 
 def touch_of_base(lanes: Lanes, centre: Vector, axle: Vector, profile: WheelProfile, features: frozenset[str]) -> Touch:
     """Return where a wheel is nearest to the base: the normal under its centre, improved at the point that it finds."""
-    if not features & {"waves", "bumps"}:
+    if not features & BASES:
         _, reach = support(profile, axle, [0.0, 0.0, 1.0])
         return Touch(-(centre[2] + reach[2]), [0.0, 0.0, 1.0], reach)
     height, normal, reach = 0.0, _normal(*base_height(lanes, centre[0], centre[1], features)[1:]), [0.0] * 3

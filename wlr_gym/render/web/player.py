@@ -150,11 +150,11 @@ class PageFloor:
         step = marks.REACH if stage.relief is None else _SURFACE_STEP
         middle = np.round(place / step) * step
         areas = marks.areas(parameters, middle) if view.friction else []
-        seen = (areas, stage.relief and (stage.relief, *middle[:2], colour))
+        seen = (areas, view.friction, stage.relief and (stage.relief, *middle[:2], colour))
         if seen != self._seen:
             for node in self._shown:
                 node.remove()
-            self._shown = self._boxes(areas) if stage.relief is None else self._triangles(stage, areas, middle)
+            self._shown = self._boxes(areas) if stage.relief is None else self._triangles(stage, view, areas, middle)
             self._shown += self._labels(stage, areas)
             self._seen = seen
         spots = marks.spots(stage) if view.friction else []
@@ -186,11 +186,11 @@ class PageFloor:
             for k, (area, height) in enumerate(zip(areas, stage.height(corners), strict=True))
         ]
 
-    def _triangles(self, stage: Stage, areas: Sequence[marks.Area], middle: NDArray[np.float64]) -> list[Any]:
+    def _triangles(self, stage: Stage, view: View, areas: Sequence[marks.Area], middle: NDArray[np.float64]) -> list[Any]:
         """Add what can be seen of a floor that is not flat from a place, as one mesh per colour."""
         assert stage.relief is not None
         found = stage.relief.surface(middle, [(area.low, area.high) for area in areas], _COARSENESS)
-        colours = [marks.floor_colour(stage.parameters), *(friction_colour(area.mu) for area in areas), marks.EDGE]
+        colours = marks.surface_colours(stage, areas, friction=view.friction)
         return [
             self._server.scene.add_mesh_trimesh(
                 f"{FLOOR}/surface_{k}", squared_mesh(found, faces, colour), cast_shadow=False, receive_shadow=False

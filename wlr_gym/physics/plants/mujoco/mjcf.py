@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.physics.plants import relief
 from wlr_gym.robot import CORNER_SIGNS, FIRST_WHEEL, JOINTS, LEGS, WHEELS, Robot, standing_height
 from wlr_gym.robot.interchange.recognition import LinkJoint, LinkShape, LinkTree, Placement, RigidLink
 from wlr_gym.robot.parameters import Parameters
@@ -254,7 +255,7 @@ NOT_IN_MJCF = (
     "sensors", "tolerances", "dynamixel_ids", "servo gains, no-load speeds, currents, gear stiffness and supply voltage",
 )  # fmt: skip
 #: What of a floor's pieces an MJCF cannot hold.
-NOT_IN_MJCF_FLOOR = ("edge radii of pieces", "direction of friction on pieces", "patches of friction")
+NOT_IN_MJCF_FLOOR = ("edge radii of pieces", "direction of friction on pieces", "patches and maps of friction")
 #: m; how far a piece of the floor reaches to both sides, and along its heading where it has no end.
 REACH = 10.0
 _GEOM = mujoco.mjtGeom
@@ -276,11 +277,11 @@ def mjcf_text(robot: Robot, parameters: Parameters | None = None) -> str:
         parameters: (1) it and its floor; None = nominal, on a plane.
 
     Raises:
-        InputError: a floor of waves or bumps.
+        InputError: a floor of waves, bumps or a grid.
     """
     row = Parameters.nominal(robot) if parameters is None else parameters
-    if row["wave.height"].any() or row["bumps.height"].any():
-        raise InputError("floor: base: MJCF has no waves or bumps; expected a plane, with pieces where there are any")
+    if relief.families(row) & relief.BASES:
+        raise InputError("floor: base: MJCF has no waves, bumps or grids; expected a plane, with pieces where there are any")
     kept: list[Any] = []
     model = build_model(robot, row, extend=functools.partial(_complete, robot=robot, row=row, kept=kept))
     root = ElementTree.fromstring(kept[0].to_xml())

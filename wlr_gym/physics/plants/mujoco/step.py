@@ -52,8 +52,8 @@ from wlr_gym.robot import FIRST_WHEEL
 
 #: Families of effects: always all, so that no robot's bits can depend on what its neighbours have. On a floor with relief,
 #: :data:`ON_RELIEF`: MuJoCo's model is then another one.
-FEATURES = frozenset({"drive", "backlash", "ground", "compliance", "brush"})
-ON_RELIEF = FEATURES | {"relief", "waves", "bumps", "piece", "pieces"}
+FEATURES = frozenset({"drive", "backlash", "ground", "friction_map", "compliance", "brush"})
+ON_RELIEF = FEATURES | {"relief", "waves", "bumps", "grid", "piece", "pieces"}
 
 #: MuJoCo's state by lane: ``qpos`` and ``qvel``. Joints along the tree: leg, wheel, leg, wheel, ...
 POSITION: tuple[str, ...] = (
