@@ -209,7 +209,7 @@ def test_export_writes_the_pieces(step, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--floor", "rough", "--out", "x.xml"], "MJCF has no waves or bumps"),
+        (["--floor", "rough", "--out", "x.xml"], "MJCF has no waves, bumps or grids"),
         (["--floor", "kerbs", "--out", "x.urdf"], "URDF holds a robot, no floor"),
     ],
 )
