@@ -11,7 +11,8 @@ import pytest
 from wlr_gym.base.errors import InputError, MissingPackageError
 from wlr_gym.cli import doctor
 from wlr_gym.cli.options import RobotOption
-from wlr_gym.hardware.config import load_hardware
+from wlr_gym.hardware import serial_frames
+from wlr_gym.hardware.config import FlowPort, load_hardware, with_ports
 from wlr_gym.robot import load_robot
 
 pytest.importorskip("dynamixel_sdk")
@@ -41,13 +42,13 @@ def look(capsys, **options):
 
 def test_a_good_robot_passes(machine, capsys):
     code, text = look(capsys)
-    assert (code, text.splitlines()[-1]) == (0, "All 211 checks passed.")
+    assert (code, text.splitlines()[-1]) == (0, "All 214 checks passed.")
     assert "8 of 8     supply" in text
     assert "bus speed: median 3.00 ms" in text
     assert "All 8" not in text
     assert doctor.run(doctor.DoctorOptions(emulated=True, json=True)) == 0
     found = json.loads(capsys.readouterr().out)
-    assert len(found) == 211
+    assert len(found) == 214
     assert {entry["where"] for entry in found} >= {"legs", "imu", "wheel_rr", "robot"}
 
 
@@ -125,7 +126,7 @@ def test_mending_asks_writes_registers_and_looks_again(machine, capsys, monkeypa
 
 
 def test_verbose_lists_every_joint(machine, capsys):
-    assert len(look(capsys, verbose=True)[1].splitlines()) == 212
+    assert len(look(capsys, verbose=True)[1].splitlines()) == 215
 
 
 @pytest.mark.slow
@@ -200,3 +201,35 @@ def test_an_absent_sdk_is_named_with_its_extra(monkeypatch, emulated):
         monkeypatch.delitem(sys.modules, f"wlr_gym.hardware.{name}", raising=False)
     with pytest.raises(MissingPackageError, match=r"dynamixel_sdk.*wlr-gym\[robot\]"):
         RobotOption(emulated=emulated).link()
+
+
+def test_the_board_of_the_imu_tells_its_settings(machine, capsys, monkeypatch):
+    def status(self, port):
+        return serial_frames.STATUS_FRAMES.encode({**good, "gyro_range": 250, "bus_locks": 2}.values())
+
+    good = dict.fromkeys(serial_frames.STATUS_FRAMES.fields, 0)
+    good |= {"version_major": 1, "sensors": 1, "imu_rate": 200, "accel_range": 4, "bandwidth": 44}
+    monkeypatch.setattr(Machine, "_board_status", status)
+    code, text = look(capsys)
+    assert code == 1
+    assert re.search(r"FAULT +imu +settings: 200 Hz, 250 deg/s, 4 g, 44 Hz bandwidth, expected 200 Hz, 500 deg/s", text)
+    assert "2 bus locks" in text
+    monkeypatch.setattr(Machine, "_board_status", lambda self, port: b"")
+    code, text = look(capsys)
+    assert code == 0
+    assert re.search(r"warning +imu +firmware: it does not say", text)
+
+
+def test_both_sensors_on_one_board(monkeypatch, capsys):
+    hardware = HARDWARE.model_copy(update={"flow": FlowPort(port=HARDWARE.imu.port)})
+    machine = Machine(load_robot("flow"), hardware)
+    monkeypatch.setattr(RobotOption, "link", lambda self: emulated_link(machine))
+    monkeypatch.setattr(RobotOption, "load", lambda self: (machine.robot, hardware))
+    code, text = look(capsys, verbose=True)
+    assert code == 0, text
+    assert re.search(r"flow +readings: 5\d of 50", text), text
+    assert re.search(r"flow +losses: 0 lost, 0 broken", text)
+    assert machine.sensors == ("imu",)
+    moved = with_ports(hardware, {"imu": "/dev/other"})
+    assert moved.flow is not None
+    assert moved.flow.port == "/dev/other"

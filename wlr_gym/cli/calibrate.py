@@ -387,6 +387,7 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
         link.imu.open()
         print("Enter continues, q ends without a file.")
         calibration = _find_calibration(options, hardware.imu.calibration, link, ask)
+        _require_board(link, hardware)
     for name, value in calibration.model_dump(exclude_unset=True).items():
         print(f"{name:13} {value}")
     note = f"IMU calibrated by wlr calibrate imu, {today()}: mounting * scale * (measured - offset), SI units."
@@ -394,6 +395,17 @@ def calibrate_imu(options: ImuOptions, ask: Ask = ask_terminal) -> int:
     if options.json:
         print_json({"hardware": options.out, "imu": calibration.model_dump(mode="json")})
     return OK
+
+
+def _require_board(link: Link, hardware: Hardware) -> None:
+    """Print what the IMU's board says of itself; refuse one with other ranges than the file: all would be off by a factor."""
+    from wlr_gym.hardware.imu import ImuStream
+    from wlr_gym.hardware.safety.preflight import check_board
+
+    for check in check_board(link.imu, hardware.imu, link.clock) if isinstance(link.imu, ImuStream) else ():
+        print(f"{check.what:13} {check.found}" if check.ok else check)
+        if check.is_fatal and not check.ok:
+            raise InputError(f"imu {check.what}: {check.found}, expected {check.expected}. {check.remedy}")
 
 
 def _find_calibration(options: ImuOptions, known: ImuCalibration, link: Link, ask: Ask) -> ImuCalibration:

@@ -67,6 +67,7 @@ def run(options: DoctorOptions) -> int:
 
 def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions, console: Console) -> list[Check]:
     """Return all checks of ports, adapters, servos, buses, IMU and camera; mends and scans where that was asked for."""
+    from wlr_gym.hardware.imu import ImuStream
     from wlr_gym.hardware.loop import TIMED_READS
     from wlr_gym.hardware.safety import preflight
     from wlr_gym.hardware.safety.preflight import check_camera
@@ -92,6 +93,8 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
         found.append(preflight.Check("robot", "bus", False, str(error), "a bus that stays", "Check plugs and supply."))
     if "imu" in open_here:
         found += preflight.check_imu(link.imu, hardware.imu, link.clock)
+        if isinstance(link.imu, ImuStream):
+            found += preflight.check_board(link.imu, hardware.imu, link.clock)
     if "flow" in open_here and link.flow is not None and hardware.flow is not None:
         found += preflight.check_flow(link.flow, hardware.flow, link.clock)
     if link.camera is not None and (file := options.camera_file()) is not None:

@@ -294,6 +294,9 @@ class Hardware(SettingsModel):
     def _names_are_known(self) -> Hardware:
         for name in {"imu", "flow"} & set(self.buses):
             raise ValueError(f"buses.{name}: a sensor is called that; expected another name for the bus")
+        if self.flow is not None and self.flow.port == self.imu.port and self.flow.baud_rate != self.imu.baud_rate:
+            rates = f"{self.flow.baud_rate}, but imu has {self.imu.baud_rate}"
+            raise ValueError(f"flow.baud_rate: {rates} on the same port; expected one speed")
         for name, values in self.measured:
             for place in values:
                 check_name("joint or bus", place, (*JOINTS, *self.buses), f"measured.{name}")
@@ -360,6 +363,8 @@ def with_ports(hardware: Hardware, ports: dict[str, str]) -> Hardware:
         InputError: a name that is no bus.
     """
     changed: dict[str, Any] = {"buses": dict(hardware.buses)}
+    if "imu" in ports and hardware.flow is not None and hardware.flow.port == hardware.imu.port:
+        ports = {"flow": ports["imu"], **ports}  # both are on one board
     for name, port in ports.items():
         check_name("port", name, hardware.port_names)
         if name in hardware.buses:

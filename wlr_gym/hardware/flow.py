@@ -1,9 +1,8 @@
 """The optical-flow sensor in rad/s along the body's axes: a PMW3901 behind a microcontroller's serial stream.
 
-The microcontroller polls the chip faster than its 121 frames per second, and sends a frame
-(:mod:`wlr_gym.hardware.serial_frames`) for each of the chip's, or for several: 20 bytes with sync A5 F1, stamped when the
-chip's last one was taken. Content: microseconds from the chip's frame before the first counted to that one (u16), counts along
-the chip's x and y (i16), SQUAL (u8), one byte that is 0, Shutter (u16).
+The microcontroller (``firmware/``) polls the chip faster than its 121 frames per second, and sends a frame
+(:data:`wlr_gym.hardware.serial_frames.FLOW_FRAMES`) for each of the chip's, or for several, stamped when the chip's last one
+was taken. Its ``interval`` is from the chip's frame before the first counted to that one.
 """
 
 from __future__ import annotations
@@ -17,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.hardware.config import FlowPort
-from wlr_gym.hardware.serial_frames import Device, FrameFormat, FrameStream, SerialDevice
+from wlr_gym.hardware.serial_frames import FLOW_FRAMES, Device, FrameStream, SerialDevice
 from wlr_gym.robot.description import FlowSensor
 
 Array = NDArray[np.float64]
 
-FLOW_FRAMES = FrameFormat(b"\xa5\xf1", "HhhBxH")
 #: Greatest value of the PMW3901's register SQUAL.
 FULL_QUALITY = 255
 #: s: what was counted before is no part of a reading: control steps were missed.

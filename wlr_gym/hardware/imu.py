@@ -1,8 +1,7 @@
 """The IMU in SI units and the body frame: an MPU-6050 behind a microcontroller's serial stream, or on this computer's I2C bus.
 
-The stream's frames (:mod:`wlr_gym.hardware.serial_frames`) hold the chip's burst in its own counts, body axes: accelerometer
-x, y, z, temperature, gyroscope x, y, z (i16 each; degC = counts/340 + 36.53): 24 bytes with sync A5 5A. The chip is driven by
-register map RM-MPU-6000A revision 4.2 (Linux).
+The stream's frames (:data:`wlr_gym.hardware.serial_frames.IMU_FRAMES`) hold the chip's burst in its own counts and axes;
+``firmware/`` sends them. On I2C the chip is driven by register map RM-MPU-6000A revision 4.2 (Linux).
 """
 
 from __future__ import annotations
@@ -18,13 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.hardware.config import ImuCalibration, ImuPort
-from wlr_gym.hardware.serial_frames import TAKEN, Device, FrameFormat, FrameStream, PortInUseError, SerialDevice
+from wlr_gym.hardware.serial_frames import IMU_FRAMES, TAKEN, Device, FrameStream, PortInUseError, SerialDevice
 from wlr_gym.physics.plants.sensors import rotation
 
 Array = NDArray[np.float64]
 Counts = tuple[int, int, int]
 
-IMU_FRAMES = FrameFormat(b"\xa5\x5a", "7h")
 #: One g as the MPU-6050's data sheet counts it, m/s2.
 STANDARD_GRAVITY = 9.80665
 
@@ -343,6 +341,10 @@ class Mpu6050:
 Imu = ImuStream | Mpu6050
 
 
-def make_imu(port: ImuPort, clock: Callable[[], float] = time.monotonic) -> Imu:
-    """Return the IMU the hardware file names, not yet connected; ``clock`` (s) tells ages."""
-    return Mpu6050(port, clock) if port.driver == "i2c" else ImuStream(port, clock)
+def make_imu(
+    port: ImuPort,
+    clock: Callable[[], float] = time.monotonic,
+    make_device: Callable[[str, int, str], Device] = SerialDevice,
+) -> Imu:
+    """Return the IMU the hardware file names, not yet connected; see :class:`ImuStream` for the arguments."""
+    return Mpu6050(port, clock) if port.driver == "i2c" else ImuStream(port, clock, make_device)

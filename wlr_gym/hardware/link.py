@@ -24,6 +24,7 @@ from wlr_gym.hardware.safety.camera import CameraWatch, camera_statistics
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.preflight import NotReadyError
 from wlr_gym.hardware.safety.rules import VERTICAL_BAND, Mask, RobotStatus, next_up, reach, tilt_of, unseen
+from wlr_gym.hardware.serial_frames import SharedPorts
 from wlr_gym.hardware.servos import JointReadings, ServoRegisters, Servos
 from wlr_gym.hardware.timing import Clock, MonotonicClock
 from wlr_gym.robot import JOINTS, Robot
@@ -72,9 +73,10 @@ def serial_link(robot: Robot, hardware: Hardware, camera: CameraFile | None = No
     clock = MonotonicClock()
     servos = Servos(robot, hardware, hardware.safety.patience, clock.now)
     port, sensor = hardware.flow, robot.sensors.flow
-    flow = None if port is None or sensor is None else FlowStream(port, sensor, clock.now)
+    ports = SharedPorts()  # one board may have both sensors
+    flow = None if port is None or sensor is None else FlowStream(port, sensor, clock.now, ports)
     eye = None if camera is None else LiveCamera(camera, robot, poses)
-    return Link(servos, make_imu(hardware.imu, clock.now), clock, is_serial=True, flow=flow, camera=eye)
+    return Link(servos, make_imu(hardware.imu, clock.now, ports), clock, is_serial=True, flow=flow, camera=eye)
 
 
 # ---- what is known ----
@@ -83,8 +85,8 @@ def serial_link(robot: Robot, hardware: Hardware, camera: CameraFile | None = No
 HEALTH_STEPS = 5
 #: s that a reading may be old by which the robot is judged to stand.
 ATTITUDE_AGE = 0.1
-#: s the IMU may take until its first reading.
-IMU_TIME = 0.5
+#: s the IMU may take until its first reading: an Arduino boots for 2 when its port is opened.
+IMU_TIME = 3.0
 
 
 class Sensing:

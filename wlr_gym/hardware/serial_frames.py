@@ -1,9 +1,12 @@
-"""Serial devices: bytes in and out, and the numbered frames in which a microcontroller sends what its sensor read.
+"""Serial devices: bytes in and out, and the numbered frames in which a microcontroller sends what its sensors read.
 
 Servo buses, IMU and optical-flow sensor stand on :class:`SerialDevice`: one program has it at a time, every failure is an
 ``OSError``, and no call waits longer than it is told. Sensors send frames of fixed size (:class:`FrameFormat`): two bytes of
 sync, sequence number (u16), microseconds since the microcontroller's boot (u32), content, CRC-16 of all before it (polynomial
 8005, as the servos use); little-endian, numbers wrap. :class:`FrameStream` reads them and tells when each was taken.
+
+:data:`FORMATS` is the one description of the frames: readers and emulator use it, and ``firmware/header.py`` writes the
+firmware's header from it. One line may carry all kinds. :data:`STATUS_REQUEST` has the board send a status frame.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import errno
 import os
 import select
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -34,6 +37,7 @@ _CHUNK, _LARGEST_BACKLOG = 4096, 64
 #: s since the port was last empty, up to which frames are hardly older than that: they relate the clocks.
 _RECENT = 0.1
 _CRC_SIZE = 2
+_SYNC = b"\xa5"
 
 
 class PortInUseError(InputError):
@@ -127,6 +131,60 @@ class SerialDevice:
         return self.serial.fileno()
 
 
+class SharedPorts:
+    """Opens serial devices. Readers of one path share it, and each gets all its bytes: a board has one line for its sensors.
+
+    Args:
+        make_device: opens one: path, bit/s, name for messages.
+    """
+
+    def __init__(self, make_device: Callable[[str, int, str], Device] = SerialDevice) -> None:
+        self._make_device = make_device
+        self._shares: dict[str, list[SharedDevice]] = {}
+
+    def __call__(self, path: str, baud_rate: int, name: str) -> Device:
+        """Open a device, or join those who have it open."""
+        shares = self._shares.setdefault(path, [])
+        return SharedDevice(shares[0].device if shares else self._make_device(path, baud_rate, name), shares)
+
+
+class SharedDevice:
+    """One reader's share of a device; the last one that closes it closes the device."""
+
+    def __init__(self, device: Device, shares: list[SharedDevice]) -> None:
+        self.device, self._shares, self._buffer = device, shares, bytearray()
+        shares.append(self)
+
+    def received(self) -> bytes:
+        """Return all bytes that have come since this reader asked last."""
+        return self._take(self.device.received())
+
+    def wait(self, seconds: float) -> bytes:
+        """Return bytes as soon as there are some; none when the time is over."""
+        return self._take(b"" if self._buffer else self.device.wait(seconds))
+
+    def write(self, data: bytes) -> int:
+        """Send bytes."""
+        return self.device.write(data)
+
+    def reset_input_buffer(self) -> None:
+        """Throw away what has come for this reader."""
+        self.received()
+
+    def close(self) -> None:
+        """Leave the device to the others."""
+        self._shares.remove(self)
+        if not self._shares:
+            self.device.close()
+
+    def _take(self, data: bytes) -> bytes:
+        for share in self._shares:
+            share._buffer += data
+        taken = bytes(self._buffer)
+        self._buffer.clear()
+        return taken
+
+
 # ---- frames ----
 
 
@@ -148,22 +206,25 @@ def crc16(data: bytes, crc: int = 0) -> int:
 
 
 class FrameFormat:
-    """How the frames of one kind of sensor look.
+    """How the frames of one kind look.
 
     Args:
-        sync: how a frame begins, two bytes.
-        content: of what comes after sequence number and microseconds, as ``struct`` writes it.
+        sync: how a frame begins, two bytes, the first of which is that of all kinds.
+        content: name -> type (as ``struct`` writes it) of what comes after sequence number and microseconds, in order; ``x`` is
+            a byte of padding.
 
     Attributes:
         size: bytes of a frame.
+        fields: name -> type of everything between sync and CRC.
     """
 
-    def __init__(self, sync: bytes, content: str) -> None:
+    def __init__(self, sync: bytes, content: dict[str, str]) -> None:
         self.sync = sync
-        self._layout = struct.Struct(f"<2sHI{content}")
+        self.fields: dict[str, str] = {"sequence": "H", "microseconds": "I", **content}
+        self._layout = struct.Struct("<2s" + "".join(self.fields.values()))
         self.size: int = self._layout.size + _CRC_SIZE
 
-    def encode(self, numbers: tuple[int, ...]) -> bytes:
+    def encode(self, numbers: Iterable[int]) -> bytes:
         """Return a frame as bytes: its sequence number and microseconds, wrapped, and its content."""
         sequence, microseconds, *content = numbers
         body = self._layout.pack(self.sync, sequence % 2**16, microseconds % 2**32, *content)
@@ -175,8 +236,46 @@ class FrameFormat:
         return self._layout.unpack(body)[1:] if crc16(body) == int.from_bytes(crc, "little") else None
 
 
+#: The MPU-6050's burst in its own counts; degC = temperature/340 + 36.53.
+IMU_FRAMES = FrameFormat(
+    b"\xa5\x5a", dict.fromkeys(("accel_x", "accel_y", "accel_z", "temperature", "gyro_x", "gyro_y", "gyro_z"), "h")
+)
+#: What the PMW3901 counted in ``interval`` us that end at the stamp; quality is its SQUAL.
+FLOW_FRAMES = FrameFormat(b"\xa5\xf1", {"interval": "H", "x": "h", "y": "h", "quality": "B", "zero": "x", "shutter": "H"})
+#: Version, settings, and counters (modulo 65536) of the board.
+STATUS_FRAMES = FrameFormat(
+    b"\xa5\xc3",
+    {
+        "version_major": "B",
+        "version_minor": "B",
+        "reset_cause": "B",  # the ATmega328P's MCUSR
+        "sensors": "B",  # bits of SENSORS: what is there and set up
+        "imu_rate": "H",  # Hz
+        "gyro_range": "H",  # deg/s
+        "accel_range": "B",  # g
+        "bandwidth": "B",  # Hz
+        "baud_rate": "I",
+        "imu_identity": "B",  # WHO_AM_I as it was answered last; 0 = nobody did
+        "bus_errors": "H",  # transfers of the two-wire bus that failed
+        "bus_locks": "H",  # times the bus was held, and freed
+        "imu_restarts": "H",  # times the IMU had gone
+        "imu_missed": "H",  # samples that were not read before the next
+        "flow_restarts": "H",  # times the flow sensor had gone
+        "line_full": "H",  # frames that found no room in the buffer of the line
+    },
+)
+FORMATS = {"imu": IMU_FRAMES, "flow": FLOW_FRAMES, "status": STATUS_FRAMES}
+#: Sensor -> its bit in the status frame.
+SENSORS = {"imu": 1, "flow": 2}
+#: What the host sends to get a status frame.
+STATUS_REQUEST = b"\xa5?"
+#: Of the firmware; another major number speaks another language.
+FIRMWARE_VERSION = (1, 0)
+_BY_SYNC = {format.sync[1]: format for format in FORMATS.values()}
+
+
 class FrameParser:
-    """Finds whole frames in a stream, and counts by their sequence numbers (modulo 65536) what is missing.
+    """Finds whole frames of one kind in a stream, and counts by their sequence numbers (modulo 65536) what is missing.
 
     Noise costs no more than the frames it hits.
 
@@ -187,6 +286,7 @@ class FrameParser:
     Attributes:
         lost: frames missing between the received ones.
         crc_errors: frames dropped because their CRC was wrong.
+        status: the last status frame's fields; None = there was none.
     """
 
     def __init__(self, format: FrameFormat, *, repeats: bool = True) -> None:
@@ -194,25 +294,42 @@ class FrameParser:
         self._buffer = bytearray()
         self._last: int | None = None
         self.lost = self.crc_errors = 0
+        self.status: dict[str, int] | None = None
 
     def feed(self, data: bytes) -> list[tuple[int, ...]]:
         """Take bytes; return the frames they complete: sequence number, microseconds, content."""
-        buffer, size, frames = self._buffer, self._format.size, []
+        buffer, place, frames = self._buffer, 0, []
         buffer += data
-        while (place := buffer.find(self._format.sync)) >= 0 and len(buffer) >= place + size:
-            frame = self._format.decode(bytes(buffer[place : place + size]))
-            if frame is None:
-                self.crc_errors += 1
-                del buffer[: place + 1]
+        while (place := _first(buffer, place)) + 1 < len(buffer):
+            format = _BY_SYNC.get(buffer[place + 1])
+            if format is not None and len(buffer) < place + format.size:
+                break
+            frame = None if format is None else format.decode(bytes(buffer[place : place + format.size]))
+            if format is None or frame is None:
+                self.crc_errors += format is self._format
+                place += 1
                 continue
-            del buffer[: place + size]
-            sequence, last, self._last = frame[0], self._last, frame[0]
-            if sequence != last:
-                self.lost += 0 if last is None else (sequence - last - 1) % 65536
-            if sequence != last or self._repeats:
+            place += format.size
+            if format is self._format and self._is_wanted(frame[0]):
                 frames.append(frame)
-        del buffer[: max(0, len(buffer) - 2 * size)]  # noise without a start never piles up
+            elif format is STATUS_FRAMES:
+                self.status = dict(zip(format.fields, frame, strict=True))
+        del buffer[:place]
         return frames
+
+    def _is_wanted(self, sequence: int) -> bool:
+        """Count what is missing before a frame; return whether to hand it on."""
+        last, self._last = self._last, sequence
+        if sequence == last:
+            return self._repeats
+        self.lost += 0 if last is None else (sequence - last - 1) % 65536
+        return True
+
+
+def _first(buffer: bytearray, place: int) -> int:
+    """Return where the next frame may begin, from ``place`` on; the end where none does."""
+    found = buffer.find(_SYNC, place)
+    return len(buffer) if found < 0 else found
 
 
 class StreamClock:
@@ -319,6 +436,20 @@ class FrameStream:
         if self._device is not None:
             self._device.close()
             self._device = None
+
+    def request_status(self) -> None:
+        """Ask the board for its status, which :attr:`FrameParser.status` has once it came.
+
+        Raises:
+            ConnectionError: the port is not open, or is gone.
+        """
+        if self._device is None:
+            raise ConnectionError("not open")
+        self.parser.status = None
+        try:
+            self._device.write(STATUS_REQUEST)
+        except OSError as error:
+            raise ConnectionError(f"gone: {error}") from None
 
     def frames(self) -> list[TimedFrame]:
         """Return the frames that have come since the last call; does not wait.

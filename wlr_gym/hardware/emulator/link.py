@@ -16,6 +16,7 @@ from wlr_gym.hardware.emulator.machine import Machine, MachineOptions
 from wlr_gym.hardware.flow import FlowStream
 from wlr_gym.hardware.imu import ImuStream
 from wlr_gym.hardware.link import Link
+from wlr_gym.hardware.serial_frames import SharedPorts
 from wlr_gym.hardware.servos import Servos
 from wlr_gym.physics.effects.patch import Source
 from wlr_gym.physics.floor import FloorSource
@@ -89,9 +90,12 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
     def make_port(path: str, baud_rate: int, patience: float) -> DynamixelPort:
         return DynamixelPort(names[path], baud_rate, patience, machine.now, partial(MemoryDevice, machine))
 
+    sensors = {} if hardware.flow is None else {hardware.flow.port: "flow"}
+    sensors[hardware.imu.port] = "imu"
+    ports = SharedPorts(lambda path, *_: MemoryDevice(machine, sensors[path]))
     flow = eye = None
     if hardware.flow is not None and robot.sensors.flow is not None:
-        flow = FlowStream(hardware.flow, robot.sensors.flow, machine.now, lambda *_: MemoryDevice(machine, "flow"))
+        flow = FlowStream(hardware.flow, robot.sensors.flow, machine.now, ports)
     if camera is not None:
         from wlr_gym.hardware.emulator.camera import EmulatedCamera
 
@@ -99,7 +103,7 @@ def emulated_link(machine: Machine, camera: CameraFile | None = None) -> Link:
         eye = EmulatedCamera(machine, camera)
     return Link(
         servos=Servos(robot, hardware, hardware.safety.patience, machine.now, make_port),
-        imu=ImuStream(hardware.imu, machine.now, lambda *_: MemoryDevice(machine, "imu")),
+        imu=ImuStream(hardware.imu, machine.now, ports),
         clock=machine,
         is_serial=False,
         finish=machine.close,

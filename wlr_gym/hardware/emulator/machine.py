@@ -37,8 +37,16 @@ from wlr_gym.hardware.dynamixel.tables import (
 from wlr_gym.hardware.emulator.faults import Fault, FaultBoard, parse_fault
 from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
 from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo, MotorDrive
-from wlr_gym.hardware.flow import FLOW_FRAMES, FULL_QUALITY, FlowConversion
-from wlr_gym.hardware.imu import IMU_FRAMES, Conversion
+from wlr_gym.hardware.flow import FULL_QUALITY, FlowConversion
+from wlr_gym.hardware.imu import IDENTITY, Conversion
+from wlr_gym.hardware.serial_frames import (
+    FIRMWARE_VERSION,
+    FLOW_FRAMES,
+    IMU_FRAMES,
+    SENSORS,
+    STATUS_FRAMES,
+    STATUS_REQUEST,
+)
 from wlr_gym.physics import servo as law
 from wlr_gym.physics.effects.patch import Source, apply_patch, load_patch
 from wlr_gym.physics.floor import FloorSource, lay_floor, load_floor
@@ -137,8 +145,10 @@ class Machine:
         self._flow: EmulatedFlow | None = None
         if port is not None and sensor is not None:
             self._flow = EmulatedFlow(port, sensor, self.faults, self.options.tick)
-        self.sensors: tuple[str, ...] = ("imu",) if self._flow is None else ("imu", "flow")
-        self.places: tuple[str, ...] = (*JOINTS, *hardware.buses, *self.sensors, "camera")
+        sensors = ("imu",) if self._flow is None else ("imu", "flow")
+        self._flow_line = "imu" if port is not None and port.port == hardware.imu.port else "flow"
+        self.sensors: tuple[str, ...] = sensors if self._flow_line == "flow" else ("imu",)
+        self.places: tuple[str, ...] = (*JOINTS, *hardware.buses, *sensors, "camera")
         self.is_plugged: dict[str, bool] = dict.fromkeys([*hardware.buses, *self.sensors], True)
         self.pulls: dict[str, int] = dict.fromkeys(self.is_plugged, 0)
         self._due: dict[str, list[tuple[float, int, bytes]]] = {name: [] for name in self.is_plugged}
@@ -188,7 +198,7 @@ class Machine:
         while self.time >= (self._frames + 1) / self.hardware.imu.rate - 1e-9:
             self._read_imu()
         if self._flow is not None:
-            self._send("flow", self._flow.step(self.time, self._paused, self.coupling.sensors))
+            self._send(self._flow_line, self._flow.step(self.time, self._paused, self.coupling.sensors))
         if self.faults.any or not all(self.is_plugged.values()):
             self._pull_and_plug()
         for watcher in self.watchers:
@@ -243,8 +253,24 @@ class Machine:
     # ---- the adapters ----
 
     def receive(self, bus: str, data: bytes, now: float, baud_rate: int | None) -> None:
-        """Take bytes that the host sent to a bus at ``now`` (s); see :meth:`BusLine.receive`."""
-        self._send(bus, self.lines[bus].receive(data, now, baud_rate))
+        """Take bytes that the host sent to a bus (see :meth:`BusLine.receive`) or a sensor's board at ``now`` (s)."""
+        if bus in self.lines:
+            self._send(bus, self.lines[bus].receive(data, now, baud_rate))
+        elif STATUS_REQUEST in data:
+            self._send(bus, [Emission(self.time, self._board_status(bus))])
+
+    def _board_status(self, port: str) -> bytes:
+        """Return the status frame of the board on a sensor's line: an untroubled one, set up as the hardware file says."""
+        imu, microseconds = self.hardware.imu, round((self.time + self._paused) * 1e6)
+        here = {port, *(["flow"] if self._flow is not None and port == self._flow_line else [])}
+        status = dict.fromkeys(STATUS_FRAMES.fields, 0) | dict(
+            zip(("version_major", "version_minor"), FIRMWARE_VERSION, strict=True)
+        )
+        status |= {"microseconds": microseconds, "sensors": sum(SENSORS[name] for name in here), "imu_identity": IDENTITY}
+        status |= {"imu_rate": round(imu.rate)} | imu.model_dump(
+            include={"gyro_range", "accel_range", "bandwidth", "baud_rate"}
+        )
+        return STATUS_FRAMES.encode(status.values())
 
     def arrived(self, port: str, now: float | None = None) -> bytes:
         """Take the bytes of a bus or a sensor that have reached the host at ``now`` (s); None = at emulated time."""

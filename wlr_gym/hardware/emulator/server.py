@@ -323,7 +323,7 @@ class Server:
     def _listen(self, names: list[str]) -> None:
         for name in names:
             port = self._ports[name]
-            if (data := port.read()) and name in self.machine.lines:  # the microcontrollers of the sensors take no orders
+            if data := port.read():
                 self._slip(ANSWER_LAG)
                 self.machine.receive(name, data, self._now(), port.baud_rate())
 

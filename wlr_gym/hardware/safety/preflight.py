@@ -26,9 +26,9 @@ from wlr_gym.hardware.config import FIXED_REGISTERS, Bus, FlowPort, Hardware, Im
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import error_names, load_table
 from wlr_gym.hardware.flow import FlowStream
-from wlr_gym.hardware.imu import STANDARD_GRAVITY, Imu, ImuGoneError
+from wlr_gym.hardware.imu import RELATIVES, STANDARD_GRAVITY, Imu, ImuGoneError, ImuStream
 from wlr_gym.hardware.safety.camera import LARGEST_AGE, LARGEST_SIGMA
-from wlr_gym.hardware.serial_frames import PortInUseError, is_pseudo_terminal
+from wlr_gym.hardware.serial_frames import FIRMWARE_VERSION, SENSORS, PortInUseError, is_pseudo_terminal
 from wlr_gym.hardware.servos import JointMap, Servos
 from wlr_gym.hardware.timing import Clock
 from wlr_gym.robot import JOINTS, LEGS, Robot
@@ -49,6 +49,8 @@ _LOOK_TIME, _IMU_PERIOD, _FLOW_PERIOD = 1.0, 0.005, 0.02
 FLOW_REST = 0.1
 #: s from emptying the IMU's port until what comes is of now.
 SETTLE_TIME = 0.05
+#: s from opening the port until an Arduino's sensors send: its bootloader runs for 2. s the board's status may take.
+BOOT_TIME, STATUS_TIME = 3.0, 0.3
 #: rad/s a calibrated gyroscope may read at rest.
 LARGEST_RATE = 0.02
 #: rad that gravity may be off the vertical.
@@ -379,6 +381,8 @@ def sample_imu(imu: Imu, clock: Clock, seconds: float = _LOOK_TIME) -> ImuSample
 
 
 _LIGHT = "Give it light and a floor with texture, 80 mm or more below it; check its supply, port and wiring."
+#: Counters of the board's status.
+_BOARD_FAULTS = ("bus_errors", "bus_locks", "imu_restarts", "imu_missed", "flow_restarts", "line_full")
 _CABLE = "Shorten the cable, keep it away from the motors' supply, check ground."
 #: Sensor -> check -> what to do where it fails.
 _REMEDIES = {
@@ -417,7 +421,9 @@ def _sensor_check(where: str, what: str, ok: bool, found: str, expected: str, is
 def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
     """Listen to the IMU, which is open, of a robot that stands still on a level floor."""
     try:
-        imu.read()  # what piled up does not count ...
+        end = clock.now() + BOOT_TIME
+        while imu.read() is None and clock.now() < end:  # what piled up does not count ...
+            clock.wait_until(clock.now() + SETTLE_TIME)
         clock.wait_until(clock.now() + SETTLE_TIME)
         imu.read()  # ... nor what was thrown away behind it
         before = replace(imu.statistics)
@@ -449,6 +455,46 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
         _sensor_check("imu", "gravity", right, f"{length:.2f} m/s2", f"{gravity} within {LARGEST_LENGTH_ERROR:.0%}"),
         _sensor_check("imu", "level", tilt < LARGEST_TILT, f"{math.degrees(tilt):.1f} deg", level, True),
     ]
+
+
+def board_status(imu: ImuStream, clock: Clock) -> dict[str, int] | None:
+    """Ask an IMU's board, which is open, for its status; None = it does not answer."""
+    try:
+        imu.request_status()
+    except ConnectionError as error:
+        raise ImuGoneError(f"IMU port {imu.path} is {error}") from None
+    end = clock.now() + STATUS_TIME
+    while imu.parser.status is None and clock.now() < end:
+        clock.wait_until(clock.now() + _IMU_PERIOD)
+        imu.read()
+    return imu.parser.status
+
+
+def check_board(imu: ImuStream, port: ImuPort, clock: Clock) -> list[Check]:
+    """Ask the microcontroller of the IMU, which is open, for its firmware, settings and faults."""
+    flash, version = "Flash it: docs/build.md.", ".".join(map(str, FIRMWARE_VERSION))
+    try:
+        status = board_status(imu, clock)
+    except ImuGoneError as error:
+        return [Check("imu", "firmware", False, str(error), version, "Plug it in again, check its cable.")]
+    if status is None:
+        return [Check("imu", "firmware", False, "it does not say", version, flash, is_fatal=False)]
+    found = f"{status['version_major']}.{status['version_minor']}"
+    checks = [Check("imu", "firmware", status["version_major"] == FIRMWARE_VERSION[0], found, version, flash, is_fatal=False)]
+    if not status["sensors"] & SENSORS["imu"]:
+        identity = status["imu_identity"]
+        name = f"{identity:#04x} ({RELATIVES.get(identity, 'another chip')})" if identity else "nobody answers"
+        checks.append(
+            Check("imu", "chip", False, name, "an MPU-6050 (0x68)", "Check its wiring (SDA, SCL, INT), supply, chip.")
+        )
+    units = {"rate": "Hz", "gyro_range": "deg/s", "accel_range": "g", "bandwidth": "Hz bandwidth"}
+    has = {name: status["imu_rate" if name == "rate" else name] for name in units}
+    told, asked = (", ".join(f"{values[name]:g} {units[name]}" for name in units) for values in (has, port.model_dump()))
+    remedy = "Write what the board says into the hardware file (imu), or flash it with the file's settings."
+    checks.append(Check("imu", "settings", told == asked, told, asked, remedy))
+    faults = {name.replace("_", " "): status[name] for name in _BOARD_FAULTS if status[name]}
+    listed = ", ".join(f"{count} {name}" for name, count in faults.items()) or "none"
+    return [*checks, Check("imu", "board faults", not faults, listed, "none since its reset", _CABLE, is_fatal=False)]
 
 
 def check_flow(flow: FlowStream, port: FlowPort, clock: Clock) -> list[Check]:
