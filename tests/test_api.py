@@ -79,8 +79,10 @@ def test_a_policy_is_trained_scored_and_loaded_from_python(tmp_path: Path) -> No
 
 
 def test_baselines_fit_the_task() -> None:
-    from wlr_gym.learning.evaluation.scoring import fitting_baselines
+    from wlr_gym.learning.evaluation.scoring import default_baselines, fitting_baselines
 
     assert fitting_baselines("WLR-Velocity-v0") == ("do_nothing", "pid")
+    assert default_baselines("pid", "WLR-Velocity-v0") == ("do_nothing", "pid")
+    assert default_baselines("velocity_blind", "WLR-Velocity-v0") == ("do_nothing", "pid", "slip_compensating_no_camera")
     with pytest.raises(InputError, match="unknown backend 'mujco' \\(did you mean 'mujoco'"):
         wlr_gym.evaluate("pid", backend="mujco")

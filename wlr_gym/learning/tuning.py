@@ -21,6 +21,7 @@ from wlr_gym.base.files import output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.envs.interfaces import Infos
+from wlr_gym.envs.registry import task_name_of
 from wlr_gym.learning.evaluation.metrics import has_limits
 from wlr_gym.learning.evaluation.rollout import make_core, measures_of, start_episodes
 from wlr_gym.policy import Policy, Training, write_contract
@@ -57,7 +58,9 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
         if name not in tunable:
             raise unknown_name("setting", name, tunable, f"agent '{agent}': search.steps")
     episodes = general.search.episodes
-    with closing(make_core(training.environment, episodes, config.get("environment", {}))) as core:
+    floors = general.search.randomization.get(task_name_of(training.environment))
+    keywords = dict(config.get("environment", {})) | ({} if floors is None else {"randomization": floors})
+    with closing(make_core(training.environment, episodes, keywords)) as core:
         contract = core.contract()
         if not has_limits(measures_of(core)):
             raise InputError(f"agent '{agent}' is tuned by the limits of a task's success, and '{contract['task']}' has none")

@@ -138,11 +138,13 @@ class SearchConfig(SettingsModel):
         steps: setting -> its first step.
         rounds: passes over the settings.
         episodes: that every candidate is scored by.
+        randomization: task -> floors and robots of these episodes; a task without one has the environment's.
     """
 
     steps: dict[str, float] = Field(default_factory=dict)
     rounds: int = Field(default=5, gt=0)
     episodes: int = Field(default=256, gt=0)
+    randomization: dict[str, Any] = Field(default_factory=dict)
 
 
 class PidGains(SettingsModel):
@@ -151,6 +153,8 @@ class PidGains(SettingsModel):
     Attributes:
         steering: wheel speed difference over what rolling alone needs for the wanted yaw rate.
         yaw_rate_p: on the error of the gyro's yaw rate. yaw_rate_i: on its integral, 1/s.
+        forward_lead, turn_lead: s by which the commanded forward velocity and yaw rate run ahead as they change: that is how
+            late wheels and body follow. Up to ``integral_limit``.
         velocity_p: on the error of the estimated forward velocity. velocity_i: on its integral, 1/s.
         lateral: yaw rate per lateral error, rad/(m s). heading: yaw rate per heading error, 1/s.
         uphill: yaw rate per specific force to the left, rad s/m: turns the robot uphill on a slope.
@@ -164,6 +168,8 @@ class PidGains(SettingsModel):
     steering: float = Field(1.0, ge=0)
     yaw_rate_p: float = Field(0.0, ge=0)
     yaw_rate_i: float = Field(0.0, ge=0)
+    forward_lead: float = Field(0.0, ge=0)
+    turn_lead: float = Field(0.0, ge=0)
     velocity_p: float = Field(0.0, ge=0)
     velocity_i: float = Field(0.0, ge=0)
     lateral: float = Field(0.0, ge=0)
@@ -248,16 +254,17 @@ class Pid:
         self._period = period
         self._sees_legs = f"leg_position[{LEGS[0]}]" in read
         self._sent: Array = np.zeros((0, 4))
+        self._commands: Array = np.zeros((2, 0))
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
         """Return actions (N, 8) for observations (N, D)."""
         forward, turn = self.motion(observations)
+        without, rate = self.legs(observations)
         reach, reach_rate = self._reach_under(observations)
-        without = self.legs(observations)
         legs = without + reach
         self._sent = self.chassis.within(legs) - without
         rolling = self.rolling_speed(observations, forward, turn)
-        wheels = self.chassis.wheel_rate(rolling, legs, self.leg_rate(observations) + reach_rate)
+        wheels = self.chassis.wheel_rate(rolling, legs, rate + reach_rate)
         return self.chassis.actions(legs + self._leg_integral.add(legs - self.leg_angle(observations)), wheels)
 
     def _reach_under(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
@@ -271,7 +278,7 @@ class Pid:
         angle = self.leg_angle(observations)
         error = angle - self.chassis.robot.home.leg_angle if self._sees_legs else np.zeros(angle.shape)
         before = np.where(np.isnan(self._sent), error, self._sent)
-        step = abs(config.legs_inward) * self._period / max(config.lean_time, self._period)
+        step = self.pace() * abs(config.legs_inward) * self._period / max(config.lean_time, self._period)
         change = np.clip(wanted - before, -step, step)
         return before + change, change / self._period
 
@@ -280,12 +287,23 @@ class Pid:
         config = self.config
         forward = self.forward(observations)
         turn = self.wanted_yaw_rate(observations, forward)
+        lead, turn_lead = self._leads(forward, self.turn(observations))
         error = turn - self.gyro(observations)
-        turn = config.steering * turn + config.yaw_rate_p * error + self._yaw_rate_integral.add(error)
-        if self.estimated_forward is not None:
-            error = forward - self.estimated_forward(observations)
-            forward = forward + config.velocity_p * error + self._velocity_integral.add(error)
+        turn = config.steering * (turn + turn_lead) + config.yaw_rate_p * error + self._yaw_rate_integral.add(error)
+        if self.estimated_forward is None:
+            return forward + lead, turn
+        error = forward - self.estimated_forward(observations)
+        forward = forward + lead + config.velocity_p * error + self._velocity_integral.add(error)
         return forward, turn
+
+    def _leads(self, forward: Array, turn: Array) -> Array:
+        """Return by how much commanded forward velocities (N,), m/s, and yaw rates (N,), rad/s, run ahead (2, N)."""
+        commands, limit = np.stack([forward, turn]), self.config.integral_limit
+        before = self._commands if self._commands.shape == commands.shape else np.full(commands.shape, np.nan)
+        self._commands = commands
+        seconds = np.array([[self.config.forward_lead], [self.config.turn_lead]])
+        change = np.where(np.isnan(before), 0.0, commands - before)
+        return np.clip(seconds / self._period * change, -limit, limit)
 
     def wanted_yaw_rate(self, observations: NDArray[np.floating], forward: Array) -> Array:
         """Return the commanded yaw rate (N,), or the one that leads back to the path."""
@@ -293,9 +311,13 @@ class Pid:
         steer = self.curvature(observations) * forward - self.config.lateral * lateral - self.config.heading * heading
         return self.turn(observations) + steer + self.config.uphill * self.leftward_force(observations)
 
-    def legs(self, observations: NDArray[np.floating]) -> Array:
-        """Return the leg setpoints (N, 4), rad, without what reaches under the body."""
-        return self.chassis.robot.home.leg_angle + self.leg_offset(observations)
+    def pace(self) -> Array | float:
+        """Return how many times faster than within ``lean_time`` the legs (N, 4) reach under the body."""
+        return 1.0
+
+    def legs(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
+        """Return the leg setpoints (N, 4), rad, without what reaches under the body, and how fast they move, rad/s."""
+        return self.chassis.robot.home.leg_angle + self.leg_offset(observations), self.leg_rate(observations)
 
     def rolling_speed(self, observations: NDArray[np.floating], forward: Array, turn: Array) -> Array:
         """Return how fast each wheel is to roll ahead (N, 4), m/s."""
@@ -308,6 +330,8 @@ class Pid:
         self._leg_integral.reset(mask)
         if len(self._sent) == len(mask):
             self._sent[mask] = np.nan
+        if self._commands.shape[1] == len(mask):
+            self._commands[:, mask] = np.nan
 
 
 def task_settings(model: type[Settings], contract: Mapping[str, Any], config: Mapping[str, Any], agent: str) -> Settings:
@@ -321,6 +345,14 @@ def task_settings(model: type[Settings], contract: Mapping[str, Any], config: Ma
 # ---- with the slip observer ------------------------------------------------------------------------------------------
 
 
+#: Time constants of what the warp follows: the yaw rate's error, the slip of the sides, s.
+ERROR_TIME, SLIP_TIME = 0.08, 0.3
+#: The sides slip unevenly where the difference over the mean (and this, m/s) exceeds so much, surely where by so much.
+LEAST_SLIP, UNEVEN, UNEVEN_RANGE = 0.01, 0.9, 0.4
+#: How fast the warp moves, rad/s.
+WARP_RATE = 0.2
+
+
 class SlipGains(PidGains):
     """Gains: those of ``pid``, and
 
@@ -329,12 +361,21 @@ class SlipGains(PidGains):
         load_shift: share of the load moved per difference of the axles' slip speeds, s/m; 0 = legs stay.
         load_shift_time: time constant of that difference, s.
         largest_shift: of the share.
+        warp: largest angle by which the legs of one side lean one way and those of the other side the other, rad; 0 = never.
+        warp_rise: of the warp's level (0 to 1) per s and rad/s of yaw rate error beyond ``warp_threshold`` (rad/s).
+        warp_forget: s in which the level falls to 1/e.
+        warp_reach: how many times faster, more, the unloaded legs reach under the body at the whole level.
     """
 
     slip_limit: float = Field(1.0, gt=0)
     load_shift: float = Field(0.0, ge=0)
     load_shift_time: float = Field(0.5, gt=0)
     largest_shift: float = Field(0.14, ge=0, lt=0.3)
+    warp: float = Field(0.0, ge=-0.2, le=0.2)
+    warp_rise: float = Field(60.0, ge=0)
+    warp_threshold: float = Field(0.015, ge=0)
+    warp_forget: float = Field(5.0, gt=0)
+    warp_reach: float = Field(0.0, ge=0)
 
 
 class SlipCompensatingConfig(SlipGains, PidConfig):
@@ -352,6 +393,10 @@ class SlipCompensating(Pid):
     length l the front wheels carry the share 1/2 - l cos(phi) / l_x of the body: equations (16) and (17) of the paper,
     corrected (``studies/paper/corrected.py``), for parallel legs on a level floor, their own mass neglected. Load goes to the
     axle that slips less: the smoothed difference of the axles' slip is remembered.
+
+    Warp: where the robot turns too little and one side slips more than the other, the legs of the left lean one way and those
+    of the right the other, which moves the load to one wheel diagonal. There it turns whatever the ratio of the frictions
+    (docs/physics.md). Which diagonal does not matter. The level rises with the yaw rate's error and is forgotten slowly.
     """
 
     def __init__(self, contract: Mapping[str, Any], config: SlipCompensatingConfig) -> None:
@@ -359,6 +404,7 @@ class SlipCompensating(Pid):
         self.settings = config
         self.velocity = self.readings.first((ESTIMATED_FORWARD,))
         self._slip = [self.readings.first((f"estimated_slip_velocity[{wheel},x]",)) for wheel in WHEELS]
+        self._warp = Warp(config, contract["control_period"])
         self._share = min(1.0, contract["control_period"] / config.load_shift_time)
         self._difference: Array = np.zeros(0)
         hip = self.chassis.robot.hip_position
@@ -371,9 +417,16 @@ class SlipCompensating(Pid):
         wanted = super().rolling_speed(observations, forward, turn)
         return np.clip(wanted, travel - allowed[:, None], travel + allowed[:, None])
 
-    def legs(self, observations: NDArray[np.floating]) -> Array:
-        """Return the leg setpoints (N, 4), rad: leaning so that the load is on the axle that slips less."""
-        home = super().legs(observations)
+    def pace(self) -> Array:
+        """Return how many times faster than within ``lean_time`` the legs (N, 4) reach under the body: while warped, those
+        that the warp unloads hurry."""
+        unloaded = self.chassis.front * self.chassis.left < 0
+        return 1.0 + self.settings.warp_reach * self._warp.level[:, None] * unloaded
+
+    def legs(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
+        """Return the leg setpoints (N, 4), rad, and their rates, rad/s: leaning so that the load is on the axle that slips
+        less, and warped."""
+        home, rate = super().legs(observations)
         slip = np.abs(np.stack([read(observations) for read in self._slip], axis=1))
         difference = (slip * self.chassis.front).sum(axis=1) / 2
         if len(self._difference) != len(difference):
@@ -381,13 +434,60 @@ class SlipCompensating(Pid):
         self._difference = self._difference + self._share * (difference - self._difference)
         bound = self.settings.largest_shift
         shift = np.clip(-self.settings.load_shift * self._difference, -bound, bound)
-        return home + lean(self.chassis.robot, shift)[:, None]
+        wanted = self.wanted_yaw_rate(observations, self.forward(observations))
+        left = np.sign(self.chassis.left)
+        warp, warp_rate = self._warp.follow(wanted - self.gyro(observations), slip, left)
+        leaning = home + lean(self.chassis.robot, shift)[:, None]
+        return leaning - warp[:, None] * left, rate - warp_rate[:, None] * left
 
     def reset(self, mask: NDArray[np.bool_]) -> None:
         """Forget the robots in ``mask`` (N,)."""
         super().reset(mask)
+        self._warp.reset(mask)
         known = len(self._difference) == len(mask)
         self._difference = np.where(mask, 0.0, self._difference) if known else np.zeros(len(mask))
+
+
+class Warp:
+    """How far the legs of N robots are warped: see :class:`SlipCompensating`.
+
+    Attributes:
+        angle: (N,) rad. level: (N,) share of the largest warp that is wanted.
+    """
+
+    def __init__(self, gains: SlipGains, period: float) -> None:
+        self._gains, self._period = gains, period
+        self._set(np.zeros((5, 0)))
+
+    def _set(self, state: Array) -> None:
+        self._state = state
+        self.angle, self.level, self._error, self._difference, self._size = state
+
+    def follow(self, error: Array, slip: Array, left: Array) -> tuple[Array, Array]:
+        """Return the warp (N,) after this step, rad, and how fast it moves, rad/s.
+
+        Args:
+            error: wanted less measured yaw rate (N,), rad/s.
+            slip: speed along the heading (N, 4), m/s. left: (4,) +1 for wheels on the left, -1 for those on the right.
+        """
+        gains, period = self._gains, self._period
+        if self._state.shape[1] != len(error):
+            self._set(np.zeros((5, len(error))))
+        slow = self._error + min(period / ERROR_TIME, 1.0) * (error - self._error)
+        difference = self._difference + period / SLIP_TIME * ((slip * left).sum(axis=1) / 2 - self._difference)
+        size = self._size + period / SLIP_TIME * (slip.mean(axis=1) - self._size)
+        uneven = np.abs(difference) / (size + LEAST_SLIP)
+        split = np.clip((uneven - UNEVEN) / UNEVEN_RANGE, 0.0, 1.0)
+        rise = gains.warp_rise * split * np.maximum(np.abs(slow) - gains.warp_threshold, 0.0)
+        level = np.clip(self.level + period * (rise - self.level / gains.warp_forget), 0.0, 1.0)
+        step = np.clip(gains.warp * level - self.angle, -WARP_RATE * period, WARP_RATE * period)
+        self._set(np.stack([self.angle + step, level, slow, difference, size]))
+        return self.angle, step / period
+
+    def reset(self, mask: NDArray[np.bool_]) -> None:
+        """Forget the robots in ``mask`` (N,)."""
+        if self._state.shape[1] == len(mask):
+            self._state[:, mask] = 0.0
 
 
 def lean(robot: Robot, shift: Array) -> Array:

@@ -11,6 +11,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import versions
 from wlr_gym.base.settings import read_json
+from wlr_gym.policy.control import SlipGains
 from wlr_gym.robot import load_robot
 
 Contract = Mapping[str, Any]
@@ -33,6 +34,7 @@ DEFAULTS = {
     "observer": None,
     "observer.camera": True,
     "controller": None,
+    **{f"controller.{name}": gain.default for name, gain in SlipGains.model_fields.items()},
 }
 _INDEX = re.compile(r"\[\d+\]")
 

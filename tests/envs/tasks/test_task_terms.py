@@ -308,6 +308,7 @@ GAINS = {
     "steering": 1.7, "yaw_rate_p": 3.0, "yaw_rate_i": 4.0, "velocity_p": 2.0, "velocity_i": 3.0, "lateral": 3.0, "heading": 1.5,
     "uphill": 0.05, "legs_inward": 0.1, "lean_time": 0.5, "leg_i": 0.7,
     "integral_limit": 0.05, "slip_limit": 0.05, "load_shift": 2.0, "load_shift_time": 0.3,
+    "warp": 0.04, "warp_rise": 300.0, "warp_reach": 2.0, "forward_lead": 0.1, "turn_lead": 0.07,
 }  # fmt: skip
 TASKS = ("velocity", "path", "posture", "slope")
 
@@ -316,8 +317,10 @@ class Controlled:
     """Robots whose task tells them the action of the controller, and its memory, with seeds 0, 1, ..."""
 
     def __init__(self, task: str, gains=GAINS, count=4, action=None, options=None, **keywords) -> None:
-        term = f"{task}_controller"
-        changes = {"latency": PROMPT, "controller": gains, "observations": {term: {}}, "action": action or {}}
+        term, warp = f"{task}_controller", f"{task}_memory"
+        gains = gains | ({"warp": 0.0, "forward_lead": 0.0, "turn_lead": 0.0} if task == "posture" else {})
+        terms = {term: {}} | ({warp: {}} if gains.get("warp") else {})
+        changes = {"latency": PROMPT, "controller": gains, "observations": terms, "action": action or {}}
         self.core = make_core(f"WLR-{task.title()}-v0", count, {"task": changes, **keywords})
         self._columns = [k for k, column in enumerate(self.core.task.policy) if column.term == term]
         self.begin(options)
@@ -352,8 +355,8 @@ def agent_of(core, gains=GAINS) -> Policy:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_action_is_that_of_the_agent(task):
-    robots = Controlled(task)
-    agent, seen = agent_of(robots.core), []
+    robots = Controlled(task, randomization="split")
+    agent, seen = agent_of(robots.core, robots.core.contract()["controller"]), []
     for _ in range(150):
         seen.append(agent.act(robots.core.observation))
         np.testing.assert_allclose(robots.action, seen[-1], atol=2e-6)

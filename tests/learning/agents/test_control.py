@@ -198,6 +198,23 @@ def test_search_finds_what_scores_better_and_is_reproducible(tmp_path):
         Training(ENVIRONMENT, tmp_path / "none", settings | {"search": {"steps": {}, "episodes": 4}}, progress=False)
     )
     assert read_contract(none)["training"]["score"] > 1.2 * scores[0]
+    late = {
+        "velocity": {
+            "base": "none",
+            "events": {
+                "command_delay": {
+                    "parameters": ["command.delay"],
+                    "distribution": "uniform",
+                    "operation": "set",
+                    "low": 0.1,
+                    "high": 0.1,
+                }
+            },
+        }
+    }
+    late = settings | {"search": {"steps": {}, "episodes": 4, "randomization": late}}
+    late = load_agent("pid").train(Training(ENVIRONMENT, tmp_path / "late", late, progress=False))
+    assert read_contract(late)["training"]["score"] > read_contract(none)["training"]["score"]
     policy = load_policy(folder, content["environment"])
     assert policy.config.steering == content["config"]["steering"]  # type: ignore[attr-defined]
 

@@ -31,6 +31,7 @@ def rollout(ticks=TICKS, episodes=EPISODES, **changes) -> Rollout:
         "forward_velocity": 0.1 * one,
         "yaw_rate": 0 * one,
         "slip_velocity": np.zeros((ticks, episodes, 4, 2)),
+        "load": np.full((ticks, episodes, 4), 7.0),
         "excess_slip": 0 * one,
         "energy": 1.0 * PERIOD * one,
         "saturated": np.zeros((ticks, episodes, 8), bool),

@@ -126,6 +126,29 @@ def test_median_and_tail_of_the_tracking_error():
     assert 0.15 < card["tracking_error_median"].low < 0.5 < card["tracking_error_median"].high < 0.85
 
 
+def test_errors_by_friction_ratio():
+    """Ratios of 1, 3, 4.5 and 9, whichever wheel grips; excess slip of the last two."""
+    friction = np.ones((4, 4, 2))
+    friction[[1, 2, 3], [0, 1, 2], 0] = 1.0 / 3.0, 4.5, 1.0 / 9.0
+    excess = np.broadcast_to([0.001, 0.002, 0.003, 0.005], (TICKS, 4))
+    reached = np.array([0.1, 0.2, 0.3, 0.5])
+    card = score(rollout(friction=friction, excess_slip=excess, measured=measured(0.02 * reached, 0.06 * reached)))
+    found = [card[f"tracking_error_{name}"].mean for name in ("even", "uneven", "hard")]
+    assert found == pytest.approx([0.1, 0.2, 0.4])
+    assert card["excess_slip_hard"].mean == pytest.approx(0.004)
+    assert np.isnan(score(rollout())["tracking_error_hard"].mean)
+
+
+def test_slip_by_load():
+    """A wheel without load slips for nothing, one with all of it for all."""
+    slip, load = np.zeros((TICKS, EPISODES, 4, 2)), np.zeros((TICKS, EPISODES, 4))
+    slip[:, :, 0, 0], slip[:, :, 1, 1] = 0.08, 0.02
+    load[:, :, 1], load[:, :, 2] = 10.0, 30.0
+    card = score(rollout(slip_velocity=slip, load=load))
+    assert card["load_weighted_slip"].mean == pytest.approx(0.005)
+    assert card["slip_speed"].mean == pytest.approx(0.025)
+
+
 def test_steady_and_transient_parts():
     """The error is 2 in the first 2 s and after a change of command, else 1; both parts together are the whole."""
     ticks, change = 400, 200

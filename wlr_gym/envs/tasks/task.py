@@ -21,7 +21,15 @@ from wlr_gym.base.paths import named_in
 from wlr_gym.base.settings import ORDERED, SettingsModel, overlay, parse_config, read_config
 from wlr_gym.envs.tasks.scaling import check_rule, scaled
 from wlr_gym.envs.tasks.signals import signals_of
-from wlr_gym.envs.tasks.terms import COMMANDS, COMPUTED, POLICY_TERMS, PRIVILEGED_TERMS, SCALARS, ObservationTerm
+from wlr_gym.envs.tasks.terms import (
+    COMMANDS,
+    COMPUTED,
+    CONTROLLER,
+    POLICY_TERMS,
+    PRIVILEGED_TERMS,
+    SCALARS,
+    ObservationTerm,
+)
 from wlr_gym.envs.tasks.terms.observations import limit_for
 from wlr_gym.policy.agents import FED
 from wlr_gym.policy.control import SlipGains
@@ -284,6 +292,11 @@ def _check_commands(config: TaskConfig, where: str) -> None:
         for name in getattr(config, group)
     }
     used = [name for name in (*config.observations, *config.privileged) if name in COMPUTED]
+    for name in used:
+        needed = f"{name.removesuffix(CONTROLLER)}_memory"
+        for gain in ("warp", "forward_lead", "turn_lead"):
+            if name.endswith(CONTROLLER) and getattr(config.controller, gain, 0.0) and needed not in used:
+                raise InputError(f"{where}: controller.{gain} is not 0: {name} then needs the observation term '{needed}'")
     functions |= {f"observation term '{name}'": COMPUTED[name].function for name in used}
     for term, function in functions.items():
         if config.controller is None and any(name.startswith("controller.") for name in signals_of(function)):

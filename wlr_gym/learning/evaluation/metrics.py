@@ -26,6 +26,8 @@ ACTION_AT_LIMIT = 0.99
 JITTER_FREQUENCY = 5.0
 #: Environment steps of one window of the spectrum; windows overlap by half.
 WINDOW = 128
+#: Friction ratio of the wheels, largest over smallest: from the first on floors count as uneven, from the second as hard.
+UNEVEN_FLOOR, HARD_FLOOR = 2.0, 4.5
 #: s after the start and after a change of a command in which a motion is not steady yet.
 SETTLING = 2.0
 
@@ -48,11 +50,28 @@ TRACKING = (
     Metric("tracking_error_p90", "-", 3, True, "tracking_error that one episode in ten exceeds", 0.9),
     Metric("tracking_error_steady", "-", 3, True, f"tracking_error later than {_AFTER}"),
     Metric("tracking_error_transient", "-", 3, True, f"tracking_error within {_AFTER}"),
+    Metric(
+        "tracking_error_even",
+        "-",
+        3,
+        True,
+        f"tracking_error where the wheels' frictions at the start differ by less than {UNEVEN_FLOOR:g} times",
+    ),
+    Metric("tracking_error_uneven", "-", 3, True, f"where by {UNEVEN_FLOOR:g} to {HARD_FLOOR:g} times"),
+    Metric("tracking_error_hard", "-", 3, True, f"where by {HARD_FLOOR:g} times or more"),
 )
 GENERAL = (
     Metric("falls", "%", 0, True, "episodes that a termination ended"),
     Metric("slip_speed", "m/s", 4, True, "slip speed, mean over wheels and time"),
     Metric("excess_slip", "m/s", 4, True, "slip speed beyond what a steady skid turn needs, mean over wheels and time"),
+    Metric(
+        "excess_slip_hard",
+        "m/s",
+        4,
+        True,
+        f"excess_slip where the wheels' frictions at the start differ by {HARD_FLOOR:g} times or more",
+    ),
+    Metric("load_weighted_slip", "m/s", 4, True, "slip speed, mean over wheels by the load each carries, and time"),
     Metric("slip_per_metre", "m/m", 3, True, "slip distance of a wheel per metre the body travels"),
     Metric("excess_slip_per_metre", "m/m", 3, True, "slip distance beyond a steady skid turn's per metre the body travels"),
     Metric("energy_per_metre", "J/m", 1, True, "energy drawn per metre the body travels"),
@@ -149,6 +168,8 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
     width = frequency[1] if frequency.size > 1 else 0.0
     jitter = np.sqrt(np.where(seen[:, None], power, 0.0)[:, frequency > JITTER_FREQUENCY].sum(axis=1) * width)
     ones = np.ones(rollout.episodes)
+    excess_slip, hard = _sum(rollout.excess_slip, active) / ticks, friction_ratio(rollout) >= HARD_FLOOR
+    weighted = (np.linalg.norm(rollout.slip_velocity, axis=-1) * rollout.load).sum(axis=-1)
     values = {
         **{name if kind == "rms" else f"{name}_{kind}": error for (name, kind), error in errors.items()},
         **tracking,
@@ -156,7 +177,9 @@ def _per_episode(rollout: Rollout, frequency: Array, power: Array) -> dict[str, 
         "within_scales": 100.0 * succeeded(_scales(rollout.measures), errors, rollout.fell),
         "falls": 100.0 * rollout.fell,
         "slip_speed": _sum(slip, active) / ticks,
-        "excess_slip": _sum(rollout.excess_slip, active) / ticks,
+        "excess_slip": excess_slip,
+        "excess_slip_hard": (excess_slip * hard, hard),
+        "load_weighted_slip": (_sum(weighted, active), _sum(rollout.load.sum(axis=-1), active)),
         "slip_per_metre": (_sum(slip, active) * period, travel),
         "excess_slip_per_metre": (_sum(rollout.excess_slip, active) * period, travel),
         "energy_per_metre": (energy, travel),
@@ -174,11 +197,21 @@ def _tracking(rollout: Rollout, errors: dict[Which, Array]) -> dict[str, tuple[A
     scales, known = _scales(rollout.measures), np.full(rollout.episodes, float(has_limits(rollout.measures)))
     whole = (tracking_error(scales, errors, rollout.fell), known)
     parts = {"tracking_error": whole, "tracking_error_median": whole, "tracking_error_p90": whole}
+    ratio = friction_ratio(rollout)
+    classes = {"even": ratio < UNEVEN_FLOOR, "hard": ratio >= HARD_FLOOR}
+    classes["uneven"] = ~classes["even"] & ~classes["hard"]
+    parts |= {f"tracking_error_{name}": (whole[0] * inside, known * inside) for name, inside in classes.items()}
     steady = is_steady(rollout)
     for name, chosen in (("steady", rollout.active & steady), ("transient", rollout.active & ~steady)):
         own = errors_of(rollout.measures, rollout.measured, chosen)
         parts[f"tracking_error_{name}"] = tracking_error(scales, own, np.zeros_like(rollout.fell)), known * chosen.any(axis=0)
     return parts
+
+
+def friction_ratio(rollout: Rollout) -> Array:
+    """Return the largest over the smallest friction coefficient of the wheels at the start (N,), along their headings."""
+    along = np.maximum(rollout.friction[:, :, 0], 1e-6)
+    return along.max(axis=1) / along.min(axis=1)
 
 
 def is_steady(rollout: Rollout) -> Mask:

@@ -57,6 +57,7 @@ class Rollout:
         position: (T, N, 2) body origin in the floor frame, m.
         forward_velocity: (T, N) of the body origin along the body's x, m/s. yaw_rate: (T, N) rad/s.
         slip_velocity: (T, N, 4, 2) mean over the step, along each wheel's heading and axle, m/s.
+        load: (T, N, 4) normal force of each wheel, N.
         excess_slip: (T, N) mean slip speed of the wheels beyond what a steady skid turn needs, as the reward ``slip``, m/s.
         energy: (T, N) drawn from the supply, J; braking counts as negative.
         saturated: (T, N, 8) the motor was at its voltage or torque limit.
@@ -79,6 +80,7 @@ class Rollout:
     forward_velocity: Array
     yaw_rate: Array
     slip_velocity: Array
+    load: Array
     excess_slip: Array
     energy: Array
     saturated: NDArray[np.bool_]
@@ -195,6 +197,7 @@ def _signals(core: Core) -> dict[str, NDArray]:
         "forward_velocity": truth["linear_velocity_in_body"][:, 0].copy(),
         "yaw_rate": truth["angular_velocity_in_body"][:, 2].copy(),
         "slip_velocity": truth["slip_displacement"].reshape(shape) / core.task.config.control_period,
+        "load": truth["contact_force"].reshape(core.count, 4, 3)[..., 2].copy(),
         "energy": truth["electrical_energy"].copy(),
         "saturated": saturated(truth, core.task.robot),
         "friction": truth["effective_friction"].reshape(shape).copy(),

@@ -68,8 +68,8 @@ def evaluate(
             such as ``out/five/trials/*``, a folder that holds run folders, or ``NAME=POLICY,POLICY,...``: trainings of one
             recipe that differ in the seed. All play all episodes; intervals contain training-seed variance.
         env_id: id of the environment; None = the one the policy was trained in, else ``WLR-Velocity-v0``.
-        baselines: what to compare with, given as the policy is; None = ``do_nothing`` and ``pid`` as far as they fit the task.
-            The policy itself is not played twice.
+        baselines: what to compare with, given as the policy is; None = :func:`default_baselines`. The policy itself is not
+            played twice.
         episodes: per block. blocks: of episodes, each with its own seeds.
         seed: of the first episode; the others count up from it, each further block from 10000 above the last one.
         backend: ``gibbs_appell``, ``mujoco``, or ``both`` (the second for the main table only).
@@ -101,7 +101,9 @@ def evaluate(
     task = task_name_of(environment)
     patch = load_patch(effects)
     main, *others = BACKENDS if backend == "both" else (backend,)
-    subjects = read_subjects([policy, *(fitting_baselines(environment) if baselines is None else baselines)])
+    subjects = read_subjects(
+        [policy, *(default_baselines(subject.sources[0], environment) if baselines is None else baselines)]
+    )
     robot = common_robot(subjects) if robot is None else robot
     keywords: dict[str, Any] = {"randomization": randomization, "robot": robot, "effects": patch, "floor": floor}
     keywords |= {"backend": main, "threads": threads, "precision": precision, **having(sensors)}
@@ -148,6 +150,12 @@ def fitting_baselines(environment: str, names: Sequence[str] = BASELINES) -> tup
             make_policy(name, wanted)
             found.append(name)
     return tuple(found)
+
+
+def default_baselines(policy: Source, environment: str, names: Sequence[str] = BASELINES) -> tuple[str, ...]:
+    """Return what a policy is compared with where nothing is chosen: agents that fit, and the controller of a trained one."""
+    own = () if trained_environment(policy) is None else fitting_baselines(environment, (controller_of(policy),))
+    return tuple(dict.fromkeys((*fitting_baselines(environment, names), *own)))
 
 
 # ---- the acceptance test: on no family of floors does a policy lose much against what it is to replace ---------------
@@ -289,12 +297,15 @@ def _name(family: Any) -> str:
 
 
 def references_of(policy: Source, environment: str) -> tuple[str, ...]:
-    """Return what a policy is compared with: the controller it acts on or could be replaced by, and the task's blind policy."""
-    observer = policy_environment(policy).get("task", {}).get("observer") or {}
-    has_camera = observer.get("camera", True)
-    controller = "slip_compensating" if has_camera else "slip_compensating_no_camera"
+    """Return what a policy must not lose against: its controller, and the task's blind policy."""
     blind = f"{task_name_of(environment)}_blind"
-    return (controller, *([blind] if blind in shipped_names() and blind != str(policy) else []))
+    return (controller_of(policy), *([blind] if blind in shipped_names() and blind != str(policy) else []))
+
+
+def controller_of(policy: Source) -> str:
+    """Return the hand-written controller that a trained policy acts on or could be replaced by."""
+    observer = policy_environment(policy).get("task", {}).get("observer") or {}
+    return "slip_compensating" if observer.get("camera", True) else "slip_compensating_no_camera"
 
 
 def fingerprint(

@@ -23,12 +23,14 @@ from wlr_gym.envs.tasks.signals import (
     error_from_path,
     estimated_pose,
     leg_references,
+    mean,
     true_pose,
 )
 from wlr_gym.envs.tasks.terms.measures import refuse_another
 from wlr_gym.perception.observer import ESTIMATE_LAYOUT
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, TRUTH_LAYOUT, Layout
+from wlr_gym.policy.control import ERROR_TIME, LEAST_SLIP, SLIP_TIME, UNEVEN, UNEVEN_RANGE, WARP_RATE
 from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS, WHEELS, Robot
 
 # ---- commands a task can ask the robot to follow ---------------------------------------------------------------------
@@ -431,6 +433,8 @@ def climb_command(signals: Signals) -> list[Value]:
 #: What the controller remembers: integrals of the errors of yaw rate (rad/s) and forward velocity (m/s), times their gains, and
 #: by how much the front wheels slip more than the rear ones (m/s), where load is shifted.
 MEMORY = ("yaw_rate_integral", "velocity_integral", "slip_difference")
+#: What the term ``<task>_memory`` keeps, where the task has it: of the warp (``Warp`` of the agent), and the step's commands.
+MORE_MEMORY = ("warp", "warp_level", "yaw_rate_error", "slip_difference", "slip_size", "forward", "turn")
 #: Where the legs sweep also integrals of the errors of their angles (rad), times their gain.
 LEG_MEMORY = tuple(f"{leg}_integral" for leg in LEGS)
 #: Ends the name of a term that holds a controller's action.
@@ -438,6 +442,7 @@ CONTROLLER = "_controller"
 
 _LABELS = (*JOINTS, *MEMORY)
 _UNITS = ", ".join(["-"] * len(JOINTS) + ["rad/s", "m/s", "m/s"])
+_MORE_UNITS = "rad, -, rad/s, m/s, m/s, m/s, rad/s"
 
 
 @dataclass(frozen=True)
@@ -447,28 +452,49 @@ class WantedMotion:
     Attributes:
         forward: velocity, m/s. turn: yaw rate, rad/s.
         legs: angle from home (rad) and rate (rad/s) of each leg. sweeping: integrate their errors.
+        commanded_turn: what of the yaw rate is a command.
     """
 
     forward: Value
     turn: Value
     legs: Sequence[tuple[Value, Value]] = ((0.0, 0.0),) * 4
     sweeping: bool = False
+    commanded_turn: Value = 0.0
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
 def velocity_controller(signals: Signals) -> list[Value]:
     """Action of the controller that follows the commanded velocity, and what it remembers."""
-    turn = signals.command("yaw_rate") + _steer(signals, 0.0, 0.0)
-    return _feedback(signals, "velocity_controller", WantedMotion(signals.command("linear_velocity_x"), turn))
+    return _feedback(signals, "velocity", _commanded(signals))
+
+
+@computed(*MORE_MEMORY, unit=_MORE_UNITS, frame="-", limit=1.0, estimated=True)
+def velocity_memory(signals: Signals) -> list[Value]:
+    """What else that controller remembers: the warp of the legs and what it follows, commands."""
+    return _more_memory(signals, "velocity", _commanded(signals))
+
+
+def _commanded(signals: Signals) -> WantedMotion:
+    turn = signals.command("yaw_rate")
+    return WantedMotion(signals.command("linear_velocity_x"), turn + _steer(signals, 0.0, 0.0), commanded_turn=turn)
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
 def path_controller(signals: Signals) -> list[Value]:
     """Action of the controller that follows the path, and what it remembers."""
+    return _feedback(signals, "path", _back_to_path(signals))
+
+
+@computed(*MORE_MEMORY, unit=_MORE_UNITS, frame="-", limit=1.0, estimated=True)
+def path_memory(signals: Signals) -> list[Value]:
+    """What else that controller remembers: the warp of the legs and what it follows, commands."""
+    return _more_memory(signals, "path", _back_to_path(signals))
+
+
+def _back_to_path(signals: Signals) -> WantedMotion:
     forward = signals.command("linear_velocity_x")
     error = error_from_path(signals, estimated_pose(signals))
-    turn = error.curvature[0] * forward + _steer(signals, error.lateral, error.heading)
-    return _feedback(signals, "path_controller", WantedMotion(forward, turn))
+    return WantedMotion(forward, error.curvature[0] * forward + _steer(signals, error.lateral, error.heading))
 
 
 @computed(*_LABELS, *LEG_MEMORY, unit=f"{_UNITS}, rad, rad, rad, rad", frame="-", limit=1.0, estimated=True)
@@ -477,13 +503,23 @@ def posture_controller(signals: Signals) -> list[Value]:
     home = signals.robot("home.leg_angle")
     legs = [(angle - home, rate) for angle, rate in leg_references(signals)]
     motion = WantedMotion(signals.command("linear_velocity_x"), _course(signals), legs, sweeping=True)
-    return _feedback(signals, "posture_controller", motion)
+    return _feedback(signals, "posture", motion)
 
 
 @computed(*_LABELS, unit=_UNITS, frame="-", limit=1.0, estimated=True)
 def slope_controller(signals: Signals) -> list[Value]:
     """Action of the controller that climbs and holds, and what it remembers."""
-    return _feedback(signals, "slope_controller", WantedMotion(climb_speed(signals), _course(signals)))
+    return _feedback(signals, "slope", _uphill(signals))
+
+
+@computed(*MORE_MEMORY, unit=_MORE_UNITS, frame="-", limit=1.0, estimated=True)
+def slope_memory(signals: Signals) -> list[Value]:
+    """What else that controller remembers: the warp of the legs and what it follows, commands."""
+    return _more_memory(signals, "slope", _uphill(signals))
+
+
+def _uphill(signals: Signals) -> WantedMotion:
+    return WantedMotion(climb_speed(signals), _course(signals))
 
 
 def _course(signals: Signals) -> Value:
@@ -497,17 +533,20 @@ def _steer(signals: Signals, lateral: Value, heading: Value) -> Value:
     return signals.gain("uphill") * leftward_force - signals.gain("lateral") * lateral - signals.gain("heading") * heading
 
 
-def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
-    gain = signals.gain
+def _feedback(signals: Signals, task: str, motion: WantedMotion) -> list[Value]:
+    gain, name = signals.gain, f"{task}{CONTROLLER}"
     yaw_rate, velocity = signals.sensors("gyro")[2], signals.estimate("linear_velocity_in_body")[0]
     yaw_integral, velocity_integral, slip_difference = (signals.remembered(f"{name}[{label}]") for label in MEMORY)
     error = motion.turn - yaw_rate
     yaw_integral = _integral(signals, yaw_integral, gain("yaw_rate_i") * error)
-    turn = gain("steering") * motion.turn + gain("yaw_rate_p") * error + yaw_integral
+    lead, turn_lead = _leads(signals, task, motion)
+    turn = gain("steering") * (motion.turn + turn_lead) + gain("yaw_rate_p") * error + yaw_integral
     error = motion.forward - velocity
     velocity_integral = _integral(signals, velocity_integral, gain("velocity_i") * error)
-    forward = motion.forward + gain("velocity_p") * error + velocity_integral
+    forward = motion.forward + lead + gain("velocity_p") * error + velocity_integral
     share = ops.where_positive(gain("load_shift"), ops.minimum(signals.control_period / gain("load_shift_time"), 1.0), 0.0)
+    warp_before = signals.remembered(f"{task}_memory[warp]")
+    warp, level, *_ = _more_memory(signals, task, motion)
     shifted = _lean(signals, slip_difference)
     slip_difference = slip_difference + share * (_slip_difference(signals) - slip_difference)
     hip_x, hip_y = signals.robot("hip_position.x"), signals.robot("hip_position.y")
@@ -522,10 +561,12 @@ def _feedback(signals: Signals, name: str, motion: WantedMotion) -> list[Value]:
         rolling = ops.clip(forward - turn * side, travel - allowed, travel + allowed)
         inward = gain("legs_inward") * front
         reach, reach_rate = (
-            (inward, 0.0) if motion.sweeping else _reach_under(signals, f"{name}[{LEGS[index]}]", index, shifted)
+            (inward, 0.0)
+            if motion.sweeping
+            else _reach_under(signals, f"{name}[{LEGS[index]}]", index, shifted - left * warp_before, level)
         )
-        offset = offset + reach + lean
-        rate = rate + reach_rate
+        offset = offset + reach + lean - left * warp
+        rate = rate + reach_rate - left * ((warp - warp_before) / signals.control_period)
         setpoint = offset
         if motion.sweeping:
             corrections.append(_leg_correction(signals, name, index, offset))
@@ -547,12 +588,41 @@ def _leg_correction(signals: Signals, name: str, leg: int, offset: Value) -> Val
     return _integral(signals, signals.remembered(f"{name}[{LEG_MEMORY[leg]}]"), signals.gain("leg_i") * error)
 
 
-def _reach_under(signals: Signals, action: str, leg: int, shifted: Value) -> tuple[Value, Value]:
+def _leads(signals: Signals, task: str, motion: WantedMotion) -> list[Value]:
+    """By how much the commands for forward velocity (m/s) and turn (rad/s) run ahead, for they change."""
+    limit, begun = signals.gain("integral_limit"), signals.time - 0.5 * signals.control_period
+    leads = []
+    for name, command in (("forward", motion.forward), ("turn", motion.commanded_turn)):
+        change = command - signals.remembered(f"{task}_memory[{name}]")
+        lead = ops.clip(signals.gain(f"{name}_lead") / signals.control_period * change, 0.0 - limit, limit)
+        leads.append(ops.where_positive(begun, lead, 0.0))
+    return leads
+
+
+def _more_memory(signals: Signals, task: str, motion: WantedMotion) -> list[Value]:
+    """What is remembered after the next step, in the order of :data:`MORE_MEMORY`."""
+    gain, period = signals.gain, signals.control_period
+    angle, level, error, difference, size = (signals.remembered(f"{task}_memory[{label}]") for label in MORE_MEMORY[:5])
+    slip = [ops.absolute(along) for along in signals.estimate("slip_velocity")[0::2]]
+    error = error + ops.minimum(period / ERROR_TIME, 1.0) * (motion.turn - signals.sensors("gyro")[2] - error)
+    more_left = sum((left * along for (_, left), along in zip(CORNER_SIGNS, slip, strict=True)), 0.0) * 0.5
+    difference = difference + period / SLIP_TIME * (more_left - difference)
+    size = size + period / SLIP_TIME * (mean(slip) - size)
+    uneven = ops.absolute(difference) / (size + LEAST_SLIP)
+    split = ops.clip((uneven - UNEVEN) / UNEVEN_RANGE, 0.0, 1.0)
+    rise = gain("warp_rise") * split * ops.maximum(ops.absolute(error) - gain("warp_threshold"), 0.0)
+    level = ops.clip(level + period * (rise - level / gain("warp_forget")), 0.0, 1.0)
+    most = WARP_RATE * period
+    angle = angle + ops.clip(gain("warp") * level - angle, 0.0 - most, most)
+    return [angle, level, error, difference, size, motion.forward, motion.commanded_turn]
+
+
+def _reach_under(signals: Signals, action: str, leg: int, shifted: Value, level: Value) -> tuple[Value, Value]:
     """How far a leg reaches under the body after the next step (rad from home), and how fast it moves (rad/s).
 
     Args:
         action: name of the leg's action in what the controller remembers: it says where the leg was sent.
-        leg: index. shifted: what of that was load shift, rad.
+        leg: index. shifted: what of that was load shift and warp, rad. level: of the warp, whose unloaded legs hurry.
     """
     gain, period = signals.gain, signals.control_period
     wanted, within = gain("legs_inward") * CORNER_SIGNS[leg][0], gain("lean_time")
@@ -560,6 +630,8 @@ def _reach_under(signals: Signals, action: str, leg: int, shifted: Value) -> tup
     sent = signals.remembered(action) * signals.task("action.leg_scale") - shifted
     before = ops.where_positive(signals.time - 0.5 * period, sent, start)
     step = ops.absolute(wanted) * period / ops.maximum(within, period)
+    if CORNER_SIGNS[leg][0] != CORNER_SIGNS[leg][1]:
+        step = step * (1.0 + gain("warp_reach") * level)
     after = before + ops.clip(wanted - before, 0.0 - step, step)
     even = within * ops.absolute(wanted)  # positive = not at once
     return ops.where_positive(even, after, wanted), ops.where_positive(even, (after - before) / period, 0.0)
