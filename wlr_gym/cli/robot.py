@@ -14,7 +14,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import check_new_file, write_text
+from wlr_gym.base.files import check_new_file, make_output_folder, refuse_existing, write_text
 from wlr_gym.base.text import counted, pairs
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import FloorOption, ForceOption, JsonOption, refuse_given
@@ -34,7 +34,7 @@ from wlr_gym.robot.interchange.urdf import NOT_IN_URDF, parse_urdf, urdf_text
 from wlr_gym.robot.outline import QUESTIONS, Question, derived_numbers, question_of
 from wlr_gym.robot.parameters import Parameters
 
-Format = Literal["mjcf", "urdf"]
+Format = Literal["mjcf", "urdf", "parts"]
 #: End of a file's name -> format.
 SUFFIXES: dict[str, Format] = {".xml": "mjcf", ".mjcf": "mjcf", ".urdf": "urdf"}
 #: Of a robot file, and of a picture.
@@ -97,14 +97,17 @@ class RobotImportOptions(JsonOption, ForceOption):
 
 @dataclass(frozen=True)
 class RobotExportOptions(JsonOption, ForceOption, FloorOption):
-    """Write a robot as MJCF (the MuJoCo plant's own model, with --floor the floor's pieces too) or URDF."""
+    """Write a robot as MJCF (the MuJoCo plant's own model, with --floor the floor's pieces too), URDF, or parts to build it.
+
+    Parts are STL and DXF files in mm; their masses and inertias are compared with the robot file.
+    """
 
     robot: Positional[str]
     """Robot file, or name in configs/robot/."""
     out: Path
-    """File to write; .xml or .mjcf: MJCF, .urdf: URDF."""
+    """File to write; .xml or .mjcf: MJCF, .urdf: URDF. Of parts: folder."""
     format: Format | None = None
-    """Format of the file; default: by the end of --out."""
+    """mjcf, urdf or parts; default: by the end of --out."""
 
 
 @dataclass(frozen=True)
@@ -262,6 +265,8 @@ def export_robot(options: RobotExportOptions) -> int:
 
     by_name = SUFFIXES.get(options.out.suffix.lower())
     kind = options.format or by_name
+    if kind == "parts":
+        return export_parts(options)
     if kind is None:
         raise InputError(f"--out {options.out}: expected a file that ends in {', '.join(SUFFIXES)}, or --format")
     if by_name not in (None, kind) and options.out.suffix.lower() != ".xml":  # which is used for both
@@ -282,6 +287,28 @@ def export_robot(options: RobotExportOptions) -> int:
     else:
         print(f"written: {options.out}\n{kind.upper()} does not hold: {', '.join(lost)}")
     return OK
+
+
+def export_parts(options: RobotExportOptions) -> int:
+    """Write files of the parts, and how their masses differ from the robot file; 1 where one is outside the tolerance."""
+    from wlr_gym.robot.parts import TOLERANCE, compare, make_kit, write_kit
+
+    refuse_given(options, ("floor",), "parts are of a robot; leave it out")
+    robot = load_robot(options.robot)
+    kit = make_kit(robot)
+    make_output_folder(options.out)
+    refuse_existing(options.out / "parts.csv", options.force)
+    files, differences = write_kit(kit, options.out), compare(robot, kit)
+    if options.json:
+        print_json({"out": options.out, "files": files, "differences": [line._asdict() for line in differences]})
+        return OK if all(line.fits for line in differences) else FAILED
+    console = Console(highlight=False)
+    rows = [(name, str(count), f"{1e3 * mass:.1f}", made) for name, count, mass, made in kit.bill()]
+    print_table(console, ("part", "pieces", "g each", "made"), rows)
+    lines = [(d.name, f"{d.file:.4g}", f"{d.parts:.4g}", d.unit, "" if d.fits else "differs") for d in differences]
+    print_table(console, ("number", "robot file", "parts", "unit", f"within {TOLERANCE:.0%}"), lines)
+    print(f"written: {len(files)} files in {options.out}")
+    return OK if all(line.fits for line in differences) else FAILED
 
 
 def list_floors(options: FloorsOptions) -> int:
