@@ -208,7 +208,8 @@ def _body(robot: Robot) -> list[Part]:
     posts = [(sx * 60.0, sy * (half - 10.0), M3) for sx in (1, -1) for sy in (1, -1)]
     sides = lambda py, pz: ((0.0, py, pz), (0.0, -py, pz))  # noqa: E731
     windows = [(sx * 0.5 * x, 0.0, 80.0) for sx in (1, -1)]
-    plate = _sheet(2 * x, 2 * half, 8.0, [*screws, *posts, *windows])
+    feet = [(sx * 20.0, sy * (half - 7.0), M3) for sx in (1, -1) for sy in (1, -1)]
+    plate = _sheet(2 * x, 2 * half, 8.0, [*screws, *posts, *windows, *feet])
     block = _box((long + 4.0, deep - 6.0, gap)) - _box((long + 0.4, deep, wide + 0.4))
     for dx in (-20.0, 20.0):
         block -= Manifold.cylinder(2 * gap, 1.25, circular_segments=24, center=True).translate((dx, -9.0, 0.0))
@@ -231,7 +232,21 @@ def _body(robot: Robot) -> list[Part]:
         Part("cables", "bought: cables, plugs, screws (weigh yours)", _box((150.0, 100.0, 20.0)), None,
              ((0.0, 0.0, 10.0),), mass=0.18),
     ]  # fmt: skip
-    return [*parts, _ballast(robot, parts)]
+    bar = _ballast(robot, parts)
+    for _ in range(3):  # the feet weigh little, and their height is the bars'
+        support = _feet(bar, gap, half)
+        bar = _ballast(robot, [*parts, support])
+    return [*parts, support, bar]
+
+
+def _feet(bar: Part, gap: float, half: float) -> Part:
+    """Return the two feet that carry the ballast bars over the edges of the lower plate."""
+    _, y, z = bar.places[0]
+    below, edge = z + bar.solid.bounding_box()[2], y + bar.solid.bounding_box()[4]
+    foot, tall = _box((56.0, edge - half + 14.0, below + gap / 2)), (below - gap / 2) / 2
+    middle = (edge + half - 14.0) / 2
+    made = "print: PETG, 2 walls, 15 % infill; under a ballast bar"
+    return Part("ballast_foot", made, foot, 0.3 * PETG, ((0.0, middle, tall), (0.0, -middle, tall)))
 
 
 def _ballast(robot: Robot, parts: list[Part]) -> Part:
