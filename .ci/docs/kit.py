@@ -87,7 +87,7 @@ BOXES = {
     "u2": (620, 270, 150, 38, ["U2D2, TTL"]),
     "computer": (230, 350, 160, 90, ["Computer", "3 x USB: feeds both", "U2D2 and the Nano"]),
     "nano": (450, 370, 150, 150, NANO),
-    "shift": (660, 395, 130, 100, ["Level shifters", "5 V to 3.3 V", "2 x 4 channels"]),
+    "shift": (660, 395, 130, 100, ["5 V to 3.3 V", "SDA, SCL: MOSFET", "SPI: 74LVC125"]),
     "imu": (850, 340, 180, 86, ["MPU-6050 (GY-521)", "VCC 5 V, AD0 to GND", "SDA, SCL, INT"]),
     "flow": (850, 450, 180, 86, ["PMW3901 board", "3.3 V from the Nano", "NCS, MOSI, MISO, SCK"]),
 }  # fmt: skip

@@ -217,7 +217,7 @@ def test_the_board_of_the_imu_tells_its_settings(machine, capsys, monkeypatch):
     monkeypatch.setattr(Machine, "_board_status", lambda self, port: b"")
     code, text = look(capsys)
     assert code == 0
-    assert re.search(r"warning +imu +firmware: it does not say", text)
+    assert re.search(r"warning +imu +board: it does not say", text)
 
 
 def test_both_sensors_on_one_board(monkeypatch, capsys):

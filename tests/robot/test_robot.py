@@ -163,7 +163,8 @@ def test_missing_files_and_names():
     with pytest.raises(InputError, match=r"no file 'nowhere/robot.yaml'"):
         load_robot("nowhere/robot.yaml")
     with pytest.raises(
-        InputError, match=r"unknown robot config 'nomnal' \(did you mean 'nominal'\?\); valid: emanual, flow, nominal, paper"
+        InputError,
+        match=r"unknown robot config 'nomnal' \(did you mean 'nominal'\?\); valid: emanual, flow, kit, nominal, paper",
     ):
         load_robot("nomnal")
 

@@ -106,7 +106,7 @@ class Kit:
         return {name: together(part.properties() for part in parts) for name, parts in assemblies.items()}
 
 
-class Difference(NamedTuple):
+class MassDifference(NamedTuple):
     """A number of the robot file beside that of the parts."""
 
     name: str
@@ -316,7 +316,7 @@ def _wheel(robot: Robot) -> list[Part]:
 # ---- against the robot file ----
 
 
-def compare(robot: Robot, kit: Kit) -> list[Difference]:
+def compare(robot: Robot, kit: Kit) -> list[MassDifference]:
     """Return the robot file's mass properties beside those of the parts."""
     found, size = kit.properties(), max(robot.body.size)
     body, leg, wheel = found["body"], found["leg"], found["wheel"]
@@ -335,10 +335,10 @@ def compare(robot: Robot, kit: Kit) -> list[Difference]:
         ("wheel.spin_inertia", robot.wheel.spin_inertia, float(wheel.inertia[1, 1]), "kg m2"),
         ("wheel.transverse_inertia", robot.wheel.transverse_inertia, float(wheel.inertia[0, 0]), "kg m2"),
     ]
-    differences = [Difference(name, file, parts, unit, TOLERANCE * abs(file)) for name, file, parts, unit in pairs]
+    differences = [MassDifference(name, file, parts, unit, TOLERANCE * abs(file)) for name, file, parts, unit in pairs]
     offsets = zip("xyz", robot.body.com_offset, body.centre, strict=True)
     return differences + [
-        Difference(f"body.com_offset.{axis}", file, float(parts), "m", 0.01 * size) for axis, file, parts in offsets
+        MassDifference(f"body.com_offset.{axis}", file, float(parts), "m", 0.01 * size) for axis, file, parts in offsets
     ]
 
 

@@ -476,11 +476,11 @@ def check_board(imu: ImuStream, port: ImuPort, clock: Clock) -> list[Check]:
     try:
         status = board_status(imu, clock)
     except ImuGoneError as error:
-        return [Check("imu", "firmware", False, str(error), version, "Plug it in again, check its cable.")]
+        return [Check("imu", "board", False, str(error), version, "Plug it in again, check its cable.")]
     if status is None:
-        return [Check("imu", "firmware", False, "it does not say", version, flash, is_fatal=False)]
+        return [Check("imu", "board", False, "it does not say", version, flash, is_fatal=False)]
     found = f"{status['version_major']}.{status['version_minor']}"
-    checks = [Check("imu", "firmware", status["version_major"] == FIRMWARE_VERSION[0], found, version, flash, is_fatal=False)]
+    checks = [Check("imu", "board", status["version_major"] == FIRMWARE_VERSION[0], found, version, flash, is_fatal=False)]
     if not status["sensors"] & SENSORS["imu"]:
         identity = status["imu_identity"]
         name = f"{identity:#04x} ({RELATIVES.get(identity, 'another chip')})" if identity else "nobody answers"
