@@ -133,7 +133,7 @@ def together(masses: Iterable[Mass]) -> Mass:
     return Mass(mass, centre, inertia)
 
 
-def _mesh_mass(vertices: Array, triangles: Array) -> Mass:
+def _mesh_mass(vertices: Array, triangles: NDArray[Any]) -> Mass:
     """Return volume (as mass, density 1), centre and inertia of a closed mesh, by tetrahedra to the origin."""
     corners = vertices[triangles]
     volumes = np.linalg.det(corners) / 6.0
@@ -148,10 +148,10 @@ def _mesh_mass(vertices: Array, triangles: Array) -> Mass:
 # ---- shapes ----
 
 
-def _box(size: Sequence[float], middle: Sequence[float] = (0.0, 0.0, 0.0)) -> Manifold:
+def _box(size: Place) -> Manifold:
     from manifold3d import Manifold
 
-    return Manifold.cube(tuple(size), True).translate(tuple(middle))
+    return Manifold.cube(size, True)
 
 
 def _disc(radius: float, width: float, middle: float = 0.0) -> Manifold:
@@ -232,11 +232,10 @@ def _body(robot: Robot) -> list[Part]:
         Part("cables", "bought: cables, plugs, screws (weigh yours)", _box((150.0, 100.0, 20.0)), None,
              ((0.0, 0.0, 10.0),), mass=0.18),
     ]  # fmt: skip
-    bar = _ballast(robot, parts)
-    for _ in range(3):  # the feet weigh little, and their height is the bars'
-        support = _feet(bar, gap, half)
-        bar = _ballast(robot, [*parts, support])
-    return [*parts, support, bar]
+    support = _feet(_ballast(robot, parts), gap, half)
+    for _ in range(2):  # the feet weigh little, and their height is the bars'
+        support = _feet(_ballast(robot, [*parts, support]), gap, half)
+    return [*parts, support, _ballast(robot, [*parts, support])]
 
 
 def _feet(bar: Part, gap: float, half: float) -> Part:
@@ -318,28 +317,33 @@ def _wheel(robot: Robot) -> list[Part]:
 
 def compare(robot: Robot, kit: Kit) -> list[MassDifference]:
     """Return the robot file's mass properties beside those of the parts."""
-    found, size = kit.properties(), max(robot.body.size)
+    found = kit.properties()
     body, leg, wheel = found["body"], found["leg"], found["wheel"]
-    along = -float(leg.centre[2])
-    pairs: list[tuple[str, float, float, str]] = [("body.mass", robot.body.mass, body.mass, "kg")]
-    moments = zip("xyz", robot.body.inertia, np.diag(body.inertia), strict=True)
-    pairs += [(f"body.inertia.{axis}", file, float(parts), "kg m2") for axis, file, parts in moments]
-    pairs += [
+    spin, across = float(wheel.inertia[1, 1]), float(wheel.inertia[0, 0])
+    rows: list[tuple[str, float | None, float, str]] = [
+        ("body.mass", robot.body.mass, body.mass, "kg"),
+        *_axes("body.inertia", robot.body.inertia, np.diag(body.inertia)),
         ("leg.mass", robot.leg.mass, leg.mass, "kg"),
-        ("leg.com_along_leg", robot.leg.com_along_leg, along, "m"),
-        *(
-            (f"leg.inertia.{a}", f, float(p), "kg m2")
-            for a, f, p in zip("xyz", robot.leg.inertia, np.diag(leg.inertia), strict=True)
-        ),
+        ("leg.com_along_leg", robot.leg.com_along_leg, -float(leg.centre[2]), "m"),
+        *_axes("leg.inertia", robot.leg.inertia, np.diag(leg.inertia)),
         ("wheel.mass", robot.wheel.mass, wheel.mass, "kg"),
-        ("wheel.spin_inertia", robot.wheel.spin_inertia, float(wheel.inertia[1, 1]), "kg m2"),
-        ("wheel.transverse_inertia", robot.wheel.transverse_inertia, float(wheel.inertia[0, 0]), "kg m2"),
+        ("wheel.spin_inertia", robot.wheel.spin_inertia, spin, "kg m2"),
+        ("wheel.transverse_inertia", robot.wheel.transverse_inertia, across, "kg m2"),
     ]
-    differences = [MassDifference(name, file, parts, unit, TOLERANCE * abs(file)) for name, file, parts, unit in pairs]
-    offsets = zip("xyz", robot.body.com_offset, body.centre, strict=True)
-    return differences + [
-        MassDifference(f"body.com_offset.{axis}", file, float(parts), "m", 0.01 * size) for axis, file, parts in offsets
+    offset = 0.01 * max(robot.body.size)
+    rows += _axes("body.com_offset", robot.body.com_offset, body.centre, "m")
+    return [
+        MassDifference(name, file, parts, unit, offset if name.startswith("body.com_offset") else TOLERANCE * abs(file))
+        for name, file, parts, unit in rows
+        if file is not None
     ]
+
+
+def _axes(
+    name: str, file: Iterable[float | None], parts: Array, unit: str = "kg m2"
+) -> list[tuple[str, float | None, float, str]]:
+    rows = zip("xyz", file, parts.tolist(), strict=True)
+    return [(f"{name}.{axis}", of_file, of_parts, unit) for axis, of_file, of_parts in rows]
 
 
 # ---- files ----
