@@ -24,7 +24,16 @@ from typing import Annotated, Any, Literal
 
 import yaml
 
-from studies.bench.blind.cases import FIRST_SCORED_SEED, FURTHER_NULLS, SETS, BlindCase, case
+from studies.bench.blind.cases import (
+    FIRST_SCORED_SEED,
+    FIRST_TYRE_SEED,
+    FURTHER_NULLS,
+    SETS,
+    TYRE_SETS,
+    BlindCase,
+    case,
+    tyre_case,
+)
 from studies.bench.blind.score import FAILED, score
 from studies.tables import hand_over, markdown_table, plain_console
 from wlr_gym.base.errors import InputError, Interval
@@ -51,7 +60,7 @@ class Plan:
         out: folder for data, results, truths and the score.
         sets: how many data sets.
         processes: how many of them at a time.
-        first_seed: of the first set; the others follow.
+        first_seed: of the first set; the others follow. From :data:`FIRST_TYRE_SEED` on they are those about tyres.
         keep_data: leave the data sets there (3 MB each); they can be made again from their seeds.
         runs: which of the eight kinds of runs every set has; empty = its own.
     """
@@ -65,9 +74,15 @@ class Plan:
 
     def cases(self) -> list[BlindCase]:
         """Return the data sets, in the order they are analysed: the further nulls spread among the others."""
-        cases = [case(index, self.first_seed) for index in range(self.sets)]
+        cases = [self.case(index) for index in range(self.sets)]
+        if self.first_seed >= FIRST_TYRE_SEED:
+            return cases
         turns = [index / SETS if index < SETS else (index - SETS) / FURTHER_NULLS for index in range(self.sets)]
         return [one for _, one in sorted(zip(turns, cases, strict=True), key=lambda pair: pair[0])]
+
+    def case(self, index: int) -> BlindCase:
+        """Return data set number ``index``."""
+        return (tyre_case if self.first_seed >= FIRST_TYRE_SEED else case)(index, self.first_seed)
 
     def result_file(self, one: BlindCase) -> Path:
         """Return where the result of a set is kept."""
@@ -82,8 +97,10 @@ class Plan:
 class BlindTestOptions(JsonOption):
     out: Path
     """Folder for data sets, results, truths and the score; an interrupted test resumes from it."""
-    sets: Annotated[int, Interval(least=1)] = ALL_SETS
-    """Data sets; the default has 240 of all kinds and 160 more without an effect."""
+    sets: Annotated[int, Interval(least=1)] | None = None
+    """Data sets; left out: 400, of which 240 are of all kinds and 160 more without an effect; of those about tyres 90."""
+    tyres: bool = False
+    """Sets about tyres instead: elastic treads, and two of three without an effect, on a floor with bumps of 0.1 mm."""
     processes: Annotated[int, Interval(least=1)] = 2
     """Data sets at a time."""
     ray: tuple[str, ...] | None = None
@@ -94,7 +111,8 @@ class BlindTestOptions(JsonOption):
 
 def run(options: BlindTestOptions) -> int:
     """Test the gap workflow on data sets with hidden truths; print and write its score."""
-    out, plan = options.out, Plan(options.out, options.sets, options.processes)
+    first, sets = (FIRST_TYRE_SEED, TYRE_SETS) if options.tyres else (FIRST_SCORED_SEED, ALL_SETS)
+    out, plan = options.out, Plan(options.out, options.sets or sets, options.processes, first)
     report = run_blind_test(plan, say=plain_console.print, answers=options.answers, ray=ray_address(options.ray))
     return hand_over(out / "score.md", markdown(report), report, options.json, out / "score.json", out / "answers.json")
 
@@ -308,7 +326,7 @@ def _work(task: Mapping[str, Any], send: Send) -> None:
     module, _, function = task["analyser"].partition(":")
     fields = {name: value for name, value in task.items() if name not in ("index", "analyser")}
     plan = Plan(**{**fields, "out": Path(task["out"]), "runs": tuple(task["runs"])})
-    run_case(plan, case(task["index"], plan.first_seed), getattr(importlib.import_module(module), function))
+    run_case(plan, plan.case(task["index"]), getattr(importlib.import_module(module), function))
 
 
 def run_case(plan: Plan, one: BlindCase, analyser: Analyser) -> None:
@@ -346,7 +364,7 @@ def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = ()) -> str:
     from studies.bench.blind.dataset import fingerprint, simulate_runs, spoilt, write
 
     robot = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
-    tables, meta, _ = simulate_runs(robot, one.effects, one.seed, runs or one.runs, one.kind == "none", True, one.camera)
+    tables, meta, _ = simulate_runs(robot, one.effects, one.seed, runs or one.runs, one.kind == "none", True, one.camera, one.bumps)
     if one.spoilt:
         tables = spoilt(one.spoilt, tables, np.random.default_rng([one.seed, 5]))
     shutil.rmtree(folder, ignore_errors=True)

@@ -131,6 +131,7 @@ class Candidate:
         formula, units: of an effect that the library does not hold; empty otherwise.
         doc: what is missing without it, where the library's effect of this name is not meant; empty = it is.
         fixed: parameters of the effect that are not fitted.
+        unseen: those of them that a system has and its runs hardly show.
         convert: from fitted values to the effect's parameters, where the data are more nearly linear in other numbers (mass and
             moments of a load, not its place); None = they are the same.
         tolerances: per unknown, the calibrated parameters it meets; empty = it meets none.
@@ -146,6 +147,7 @@ class Candidate:
     formula: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
     fixed: Mapping[str, float] = field(default_factory=dict)
+    unseen: tuple[str, ...] = ()
     convert: Callable[[Sequence[float]], Mapping[str, float]] | None = None
     tolerances: tuple[Tolerance | None, ...] = ()
     within: Callable[[Sequence[float]], tuple[float, ...]] | None = None

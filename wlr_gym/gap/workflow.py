@@ -276,9 +276,14 @@ def _effects(search: SearchResult) -> tuple[FoundEffect, ...]:
 
 
 def found_effect(candidate: Candidate, own: Mapping[str, ParameterEstimate], frequency: float, gain: float) -> FoundEffect:
-    """Return a fitted candidate as it is written; constants of its formula that were not fitted have no width."""
+    """Return a fitted candidate as it is written.
+
+    Constants of its formula that were not fitted have no width, parameters that its runs hardly show no interval.
+    """
     fixed = candidate.fixed if candidate.formula else {}
     given = {name: ParameterEstimate(value, value, value, candidate.units[name]) for name, value in fixed.items()}
+    for name in candidate.unseen:
+        given[name] = ParameterEstimate(candidate.fixed[name], math.nan, math.nan, candidate.vocabulary[name].unit)
     name, where, units = candidate.name, candidate.where, dict(candidate.units)
     return FoundEffect(name, where, {**own, **given}, frequency, gain, candidate.formula, units, doc=candidate.doc)
 

@@ -315,6 +315,8 @@ USUAL: dict[str, Usual] = {
     "servo.wheel.no_load_speed": Usual(0.5, 150.0, "rad/s", _RATE),
     "ground.mu_x": Usual(0.02, 1.5, "-", (Mistake(1e-2, "%"),)),
     "ground.mu_y": Usual(0.02, 1.5, "-", (Mistake(1e-2, "%"),)),
+    "ground.slip_compliance": Usual(0.0, 0.5, "-", (Mistake(1e-2, "%"),)),
+    "ground.relaxation_length": Usual(1e-3, 0.05, "m", _LENGTH),
     "ground.slope": Usual(-0.6, 0.6, "rad", _ANGLE),
     "sensors.control_rate": Usual(10.0, 1000.0, "Hz", (Mistake(1e3, "kHz"),)),
     "sensors.encoder.position": Usual(1e-6, 0.1, "rad", _ANGLE),

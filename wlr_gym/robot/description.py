@@ -243,13 +243,20 @@ def _check_currents(where: str, motor: Motor, supply: float) -> None:
 
 
 class Ground(SettingsModel):
-    """Floor: friction along heading and axle, slope along x (rad), contact stiffness (N/m) and damping (N s/m)."""
+    """Floor and tyres: friction along heading and axle, slope along x (rad), contact stiffness (N/m) and damping (N s/m).
+
+    A tyre may have an elastic tread: slip per friction over load (0 = rigid), the way over which friction builds up (m), and
+    damping along the floor (N s/m).
+    """
 
     mu_x: float = Field(ge=0)
     mu_y: float = Field(ge=0)
     slope: float = 0.0
     normal_stiffness: float = Field(gt=0)
     normal_damping: float = Field(ge=0)
+    slip_compliance: float = Field(0.0, ge=0, le=5)
+    relaxation_length: float = Field(0.005, ge=5e-4, le=0.1)
+    tread_damping: float = Field(5.0, ge=0, le=100)
 
 
 class Home(SettingsModel):

@@ -37,6 +37,7 @@ class Hidden:
     patch: Array = field(default_factory=lambda: np.array([np.nan, 0.0, 0.0, 0.0, 0.0]))  # mu, x and y limits
     weak_slip: Array = field(default_factory=lambda: np.array([np.nan, 1.0]))  # mu_k, speed
     creep_speed: Array = field(default_factory=lambda: np.zeros(4))
+    bristles: Array = field(default_factory=lambda: np.stack([np.zeros(4), np.ones(4)]))  # slip per friction over load, m
     rolling: Array = field(default_factory=lambda: np.zeros(4))
     radius_scale: Array = field(default_factory=lambda: np.ones(4))
     payload: Array = field(default_factory=lambda: np.zeros(4))  # kg, x, y, z
@@ -123,9 +124,9 @@ def _write_camera(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
     hidden.camera_yaw, hidden.camera_scale = numbers.get("yaw", 0.0), numbers.get("scale", 1.0)
 
 
-def _both_rows(field_name: str, first: str, second: str) -> Law:
+def _both_rows(field_name: str, first: str, second: str, names: Sequence[str] = LEGS) -> Law:
     def write(hidden: Hidden, where: list[str], numbers: Numbers) -> None:
-        getattr(hidden, field_name)[:, _each(where, LEGS)] = np.array([[numbers[first]], [numbers[second]]])
+        getattr(hidden, field_name)[:, _each(where, names)] = np.array([[numbers[first]], [numbers[second]]])
 
     return write
 
@@ -140,11 +141,11 @@ def hide(effects: Sequence[Mapping[str, Any]]) -> Hidden:
     """Translate effects, ``{name, where, parameters}``, into the numbers of their laws.
 
     Raises:
-        KeyError: a name that is in neither table.
+        KeyError: a name that is in no table.
     """
     hidden = Hidden()
     for effect in sorted(effects, key=lambda one: one["name"] != "friction_level"):  # a level is below what single wheels have
-        law, _ = NAMED.get(effect["name"]) or STRANGE[effect["name"]]
+        law, _ = _EVERY[effect["name"]]
         law(hidden, list(effect["where"]), effect["parameters"])
     return hidden
 
@@ -198,6 +199,7 @@ class BlindCase:
         spoilt: how, for ``bad``.
         runs: which of the eight kinds of runs it has.
         camera: whether one has seen it.
+        bumps: rms height of its floor, m; None = drawn, see :func:`studies.bench.blind.copies.yielding`.
     """
 
     name: str
@@ -208,10 +210,11 @@ class BlindCase:
     spoilt: str = ""
     runs: tuple[int, ...] = RUNS[8]
     camera: bool = True
+    bumps: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what is hidden as plain data: how it is recorded shows in the data."""
-        told = {name: value for name, value in vars(self).items() if name not in ("runs", "camera")}
+        told = {name: value for name, value in vars(self).items() if name not in ("runs", "camera", "bumps")}
         return {**told, "effects": [dict(effect) for effect in self.effects]}
 
 
@@ -237,6 +240,24 @@ def case(index: int, first_seed: int = FIRST_SCORED_SEED) -> BlindCase:
     elif kind == "bad":
         spoilt = BAD[count % len(BAD)]
     return BlindCase(f"set_{seed:04d}", seed, kind, severity, effects, spoilt, *_recorded(seed, effects))
+
+
+#: The first seed of sets about tyres.
+FIRST_TYRE_SEED = 20000
+#: Sets about tyres: two of three are without an effect.
+TYRE_SETS = 90
+#: Severities of the elastic treads among them, in turn.
+TYRE_SEVERITIES = (2.0, 1.0, 2.0, 3.0)
+#: m, rms; height of the floor under all of them.
+TYRE_BUMPS = 1e-4
+
+
+def tyre_case(index: int, first_seed: int = FIRST_TYRE_SEED) -> BlindCase:
+    """Return number ``index`` of the sets about tyres: elastic treads, and on the same bumpy floor robots without any effect."""
+    seed, kind = first_seed + index, ("effect", "parameters", "none")[index % 3]
+    severity = TYRE_SEVERITIES[index // 3 % len(TYRE_SEVERITIES)] if kind == "effect" else 0.0
+    effects = (named("tyre_brush", severity, np.random.default_rng([seed, 4])),) if severity else ()
+    return BlindCase(f"set_{seed:04d}", seed, kind, severity, effects, "", *_recorded(seed, effects), TYRE_BUMPS)
 
 
 def _recorded(seed: int, effects: Sequence[Effect]) -> tuple[tuple[int, ...], bool]:
@@ -361,6 +382,11 @@ def _camera(severity: float, rng: Draw) -> Numbers:
     return {"scale": 1 + _sign(rng) * 0.015 * severity}
 
 
+def _brush(severity: float, rng: Draw) -> Numbers:
+    """Rubber at severity 1; the way over which it builds friction up is a few millimetres, whatever it is made of."""
+    return {"slip_compliance": 0.05 * severity, "relaxation_length": rng.uniform(0.004, 0.006)}
+
+
 #: Effects of the vocabulary: what each does in the simulator, and how it is drawn. Severity 1 is three tolerances or somewhat
 #: more where a tolerance hides it (by definition what 2.5 tolerances explain is no effect; of a vector the larger part has as
 #: much), else what the noise hides.
@@ -416,6 +442,12 @@ NAMED: Mapping[str, tuple[Law, Drawn]] = {
 }
 
 
+#: Effects that the cycle of :func:`case` does not have: it would draw other sets with them.
+LATER: Mapping[str, tuple[Law, Drawn]] = {
+    "tyre_brush": (_both_rows("bristles", "slip_compliance", "relaxation_length", WHEELS), _wheels(_brush)),
+}
+
+
 def _axle(name: str, severity: float, rng: Draw) -> Effect:
     return _effect(name, list(WHEELS[2 * int(rng.integers(2)) :][:2]), {"ratio": 0.1 * severity})
 
@@ -442,11 +474,14 @@ STRANGE: Mapping[str, tuple[Law, Drawn]] = {
 }
 
 
+_EVERY = {**NAMED, **LATER, **STRANGE}
+
+
 def named(name: str, severity: float, rng: Draw) -> Effect:
     """Draw an effect of the vocabulary at a severity: its place, its signs, its parameters."""
-    return NAMED[name][1](name, severity, rng)
+    return _EVERY[name][1](name, severity, rng)
 
 
 def strange(name: str, severity: float, rng: Draw) -> Effect:
     """Draw a law that no library names."""
-    return STRANGE[name][1](name, severity, rng)
+    return _EVERY[name][1](name, severity, rng)

@@ -74,6 +74,7 @@ class Copy:
     command_delay: float
     flattening: float
     floor_waves: Array  # (WAVES, 4) height, wave numbers along x and y, phase
+    steepness: float  # share of the floor's own slope that contacts follow
     gyro_bias: Array  # (3,)
     accel_bias: Array  # (3,)
 
@@ -132,6 +133,7 @@ def nominal(robot: dict[str, Any]) -> Copy:
         command_delay=0.0,
         flattening=0.0,
         floor_waves=np.zeros((WAVES, 4)),
+        steepness=0.0,
         gyro_bias=np.zeros(3),
         accel_bias=np.zeros(3),
     )
@@ -181,8 +183,11 @@ def draw(robot: dict[str, Any], rng: np.random.Generator) -> Copy:
     )
 
 
-def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
-    """Return the copy on soft tyres and a bumpy floor, with friction that creeps: what no two simulators share."""
+def yielding(copy: Copy, rng: np.random.Generator, bumps: float | None = None) -> Copy:
+    """Return the copy on soft tyres and a bumpy floor, with friction that creeps: what no two simulators share.
+
+    With ``bumps`` (m, rms) the floor is as high as that, and it pushes along its own normal instead of upwards.
+    """
 
     def drawn(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
@@ -193,7 +198,8 @@ def yielding(copy: Copy, rng: np.random.Generator) -> Copy:
         gear_creep=drawn(*YIELDING_GEAR),
         normal_stiffness=copy.normal_stiffness * drawn(*SOFTNESS),
         flattening=drawn(*FLATTENING),
-        floor_waves=_waves(drawn(*BUMPS), rng),
+        floor_waves=_waves(drawn(*BUMPS) if bumps is None else bumps, rng),
+        steepness=float(bumps is not None),
     )
 
 

@@ -66,11 +66,13 @@ class BlindRobot:
         }
 
 
-def copy_of(robot: Mapping[str, Any], seed: int, exact: bool = False, soft: bool = False) -> Copy:
+def copy_of(
+    robot: Mapping[str, Any], seed: int, exact: bool = False, soft: bool = False, bumps: float | None = None
+) -> Copy:
     """Draw a robot copy; see :func:`simulate_runs`."""
     copy = draw(dict(robot), np.random.default_rng([seed, 1]))
     copy = with_body_of(copy, nominal(dict(robot))) if exact else copy
-    return yielding(copy, np.random.default_rng([seed, 7])) if soft else copy
+    return yielding(copy, np.random.default_rng([seed, 7]), bumps) if soft else copy
 
 
 def simulate_runs(
@@ -81,6 +83,7 @@ def simulate_runs(
     exact: bool = False,
     soft: bool = False,
     camera: bool = True,
+    bumps: float | None = None,
 ) -> tuple[list[pd.DataFrame], dict[str, Any], Copy]:
     """Simulate runs of a data set.
 
@@ -92,11 +95,12 @@ def simulate_runs(
         exact: the nominal robot, but for its clocks and its sensors' biases, instead of a copy within tolerances.
         soft: tyres and gears yield, which differs from one set to the next and is in no robot file.
         camera: whether one was there.
+        bumps: rms height of the floor where tyres and gears yield, m; None = drawn.
 
     Returns:
         Tables of the runs, contents of ``meta.yaml``, the robot copy.
     """
-    copy = copy_of(robot, seed, exact, soft)
+    copy = copy_of(robot, seed, exact, soft, bumps)
     choose = np.random.default_rng([seed, 2])
     geometry = commands.Geometry(float(robot["leg"]["length"]), float(robot["wheel"]["radius"]))
     scripts = commands.scripts(choose, geometry)

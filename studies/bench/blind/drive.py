@@ -35,6 +35,8 @@ SETTLE = 1.5
 BANDWIDTH = 44.0
 #: Of the tyres, N s/m.
 NORMAL_DAMPING = 60.0
+#: Of bristles on the floor, N s/m.
+BRISTLE_DAMPING = 4.0
 #: Solutions of the velocity equation per step, at most.
 SOLUTIONS = 12
 #: Agreement of two solutions that is enough, m/s and rad/s.
@@ -120,12 +122,13 @@ def _solve(matrix, vector):
 
 
 @_jit
-def _contact(w, place, turn, hip_x, hip_y, length, radius, flat_tyre, cos, sin, rows, columns, dofs):
+def _contact(w, place, turn, hip_x, hip_y, length, radius, flat_tyre, waves, steep, cos, sin, rows, columns, dofs):
     """Find the lowest point of a wheel's disc.
 
     Writes the rows that give its velocity upwards, and along the heading and the axle that of a point above it: ``flat_tyre``
     is a share and a depth, and a tyre rolls on its radius less that share of what it is deeper. They are over the columns (8)
-    of the generalised velocities that move it. Returns how deep the lowest point is under a flat floor, its x and its y.
+    of the generalised velocities that move it. Directions follow the share ``steep`` of the floor's own slope there. Returns
+    how deep the lowest point is in the floor, its x and its y.
     """
     side_x, side_y, side_z = turn[0, 1], turn[1, 1], turn[2, 1]
     flat = np.sqrt(side_x * side_x + side_y * side_y)
@@ -140,8 +143,15 @@ def _contact(w, place, turn, hip_x, hip_y, length, radius, flat_tyre, cos, sin, 
     at_x = place[0] + turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
     at_y = place[1] + turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
     share = flat_tyre[0] * (max(-height, 0.0) - flat_tyre[1]) / radius
+    depth, slope_x, slope_y = -height, 0.0, 0.0
+    for k in range(waves.shape[0]):
+        angle = waves[k, 1] * at_x + waves[k, 2] * at_y + waves[k, 3]
+        depth += waves[k, 0] * np.sin(angle)
+        slope_x += steep * waves[k, 0] * waves[k, 1] * np.cos(angle)
+        slope_y += steep * waves[k, 0] * waves[k, 2] * np.cos(angle)
     head_x, head_y = side_y / flat, -side_x / flat
-    directions = ((head_x, head_y, 0.0), (-head_y, head_x, 0.0), (0.0, 0.0, 1.0))
+    ahead, aside = head_x * slope_x + head_y * slope_y, head_x * slope_y - head_y * slope_x
+    directions = ((head_x, head_y, ahead), (-head_y, head_x, aside), (-slope_x, -slope_y, 1.0))
     for d in range(3):
         e = directions[d]
         arm = 1.0 if d == 2 else 1.0 - share
@@ -157,7 +167,7 @@ def _contact(w, place, turn, hip_x, hip_y, length, radius, flat_tyre, cos, sin, 
     for k in range(6):
         columns[w, k] = k
     columns[w, 6], columns[w, 7] = dofs[w], dofs[4 + w]
-    return -height, at_x, at_y
+    return depth, at_x, at_y
 
 
 @_jit
@@ -186,7 +196,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
     tooth_stiffness, tooth_damping = joints[16], joints[17]
     hip_x, hip_y, radius, wheel_mu, creep, rolling = corners[0], corners[1], corners[2], corners[3], corners[4], corners[5]
     out_of_round, spring, rest, dahl_torque, dahl_stiffness = corners[6], corners[7], corners[8], corners[9], corners[10]
-    cross = corners[11]
+    cross, give, bristle_length = corners[11], corners[12], corners[13]
     length, full_supply, supply_resistance = general[0], general[1], general[2]
     wheel_acceleration, leg_velocity, leg_acceleration = general[3], general[4], general[5]
     force_x, force_y, tether, anchor_x, anchor_y = general[6], general[7], general[8], general[9], general[10]
@@ -194,6 +204,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
     patch, mu_ratio, mu_k, weak_speed = general[16:21], general[21], general[22], general[23]
     gravity, stiffness = general[24:27], general[27]
     floor_creep, gear_creep, flat_tyre = general[28], general[29], general[30:32]
+    rest_load, steep = general[32], general[33]
     filter_share = 1.0 - np.exp(-2.0 * np.pi * BANDWIDTH * STEP)
 
     size = qvel.shape[0]
@@ -206,6 +217,7 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
     bias, force, right, base = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     rows, columns, depth = np.zeros((12, 8)), np.zeros((4, 8), dtype=np.int64), np.zeros(4)
     mu_x, pressed = np.zeros(4), np.zeros(4, dtype=np.bool_)
+    bent, stays, bend, hold = np.zeros((4, 2)), np.zeros(4), np.zeros(4), np.zeros(4)
     slow = np.full(4, floor_creep)
     slow_gear, slow_roll = np.full(8, gear_creep), np.full(4, gear_creep)
     for j in range(4):
@@ -307,10 +319,8 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
             angle, spin_angle = qpos[position[w]], qpos[position[4 + w]]
             depth[w], at_x, at_y = _contact(
                 w, qpos, turn, hip_x[w], hip_y[w], length, radius[w] * (1.0 + out_of_round[w] * np.sin(spin_angle)),
-                flat_tyre, np.cos(angle), np.sin(angle), rows, columns, rate,
+                flat_tyre, waves, steep, np.cos(angle), np.sin(angle), rows, columns, rate,
             )  # fmt: skip
-            for k in range(waves.shape[0]):
-                depth[w] += waves[k, 0] * np.sin(waves[k, 1] * at_x + waves[k, 2] * at_y + waves[k, 3])
             pressed[w] = depth[w] > 0.0
             mu_x[w] = wheel_mu[w]
             inside = patch[1] < at_x and at_x < patch[2] and patch[3] < at_y and at_y < patch[4]
@@ -339,7 +349,25 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
                 for k in range(8):
                     right[columns[w, k]] += STEP * stiffness * depth[w] * lift[k]
                 mu_y = mu_x[w] * mu_ratio
-                if creep[w] > 0.0:
+                if give[w] > 0.0:
+                    # bristles relax over their way and are bent by the slip, exactly within the step
+                    own = bristle_length[w] * np.sqrt(max(normal[w], 0.01 * rest_load) / rest_load)
+                    bristles = normal[w] / (give[w] * own)
+                    gone = STEP * abs(radius[w] * (qvel[wheel] + qvel[rate[w]] + qvel[4])) / own
+                    stays[w] = np.exp(-gone)
+                    bend[w] = STEP * (-np.expm1(-gone) / gone if gone > 1e-9 else 1.0)
+                    total = 0.0
+                    for axis, mu in ((0, mu_x[w]), (1, mu_y)):
+                        speed = _along(rows[3 * w + axis], columns[w], qvel)
+                        pull_back = bristles * (stays[w] * bent[w, axis] + bend[w] * speed) + BRISTLE_DAMPING * speed
+                        total += (pull_back / max(mu * normal[w], 1e-9)) ** 2
+                    hold[w] = 1.0 / max(np.sqrt(total), 1.0)
+                    for axis in range(2):
+                        row = rows[3 * w + axis]
+                        _add_damper(matrix, row, columns[w], STEP * hold[w] * (bristles * bend[w] + BRISTLE_DAMPING))
+                        for k in range(8):
+                            right[columns[w, k]] -= STEP * hold[w] * bristles * stays[w] * bent[w, axis] * row[k]
+                elif creep[w] > 0.0:
                     share = max(slip[w], 1e-9)
                     factor = np.tanh(share / creep[w]) / share
                     _add_damper(matrix, rows[3 * w], columns[w], STEP * normal[w] * mu_x[w] * factor)
@@ -372,6 +400,10 @@ def drive(model, data, qpos, qvel, addresses, tables, times, setpoints, records)
                 pressed[w] = normal[w] > 0.0
             if change < AGREED:
                 break
+        for w in range(4):
+            for axis in range(2):
+                speed = _along(rows[3 * w + axis], columns[w], qvel)
+                bent[w, axis] = hold[w] * (stays[w] * bent[w, axis] + bend[w] * speed) if pressed[w] else 0.0
         _integrate(model, qpos.ctypes.data, qvel.ctypes.data, STEP)
         # --- inertial sensors at the body's origin
         for k in range(3):
@@ -708,6 +740,7 @@ def _corner_table(copy: Copy, hidden: Hidden) -> Array:
             *hidden.leg_spring,
             *hidden.elastic,
             np.repeat(hidden.cross_ratio, 2),
+            *hidden.bristles,
         ]
     )
 
@@ -735,5 +768,7 @@ def _general_table(copy: Copy, hidden: Hidden, profile: BlindProfile) -> Array:
             copy.gear_creep,
             copy.flattening,
             copy.weight / 4 / copy.normal_stiffness,
+            copy.weight / 4,
+            copy.steepness,
         ]
     )

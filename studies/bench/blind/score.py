@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta, binom
 
-from studies.bench.blind.cases import NAMED
+from studies.bench.blind.cases import LATER, NAMED
 from studies.bench.blind.copies import nominal, read_robot
 from wlr_gym.base.paths import data_directory
 
@@ -27,6 +27,7 @@ SHAPE = {
     "stribeck_friction": ("stribeck_speed",),
     "slip_weakening": ("slip_speed",),
     "friction_patch": ("x_min", "x_max", "y_min", "y_max"),
+    "tyre_brush": ("relaxation_length",),
     "payload": ("x", "y", "z"),
     "tether": ("x", "y"),
 }
@@ -104,7 +105,7 @@ def equivalence_set(result: Result) -> set[str]:
 def _names_within(group: Any) -> set[str]:
     """Names of the vocabulary in a nest of lists, mappings and texts: a text counts by its first word."""
     if isinstance(group, str):
-        return {group.split(" ")[0]} & {*NAMED, UNKNOWN}
+        return {group.split(" ")[0]} & {*NAMED, *LATER, UNKNOWN}
     if isinstance(group, Mapping):
         return set().union(*map(_names_within, group.values()))
     return set().union(*map(_names_within, group)) if isinstance(group, Sequence) else set()

@@ -198,7 +198,10 @@ def _effect(effect: FoundEffect) -> str:
     meaning = f"What is missing: {doc}." if doc else "Nothing in the library explains it."
     law = effect.formula or (known.equation if known else "")
     unlawful = "<p>No formula was found that holds.</p>" if effect.name == UNKNOWN_EFFECT else ""
-    rows = [(name, estimate(found)) for name, found in effect.parameters.items()]
+    rows = [
+        (name, estimate(found) if math.isfinite(found.low) else f"{estimate(found)}, assumed: runs hardly show it")
+        for name, found in effect.parameters.items()
+    ]
     tried = [
         f"{plain(name)} is {number(one.low)} to {number(one.high)}{unit_of(one.unit)}" for name, one in effect.validity.items()
     ]

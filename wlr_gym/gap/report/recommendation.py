@@ -40,6 +40,9 @@ _SEPARATED_BY: Sequence[tuple[Sequence[str], Sequence[str], str, str]] = (
      "drive and be driven: friction changes its sign with the speed, a weak motor does not; sag needs a high total current"),
     (("wheel_radius_error",), ("camera_misalignment", "tyre_creep"), "turns",
      "a wrong radius turns the robot where wheels differ; a wrong camera scale does not"),
+    (("tyre_brush",), ("tyre_creep", "friction_level", "friction_asymmetry", "slip_weakening"), "posture",
+     "legs that swing press wheels along the floor as they roll: an elastic tread slips in proportion to its speed, creep as "
+     "fast at any speed, and friction and its weakening show only where wheels slide"),
     (("friction_anisotropy", "slip_weakening"), ("friction_level", "friction_asymmetry", "tyre_creep"), "turns",
      "spins in place at several speeds beside straight braking: lateral and longitudinal grip are used apart"),
     (("coulomb_friction",), ("viscous_friction", "stribeck_friction"), "straight",

@@ -181,15 +181,20 @@ class _Library:
             unknowns = [Unknown(n, o.unit, o.neutral, o.low, o.high, o.step, o.is_size) for n, o in own.numbers.items()]
         tolerances = tuple(self._tolerance(effect, where, unknown.name, known) for unknown in unknowns) if known else ()
         numbers, ways = tuple(unknowns), tuple(starts)
-        whole = Candidate(effect.name, where, numbers, ways, tolerances=tolerances, surcharge=search.surcharge)
+        fixed = {name: self.observed.mean(number) for name, number in search.unseen.items()}
+        whole = Candidate(
+            effect.name, where, numbers, ways, fixed=fixed, unseen=tuple(fixed), tolerances=tolerances, surcharge=search.surcharge
+        )
         if own is not None:
-            whole = replace(whole, fixed=own.fixed, convert=own.parameters, within=own.within)
+            whole = replace(whole, fixed=fixed | own.fixed, convert=own.parameters, within=own.within)
         return [whole, *(_component(whole, k) for k in range(len(unknowns)) if search.components)]
 
     def _unknowns(self, effect: Effect, search: Search) -> list[Unknown]:
         """The parameters of an effect; a fit may go :data:`BEYOND` their prior."""
         found = []
         for name, parameter in effect.parameters.items():
+            if name in search.unseen:
+                continue
             low, high = parameter.prior
             low = max(low, search.least.get(name, low))
             neutral, room = parameter.neutral_in(self.observed.parameters), BEYOND * (high - low) * parameter.is_size

@@ -303,6 +303,8 @@ class Search:
         known: the number that each unknown adds to, where there is one.
         coordinates: what is fitted at one of ``places``; None = the parameters themselves.
         least: below these values of its parameters the effect is what any robot has, and calibration's.
+        unseen: parameters that runs hardly show, and the number of the model that each gets: it is not fitted, and a result
+            says so.
         relation_of_all: the relation, where it acts at all its places; empty = none in particular.
         one_per_place: beside another one of its kind at the same place no fit could move it.
         components: of its parameters one alone may be missing.
@@ -317,6 +319,7 @@ class Search:
     known: Mapping[str, Known] = field(default_factory=dict)
     coordinates: Callable[[Places, Observed], Coordinates] | None = None
     least: Mapping[str, float] = field(default_factory=dict)
+    unseen: Mapping[str, str] = field(default_factory=dict)
     relation_of_all: str = ""
     one_per_place: bool = False
     components: bool = False

@@ -280,9 +280,17 @@ CONTACT = "contact of the {}"
 BODY_FORCE = "force on the body"
 
 
+#: Slip per friction over load of the tread from which a search starts; one of rubber has 0.04 to 0.07.
+TREAD = 0.08
+
+
 def _asymmetry_guesses(where: Places, observed: Observed) -> list[Guess]:
     mu = observed.mean("ground.mu_x")
     return [one_step("mu", -0.25 * mu, mu)]
+
+
+def _tread_guesses(where: Places, observed: Observed) -> list[Guess]:
+    return [one_step("slip_compliance", TREAD, observed.mean("ground.slip_compliance"))]
 
 
 def _weakening_guesses(where: Places, observed: Observed) -> list[Guess]:
@@ -412,13 +420,21 @@ GROUND_EFFECTS: tuple[Effect, ...] = (
         "u' = s - |V|/relaxation_length u, F = -load/(slip_compliance relaxation_length) u up to mu load",
         WHEELS,
         {
-            "slip_compliance": EffectParameter("-", "slip per friction over load", 0, 5, 0.0, (0, 0.5), 0.06),
+            "slip_compliance": EffectParameter("-", "slip per friction over load", 0, 5, "ground.slip_compliance", (0, 0.3), 0.06),
             "relaxation_length": EffectParameter(
                 "m", "way over which it builds up", 5e-4, 0.1, 0.005, (0.002, 0.02), 0.005, optional=True, is_size=False
             ),
         },
         together(put("ground.slip_compliance", "slip_compliance"), put("ground.relaxation_length", "relaxation_length")),
         "level",
+        search=Search(
+            CONTACT,
+            "posture",
+            WHEEL_SETS,
+            _tread_guesses,
+            least={"slip_compliance": 0.01},
+            unseen={"relaxation_length": "ground.relaxation_length"},
+        ),
     ),
     Effect(
         "wheel_radius_error",

@@ -254,6 +254,8 @@ Array = NDArray[np.float64]
 NOT_IN_MJCF = (
     "sensors", "tolerances", "dynamixel_ids", "servo gains, no-load speeds, currents, gear stiffness and supply voltage",
 )  # fmt: skip
+#: What a robot file says of an elastic tread. MuJoCo's contacts have none: it stands among an MJCF's custom numbers.
+_TREAD = ("ground.slip_compliance", "ground.relaxation_length", "ground.tread_damping")
 #: What of a floor's pieces an MJCF cannot hold.
 NOT_IN_MJCF_FLOOR = ("edge radii of pieces", "direction of friction on pieces", "patches and maps of friction")
 #: m; how far a piece of the floor reaches to both sides, and along its heading where it has no end.
@@ -270,7 +272,7 @@ def mjcf_text(robot: Robot, parameters: Parameters | None = None) -> str:
     """Return the robot as MJCF (XML): the MuJoCo plant's model with the floor's contacts, leg limits and a motor per joint.
 
     Joint angles are those of the robot; the reference pose is its home pose. The motors take torques (N m): the servo's law is
-    no part of the file. Pieces of the floor are boxes where their faces are upright, else convex meshes, :data:`REACH` m long.
+    no part of the file. An elastic tread is written as custom numbers, which only this library reads. Pieces of the floor are boxes where their faces are upright, else convex meshes, :data:`REACH` m long.
 
     Args:
         robot: the robot.
@@ -295,6 +297,9 @@ def _complete(spec: Any, robot: Robot, row: Parameters, kept: list[Any]) -> None
     kept.append(spec)
     for piece in np.flatnonzero(row["piece.height"][0] > 0.0):
         _add_piece(spec, row, int(piece))
+    if row["ground.slip_compliance"].any():
+        for name in _TREAD:
+            spec.add_numeric(name=name, size=1, data=[row[name][0, 0]])
     spec.delete(spec.body("payload"))
     for leg in LEGS:
         joint = spec.joint(leg)
@@ -341,6 +346,8 @@ def _write_full_digits(root: ElementTree.Element, model: Any) -> None:
         for joint in element.findall("joint"):
             if joint.get("type") != "free":
                 _write_joint(joint, model)
+    for index, element in enumerate(root.iter("numeric")):
+        _write(element, data=model.numeric_data[model.numeric_adr[index] :][:1])
     for index, element in enumerate(root.iter("pair")):
         element.set("solref", "")  # set after compiling, so that it is not in the text
         _write(element, friction=model.pair_friction[index], solref=model.pair_solref[index])
@@ -549,14 +556,15 @@ def _turned(axis: Array, angle: float) -> Array:
 
 
 def _scene_numbers(model: Any, base: int, source: str) -> dict[str, float | list[float]]:
-    """What a model says of gravity, and of contacts that are pairs of their own, as the plant's are."""
+    """What a model says of gravity, of contacts that are pairs of their own, as the plant's are, and of their treads."""
     gravity = float(np.linalg.norm(model.opt.gravity))
     numbers: dict[str, float | list[float]] = {"gravity": gravity}
     if gravity and abs(model.opt.gravity[1]) < 1e-9 * gravity:
         numbers["ground.slope"] = float(np.arcsin(-model.opt.gravity[0] / gravity)) + 0.0
     if model.npair >= len(WHEELS) and (model.pair_solref < 0.0).all() and (model.pair_solimp[:, 0] == CONTACT_IMPEDANCE).all():
         numbers |= _contact_numbers(model)
-    return numbers
+    custom = {model.numeric(k).name: float(model.numeric(k).data[0]) for k in range(model.nnumeric)}
+    return numbers | {name: custom[name] for name in _TREAD if name in custom}
 
 
 def _contact_numbers(model: Any) -> dict[str, float | list[float]]:
