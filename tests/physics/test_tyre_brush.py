@@ -2,7 +2,11 @@
 
 import numpy as np
 import pytest
-from rig import BACKENDS, HOME, RADIUS, channel, drive, lock, make_plant, record
+from rig import BACKENDS, HOME, RADIUS, WEIGHT, channel, drive, lock, make_plant, record
+
+from wlr_gym.physics.plants.gibbs_appell.kinematics import STORED
+from wlr_gym.physics.plants.mujoco.step import STATE
+from wlr_gym.robot import load_robot
 
 SPEED = 0.05  # m/s
 STEP = 2.5e-4  # s
@@ -62,8 +66,38 @@ def test_a_parked_robot_stays(backend):
     assert drift < {"gibbs_appell": 1e-9, "mujoco": 1e-6}[backend]
 
 
-def swerve(plant) -> np.ndarray:
-    for tick in range(100):
+def shears(plant, backend) -> np.ndarray:
+    """Shear (4, 2) of the treads of the only robot, along heading and axle, m."""
+    store, names = {"gibbs_appell": ("lanes", STORED), "mujoco": ("servos", STATE)}[backend]
+    values = plant.get_state().arrays[store][0]
+    return np.array([[values[names.index(f"shear_{axis}{wheel}")] for axis in "xy"] for wheel in range(4)])
+
+
+@EACH
+def test_a_wheel_in_the_air_forgets_its_shear(backend):
+    """Parked on a slope with little gravity, a robot draws its legs in faster than it falls."""
+    weak = {"gravity": 1.0, "ground.slope[pitch]": 0.3, "ground.slip_compliance": 0.2}
+    plant = make_plant(1, weak, backend=backend)
+    drive(plant, 0.5)
+    assert np.abs(shears(plant, backend)[:, 0]).min() > 1e-4
+    folded, flew = HOME + np.array([-1.2, -1.2, 1.2, 1.2, 0, 0, 0, 0]), 0
+    for _ in range(20):
+        load = drive(plant, 0.02, folded).contact_force.reshape(4, 3)[:, 2]
+        assert not shears(plant, backend)[load == 0.0].any()
+        flew += (load == 0.0).sum()
+    assert flew > 8
+    drive(plant, 3.0, folded)
+    assert np.abs(shears(plant, backend)[:, 0]).min() > 1e-4
+
+
+def test_a_robot_file_states_its_tyre():
+    robot = load_robot({"base": "nominal", "name": "soft", "ground": {"slip_compliance": 0.1, "relaxation_length": 0.008}})
+    same = {"ground.slip_compliance": 0.1, "ground.relaxation_length": 0.008}
+    np.testing.assert_array_equal(swerve(make_plant(1, robot=robot)), swerve(make_plant(1, same)))
+
+
+def swerve(plant, ticks=100) -> np.ndarray:
+    for tick in range(ticks):
         wheels = 4.0 * np.sin(0.07 * tick) * np.array([1.0, 0.5, 1.0, 0.5])
         setpoints = np.concatenate([HOME[:4] + 0.1 * np.sin(0.1 * tick), wheels])
         plant.step(np.tile(setpoints, (plant.count, 1)))
@@ -71,8 +105,9 @@ def swerve(plant) -> np.ndarray:
 
 
 def test_a_stiff_tread_is_a_rigid_one():
-    truth = swerve(make_plant(2, {"ground.slip_compliance": np.array([[1e-5], [0.0]])}))
-    assert np.abs(truth[0, :3] - truth[1, :3]).max() < 2e-6
+    compliance = 0.25 * WEIGHT / (0.005 * 1e8)  # of bristles with 1e8 N/m
+    truth = swerve(make_plant(2, {"ground.slip_compliance": np.array([[compliance], [0.0]])}), 50)
+    assert np.abs(truth[0, :3] - truth[1, :3]).max() < 1e-6
 
 
 def test_a_rigid_tread_beside_an_elastic_one_keeps_its_bits():

@@ -244,6 +244,7 @@ class PlantState:
         time: (N,) since the start of the run or episode, s; only formula forces ask for it. None = its start.
         wind_up: (N, 8) of the joints, where a formula force asks for it (:data:`wlr_gym.physics.plants.forces.MEMORY`). None =
             none.
+        shear: (N, 16) of elastic treads, m, at each contact along heading and axle. None = none.
     """
 
     position: Array
@@ -259,6 +260,7 @@ class PlantState:
     supply_drop: Array | None = None
     time: Array | None = None
     wind_up: Array | None = None
+    shear: Array | None = None
 
     def __len__(self) -> int:
         return self.position.shape[0]

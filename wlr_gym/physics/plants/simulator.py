@@ -83,7 +83,7 @@ class Simulator(ABC):
     @abstractmethod
     def _servo_state(self) -> tuple[Array, ...]:
         """Return copies of the servos' references (N, 8), rad (legs: as read) and rad/s, of lead and rate of the rotors (N, 8),
-        of the supply's drop (N,) and of the joints' wind-up (N, 8)."""
+        of the supply's drop (N,), of the joints' wind-up (N, 8) and of the treads' shear (N, 16), m."""
 
     @abstractmethod
     def _engine_stores(self) -> dict[str, RowStore]:
@@ -137,7 +137,7 @@ class Simulator(ABC):
     def mechanical_state(self) -> PlantState:
         """Return a copy of the mechanical and servo state."""
         truth, has_play = self._truth, self.parameters["servo.backlash"] > 0.0
-        position, velocity, lead, rate, drop, wind_up = self._servo_state()
+        position, velocity, lead, rate, drop, wind_up, shear = self._servo_state()
         position[:, LEG_SLICE] -= self.parameters["joint.zero_offset"]
         body = ("position", "quaternion", "linear_velocity_in_body", "angular_velocity_in_body")
         return PlantState(
@@ -149,6 +149,7 @@ class Simulator(ABC):
             supply_drop=drop,
             time=self._time.copy(),
             wind_up=wind_up,
+            shear=shear,
         )
 
     # ---- snapshots ----

@@ -44,6 +44,7 @@ _PLACE = {
         (range(4), ("turns{}", "zero_angle{}", "zero_rest{}", "place{}")),
         (range(8), ("reference_position{}", "reference_velocity{}", "rotor_lead{}", "rotor_rate{}")),
         (range(1), ("supply_drop",)),
+        ([f"{a}{c}" for c in CONTACTS for a in "xy"], ("shear_{}",)),
     )
     for pattern in patterns
 }
@@ -226,6 +227,8 @@ class GibbsAppellPlant(Simulator):
             groups["rotor_lead{}"] = state.rotor_lead[rows]
         if state.supply_drop is not None:
             groups["supply_drop"] = state.supply_drop[rows, None]
+        if state.shear is not None:
+            groups["shear_{}"] = state.shear[rows]
         for name, columns in groups.items():
             values[:, _PLACE[name]] = columns
         if not np.isfinite(values).all():
@@ -239,12 +242,12 @@ class GibbsAppellPlant(Simulator):
 
     def _servo_state(self) -> tuple[Array, ...]:
         values = _gather(self._lanes, self._width, self._all).astype(np.float64)
-        names = ("reference_position{}", "reference_velocity{}", "rotor_lead{}", "rotor_rate{}", "supply_drop")
-        position, velocity, lead, rate, drop = (values[:, _PLACE[name]] for name in names)
+        names = ("reference_position{}", "reference_velocity{}", "rotor_lead{}", "rotor_rate{}", "supply_drop", "shear_{}")
+        position, velocity, lead, rate, drop, shear = (values[:, _PLACE[name]] for name in names)
         if self._float is np.float32:
             position[:, WHEEL_SLICE] += self._truth.joint_position[:, WHEEL_SLICE] - values[:, _PLACE["wheel_angle{}"]]
         wind_up = _gather(self._memory, self._width, self._all)[:, 1:].astype(np.float64)
-        return position, velocity, lead, rate, drop[:, 0], wind_up
+        return position, velocity, lead, rate, drop[:, 0], wind_up, shear
 
     def _contact_forces(self) -> Array:
         values = _gather(self._lanes, self._width, self._all).astype(np.float64)

@@ -31,6 +31,7 @@ _JOINT = np.array([0, 2, 4, 6, 1, 3, 5, 7])
 _LANE = {name: index for index, name in enumerate(STATE)}
 _ROTOR_LEAD = np.array([_LANE[f"rotor_lead{j}"] for j in range(8)])
 _ROTOR_RATE = np.array([_LANE[f"rotor_rate{j}"] for j in range(8)])
+_SHEAR = np.array([_LANE[f"shear_{a}{c}"] for c in CONTACTS for a in "xy"])
 _FORCES = np.array([_LANE[f"force_{a}{c}"] for c in CONTACTS for a in "xyz"])
 _SUMS = slice(_LANE[TICK_SUMS[0]], _LANE[TICK_SUMS[-1]] + 1)
 
@@ -133,6 +134,8 @@ class MujocoPlant(Simulator):
             groups["rotor_lead{}"] = (state.rotor_lead[rows], range(8))
         if state.supply_drop is not None:
             groups["supply_drop{}"] = (state.supply_drop[rows, None], ("",))
+        if state.shear is not None:
+            values[:, _SHEAR] = state.shear[rows]
         for pattern, (columns, labels) in groups.items():
             for k, label in enumerate(labels):
                 values[:, _LANE[pattern.format(label)]] = columns[:, k]
@@ -147,7 +150,7 @@ class MujocoPlant(Simulator):
     def _servo_state(self) -> tuple[Array, ...]:
         names = ("reference_position", "reference_velocity", "rotor_lead", "rotor_rate")
         joints = (self._state[:, [_LANE[f"{name}{j}"] for j in range(8)]] for name in names)
-        return *joints, self._state[:, _LANE["supply_drop"]].copy(), self._memory[1:].T.copy()
+        return *joints, self._state[:, _LANE["supply_drop"]].copy(), self._memory[1:].T.copy(), self._state[:, _SHEAR]
 
     def _contact_forces(self) -> Array:
         return self._state[:, _FORCES].reshape(self._count, -1, 3).copy()
