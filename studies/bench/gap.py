@@ -364,7 +364,9 @@ def make_data(folder: Path, one: BlindCase, runs: Sequence[int] = ()) -> str:
     from studies.bench.blind.dataset import fingerprint, simulate_runs, spoilt, write
 
     robot = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
-    tables, meta, _ = simulate_runs(robot, one.effects, one.seed, runs or one.runs, one.kind == "none", True, one.camera, one.bumps)
+    tables, meta, _ = simulate_runs(
+        robot, one.effects, one.seed, runs or one.runs, one.kind == "none", True, one.camera, one.bumps
+    )
     if one.spoilt:
         tables = spoilt(one.spoilt, tables, np.random.default_rng([one.seed, 5]))
     shutil.rmtree(folder, ignore_errors=True)
@@ -473,7 +475,7 @@ def _share(share: Mapping[str, Any], side: Side) -> str:
 
 def markdown(report: Mapping[str, Any]) -> str:
     """Return the report as Markdown tables: numbers beside targets, severities, confusion matrix."""
-    judgements = [(line.what, line.value, line.target, line.met) for line in lines(report)]
+    judgements = [(line.what, line.value, line.target, line.met) for line in lines(report) if line.value != "-"]
     severities = [
         (severity, shares["found"]["count"], *(f"{shares[key]['share']:.0%}" for key in ("found", "top1", "in_set")))
         for severity, shares in report["single"]["by_severity"].items()

@@ -22,7 +22,7 @@ from wlr_gym.gap.analysis import LEAST_RUNS, ParameterEstimate
 from wlr_gym.gap.estimation import FittedModel, level, mean_squares, nominal_model
 from wlr_gym.gap.problem import Setting, Unknown
 from wlr_gym.gap.report.recommendation import relation_of
-from wlr_gym.gap.report.result import write_result
+from wlr_gym.gap.report.result import read_result, write_result
 from wlr_gym.gap.robot.candidates import (
     formula_candidates,
     knobs,
@@ -175,6 +175,32 @@ def test_components_of_a_vector_are_tried_alone(tried):
     assert [len(candidate.tolerances) for candidate in centre] == [3, 1, 1, 1]
     assert [t.quantities for t in centre[2].tolerances if t is not None] == [("body.com_offset[y]",)]
     assert not [candidate for candidate in tried[1] if candidate.name == "payload"][1:]
+
+
+def test_what_runs_hardly_show_of_an_effect_is_assumed_and_said(tried, tmp_path):
+    tread = next(candidate for candidate in tried[1] if candidate.name == "tyre_brush")
+    assert [unknown.name for unknown in tread.unknowns] == ["slip_compliance"]
+    length = float(NOMINAL["ground.relaxation_length"][0, 0])
+    assert tread.effect((0.1,)).parameters == {"slip_compliance": 0.1, "relaxation_length": length}
+    fitted = {"slip_compliance": ParameterEstimate(0.1, 0.08, 0.12, "-")}
+    effect = found_effect(tread, fitted, 1.0, 50.0)
+    result = read_result(write_result(replace(EFFECT_FOUND, effects=(effect,)), tmp_path))
+    stated = result.effects[0].parameters["relaxation_length"]
+    assert (stated.value, stated.ci95, stated.unit) == (length, None, "m")
+    (written,) = load_patch(tmp_path / "patch.yaml").effects
+    assert written.parameters == {"slip_compliance": 0.1, "relaxation_length": length}
+
+
+def test_a_tread_is_sought_beyond_that_of_the_robot_file():
+    soft = Parameters.nominal(load_robot({"base": "nominal", "name": "soft", "ground": {"slip_compliance": 0.05}}))
+    still = np.zeros((100, len(CHANNELS)))
+    probes, candidates = robot_candidates(soft, {}, [still], [still], [still])
+    tread = next(candidate for candidate in candidates if candidate.name == "tyre_brush")
+    assert tread.unknowns[0].neutral == pytest.approx(0.05)
+    (start,) = tread.starts
+    assert start.values(np.zeros(1)) == pytest.approx((0.05,))
+    (probe,) = (probe.effects[0] for probe in probes if probe.key == start.directions[0][0])
+    assert start.values(np.ones(1)) == pytest.approx((probe.parameters["slip_compliance"],))
 
 
 def test_a_tether_is_anchored_near_and_a_load_carried_within_the_robot(tried):
@@ -709,7 +735,11 @@ def test_features_are_rows_of_the_run(good):
 
 
 @pytest.mark.slow
-def test_rolling_resistance_is_found_in_four_runs(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "parameter", "size"), [("rolling_resistance", "coefficient", 0.1), ("tyre_brush", "slip_compliance", 0.15)]
+)
+def test_an_effect_of_the_wheels_is_found_in_four_runs(tmp_path, name, parameter, size):
+    hidden = {"name": name, "where": list(WHEELS), "parameters": {parameter: size}}
     for k, kind in enumerate(("straight", "turns", "stop_and_go", "s_curve")):
         motion = excite(kind, k, seconds=6.0)
         meta = META.model_copy(update={"profile": motion.profile})
@@ -717,15 +747,15 @@ def test_rolling_resistance_is_found_in_four_runs(tmp_path):
         def commands(t, setpoints=motion.setpoints):
             return setpoints[min(round(t / 0.02), len(setpoints) - 1)]
 
-        run = record(commands, spaced(5.9), [RESISTANCE], meta=meta, noise=k)
+        run = record(commands, spaced(5.9), [hidden], meta=meta, noise=k)
         write_run(tmp_path / f"run_{k + 1:02d}.csv", run.table, meta)
     found = analyse(tmp_path)
     assert found.verdict == "effect_found"
-    assert found.effects[0].name == "rolling_resistance"
+    assert found.effects[0].name == name
     assert found.effects[0].where == tuple(WHEELS)
-    value = found.effects[0].parameters["coefficient"]
-    assert value.value == pytest.approx(0.1, rel=0.2)
-    assert value.low < 0.1 < value.high
+    value = found.effects[0].parameters[parameter]
+    assert value.value == pytest.approx(size, rel=0.2)
+    assert value.low < size < value.high
     assert found.gap is not None
     assert found.gap.reduction > 0.5
 

@@ -25,6 +25,7 @@ SHOWN_BY = shown_by()
         ("com_offset", "payload", "chirp", "extra mass"),
         ("payload", "com_offset", "chirp", "extra mass"),
         ("friction_level", "friction_patch", "turns", "shows best"),
+        ("tyre_brush", "tyre_creep", "posture", "in proportion to its speed"),
     ],
 )
 def test_the_motion_is_that_of_the_reason(chosen, other, excitation, reason):

@@ -252,6 +252,7 @@ def test_round_trips_keep_every_number_that_the_format_holds(case, suffix, tmp_p
     robot, *_ = case
     if suffix == "xml":
         ground = {"mu_x": 0.7, "mu_y": 0.4, "slope": 0.1, "normal_stiffness": 12345.678, "normal_damping": 98.7}
+        ground |= {"slip_compliance": 1 / 17, "relaxation_length": 0.0041, "tread_damping": 3.1}
         robot = Robot.model_validate(overlay(robot.model_dump(), {"ground": ground, "home": {"leg_angle": 1.234}}))
     path = written(robot, suffix, tmp_path)
     tree = read_mjcf(path) if suffix == "xml" else parse_urdf(path.read_text(), str(path))

@@ -90,6 +90,15 @@ def test_a_wheel_in_the_air_forgets_its_shear(backend):
     assert np.abs(shears(plant, backend)[:, 0]).min() > 1e-4
 
 
+@EACH
+def test_the_state_of_a_plant_has_the_shear(backend):
+    """Put where it is, a parked robot pushes as hard on the floor as before; without its shear it would begin to slide."""
+    plant = make_plant(1, {"ground.slip_compliance": 0.2, "ground.slope[pitch]": 0.3}, backend=backend, period=0.001)
+    parked = drive(plant, 1.0).contact_force.reshape(4, 3)[:, 0]
+    plant.reset(state=plant.mechanical_state())
+    np.testing.assert_allclose(drive(plant, 0.001).contact_force.reshape(4, 3)[:, 0], parked, rtol=0.1)
+
+
 def test_a_robot_file_states_its_tyre():
     robot = load_robot({"base": "nominal", "name": "soft", "ground": {"slip_compliance": 0.1, "relaxation_length": 0.008}})
     same = {"ground.slip_compliance": 0.1, "ground.relaxation_length": 0.008}

@@ -67,7 +67,8 @@ def leaves(tree, path=()):
 def test_nominal_robot_equals_the_shared_file():
     shared, shipped = leaves(read_yaml(SHARED)), leaves(read_yaml(NOMINAL))
     assert {key: shipped.get(key) for key in shared} == shared
-    own = {("ground", "normal_damping"), ("servo", "leg", "gear_stiffness"), ("servo", "wheel", "gear_stiffness")}
+    tread = {("ground", name) for name in ("slip_compliance", "relaxation_length", "tread_damping")}
+    own = tread | {("ground", "normal_damping"), ("servo", "leg", "gear_stiffness"), ("servo", "wheel", "gear_stiffness")}
     assert set(shipped) - set(shared) == own
 
 
@@ -99,6 +100,9 @@ def test_an_edited_file_loads_from_its_path(edited):
         ({"body__mass": -1.0}, r"body.mass = -1.0: expected more than 0"),
         ({"body__mass": math.nan}, "body.mass = nan"),
         ({"gravity": math.inf}, "gravity = inf"),
+        ({"ground__slip_compliance": -0.1}, "ground.slip_compliance = -0.1: expected 0 or more"),
+        ({"ground__relaxation_length": 5.0}, "ground.relaxation_length = 5.0: expected 0.1 or less"),
+        ({"ground__slip_complience": 0.1}, r"unknown key 'ground.slip_complience' \(did you mean 'slip_compliance'\?\)"),
         ({"body__size": [0.3, 0.2]}, "body.size.2' is missing"),
         ({"body": 3.0}, "body = 3.0: expected keys and values; keys: mass, size, inertia, com_offset$"),
         ({"leg__length": None}, "robot.yaml: 'leg.length' is missing"),
@@ -293,6 +297,8 @@ def test_the_nominal_robots_are_known():
         ({"body__mass": 2.8000000000000003}, False, True),  # every number of a simulator
         ({"body__com_offset": [0.0, 0.0, 1e-9]}, False, True),
         ({"ground__slope": 0.01}, False, True),
+        ({"ground__slip_compliance": 0.05}, False, True),
+        ({"ground__slip_compliance": 0.0, "ground__relaxation_length": 0.005, "ground__tread_damping": 5.0}, True, True),
         ({"hip_position__z": 0.001}, False, True),
         ({"leg_limits": [0.35, 2.8]}, False, True),
         ({"home__leg_angle": 1.5}, False, True),

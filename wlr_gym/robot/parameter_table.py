@@ -191,7 +191,7 @@ TABLE: tuple[ParameterSpec, ...] = (
     fixed("ground.weakening_speed", "m/s", WHEELS, at=0.1, low=1e-3, high=10, doc="slip speed over which friction falls"),
     fixed("ground.creep_speed", "m/s", WHEELS, low=0, high=1, doc="friction grows as tanh(slip/creep_speed); 0 = dry, sticks"),
     # A tread of elastic bristles (brush): slip over speed = slip_compliance times friction over load, up to mu.
-    stated("ground.slip_compliance", "-", WHEELS, low=0, high=5, doc="slip per friction over load, rolling steadily; 0 = rigid"),
+    stated("ground.slip_compliance", "-", WHEELS, low=0, high=5, doc="slip per friction over load, rolling steadily; 0: rigid"),
     stated("ground.relaxation_length", "m", WHEELS, low=5e-4, high=0.1, doc="way over which friction builds up"),
     stated("ground.tread_damping", "N s/m", WHEELS, low=0, high=100, doc="of the tread along the floor"),
     # Of the deflection beyond that under the robot at rest, a quarter of its weight.

@@ -253,7 +253,7 @@ TYRE_BUMPS = 1e-4
 
 
 def tyre_case(index: int, first_seed: int = FIRST_TYRE_SEED) -> BlindCase:
-    """Return number ``index`` of the sets about tyres: elastic treads, and on the same bumpy floor robots without any effect."""
+    """Return number ``index`` of the sets about tyres: elastic treads, and robots without any effect on the same floor."""
     seed, kind = first_seed + index, ("effect", "parameters", "none")[index % 3]
     severity = TYRE_SEVERITIES[index // 3 % len(TYRE_SEVERITIES)] if kind == "effect" else 0.0
     effects = (named("tyre_brush", severity, np.random.default_rng([seed, 4])),) if severity else ()

@@ -66,9 +66,7 @@ class BlindRobot:
         }
 
 
-def copy_of(
-    robot: Mapping[str, Any], seed: int, exact: bool = False, soft: bool = False, bumps: float | None = None
-) -> Copy:
+def copy_of(robot: Mapping[str, Any], seed: int, exact: bool = False, soft: bool = False, bumps: float | None = None) -> Copy:
     """Draw a robot copy; see :func:`simulate_runs`."""
     copy = draw(dict(robot), np.random.default_rng([seed, 1]))
     copy = with_body_of(copy, nominal(dict(robot))) if exact else copy

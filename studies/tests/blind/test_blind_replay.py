@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.bench.blind.cases import NAMED, named
+from studies.bench.blind.cases import LATER, NAMED, named
 from studies.bench.blind.copies import Copy, read_robot
 from studies.bench.blind.dataset import simulate_runs, write
 from wlr_gym.base.paths import data_directory
@@ -71,7 +71,12 @@ def test_engine_with_the_true_numbers_agrees_to_the_noise(tmp_path):
 
 
 #: Effect -> kind of run in which it shows. Play in the wheels is told apart below.
-_SHOWS = dict.fromkeys(NAMED, 7) | {"friction_patch": 2, "friction_level": 2, "supply_sag": 2, "camera_misalignment": 3}
+_SHOWS = dict.fromkeys([*NAMED, *LATER], 7) | {
+    "friction_patch": 2,
+    "friction_level": 2,
+    "supply_sag": 2,
+    "camera_misalignment": 3,
+}
 
 
 def excess(found, floor):
@@ -80,7 +85,7 @@ def excess(found, floor):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", _SHOWS)
 def test_true_effect_closes_the_gap(name, tmp_path):
     effect = named(name, 4.0, np.random.default_rng(2))
     if name == "backlash":

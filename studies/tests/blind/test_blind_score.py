@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from studies.bench.blind import score as scoring
-from studies.bench.blind.cases import NAMED, SEVERITIES, STRANGE, case, hide, named, strange
+from studies.bench.blind.cases import LATER, NAMED, SEVERITIES, STRANGE, case, hide, named, strange, tyre_case
 
 
 def truth(name, kind="effect", severity=2.0, *effects):
@@ -213,6 +213,7 @@ VANISHED = {
     "friction_patch": {"mu": 0.6},
     "slip_weakening": {"mu_k": 0.6},
     "tyre_creep": {"creep_speed": 0.0},
+    "tyre_brush": {"slip_compliance": 0.0},
     "rolling_resistance": {"coefficient": 0.0},
     "wheel_radius_error": {"scale": 1.0},
     "payload": {"mass": 0.0},
@@ -227,7 +228,7 @@ VANISHED = {
 }
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", [*NAMED, *LATER])
 def test_sizes_count_from_where_an_effect_vanishes(name):
     true = named(name, 2.0, np.random.default_rng(3))
     vanished = {**true, "parameters": {**true["parameters"], **VANISHED[name]}}
@@ -287,6 +288,15 @@ def test_further_nulls_come_after_the_cycle():
     assert not any(one.effects for one in more)
 
 
+def test_sets_about_tyres():
+    cases = [tyre_case(index) for index in range(90)]
+    assert Counter(one.kind for one in cases) == {"none": 30, "parameters": 30, "effect": 30}
+    assert Counter(one.severity for one in cases if one.effects) == {1.0: 8, 2.0: 15, 3.0: 7}
+    assert {effect["name"] for one in cases for effect in one.effects} == {"tyre_brush"}
+    assert {one.bumps for one in cases} == {1e-4}
+    assert len({one.seed for one in cases} - {case(index).seed for index in range(400)}) == 90
+
+
 def test_half_of_all_sets_have_no_camera_and_some_fewer_runs():
     cases = [case(index) for index in range(400)]
     nulls = [one for one in cases if one.kind in ("none", "parameters")]
@@ -298,9 +308,9 @@ def test_half_of_all_sets_have_no_camera_and_some_fewer_runs():
     assert min(counts.values()) > 40
 
 
-@pytest.mark.parametrize("name", [*NAMED, *STRANGE])
+@pytest.mark.parametrize("name", [*NAMED, *LATER, *STRANGE])
 def test_every_hidden_effect_reaches_the_simulator_and_grows_with_severity(name):
-    draw = named if name in NAMED else strange
+    draw = strange if name in STRANGE else named
     weak, strong = (draw(name, severity, np.random.default_rng(3)) for severity in (1.0, 4.0))
     assert weak["where"] == strong["where"]
     assert weak["parameters"] != strong["parameters"]

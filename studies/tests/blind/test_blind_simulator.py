@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 import studies.bench.blind as blind
 from studies.bench.blind import cases, drive
-from studies.bench.blind.cases import NAMED, STRANGE, hide
-from studies.bench.blind.copies import Copy, draw, nominal, read_robot
+from studies.bench.blind.cases import LATER, NAMED, STRANGE, hide
+from studies.bench.blind.copies import Copy, draw, nominal, read_robot, yielding
 from wlr_gym.base.paths import data_directory
 
 ROBOT = read_robot(data_directory("configs") / "robot" / "nominal.yaml")
@@ -105,6 +105,34 @@ def test_creep_speed_under_a_steady_pull():
     )
     expected = creep * np.arctanh(pull / (0.6 * MASS * GRAVITY))
     assert speed(records)[500:].mean() == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("compliance", [0.05, 0.2])
+def test_an_elastic_tread_slips_in_proportion_to_traction(compliance):
+    tread = effect("tyre_brush", WHEELS, slip_compliance=compliance, relaxation_length=0.005)
+    records = simulate(np.full(4, 4.0), 2.5, [tread, effect("external_force", ["body"], fx=-6.0)])
+    rim = 0.034 * records[2000:, 19:23].mean()
+    assert 1 - speed(records)[2000:].mean() / rim == pytest.approx(compliance * 6.0 / (MASS * GRAVITY), rel=0.02)
+
+
+def test_an_elastic_tread_gives_way_and_holds_a_parked_robot():
+    tread = effect("tyre_brush", WHEELS, slip_compliance=0.5, relaxation_length=0.01)
+    slope = [effect("floor_slope", ["ground"], pitch=0.05), effect("coulomb_friction", WHEELS, torque=5.0)]
+    soft, rigid = simulate(np.zeros(4), 1.0, [tread, *slope]), simulate(np.zeros(4), 1.0, slope)
+    assert soft[-1, 0] - rigid[-1, 0] == pytest.approx(-0.5 * 0.01 * np.tan(0.05), rel=0.05)
+    assert abs(soft[-1, 0] - soft[-300, 0]) < 2e-6
+
+
+def test_bumps_push_along_their_normal():
+    """Nearly without friction a robot on a slope of the floor itself is pushed down it; vertical forces leave it there."""
+    waves = np.zeros((8, 4))
+    waves[0] = 0.1, 0.5, 0.0, 0.0
+    icy = [effect("friction_level", ["ground"], mu=0.01)]
+    for steepness in (0.0, 1.0):
+        copy = replace(nominal(ROBOT), floor_waves=waves, steepness=steepness)
+        pushed = acceleration(simulate(np.zeros(4), 0.3, icy, copy), 0)
+        assert pushed == pytest.approx(-steepness * (0.05 - 0.01) * GRAVITY, rel=0.08, abs=1e-3)
+    assert yielding(nominal(ROBOT), np.random.default_rng(0), 1e-4).steepness == 1.0
 
 
 def test_a_flattened_tyre_rolls_on_less_than_its_radius():
@@ -235,7 +263,7 @@ def test_command_delay_shifts_in_time():
     assert late[250:700, 19] == pytest.approx(on_time[200:650, 19], abs=1e-3)
 
 
-_CASES = [(name, "named") for name in NAMED] + [(name, "strange") for name in STRANGE]
+_CASES = [(name, "named") for name in (*NAMED, *LATER)] + [(name, "strange") for name in STRANGE]
 _SENSOR_ONLY = {"gyro_bias", "imu_misalignment", "camera_misalignment", "camera_delay"}
 
 

@@ -183,7 +183,14 @@ class _Library:
         numbers, ways = tuple(unknowns), tuple(starts)
         fixed = {name: self.observed.mean(number) for name, number in search.unseen.items()}
         whole = Candidate(
-            effect.name, where, numbers, ways, fixed=fixed, unseen=tuple(fixed), tolerances=tolerances, surcharge=search.surcharge
+            effect.name,
+            where,
+            numbers,
+            ways,
+            fixed=fixed,
+            unseen=tuple(fixed),
+            tolerances=tolerances,
+            surcharge=search.surcharge,
         )
         if own is not None:
             whole = replace(whole, fixed=fixed | own.fixed, convert=own.parameters, within=own.within)

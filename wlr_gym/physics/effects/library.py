@@ -420,7 +420,9 @@ GROUND_EFFECTS: tuple[Effect, ...] = (
         "u' = s - |V|/relaxation_length u, F = -load/(slip_compliance relaxation_length) u up to mu load",
         WHEELS,
         {
-            "slip_compliance": EffectParameter("-", "slip per friction over load", 0, 5, "ground.slip_compliance", (0, 0.3), 0.06),
+            "slip_compliance": EffectParameter(
+                "-", "slip per friction over load", 0, 5, "ground.slip_compliance", (0, 0.3), 0.06
+            ),
             "relaxation_length": EffectParameter(
                 "m", "way over which it builds up", 5e-4, 0.1, 0.005, (0.002, 0.02), 0.005, optional=True, is_size=False
             ),

@@ -272,7 +272,8 @@ def mjcf_text(robot: Robot, parameters: Parameters | None = None) -> str:
     """Return the robot as MJCF (XML): the MuJoCo plant's model with the floor's contacts, leg limits and a motor per joint.
 
     Joint angles are those of the robot; the reference pose is its home pose. The motors take torques (N m): the servo's law is
-    no part of the file. An elastic tread is written as custom numbers, which only this library reads. Pieces of the floor are boxes where their faces are upright, else convex meshes, :data:`REACH` m long.
+    no part of the file. An elastic tread, which MuJoCo's contacts lack, stands in custom numbers that only this library reads.
+    Pieces of the floor are boxes where their faces are upright, else convex meshes, :data:`REACH` m long.
 
     Args:
         robot: the robot.
@@ -297,9 +298,8 @@ def _complete(spec: Any, robot: Robot, row: Parameters, kept: list[Any]) -> None
     kept.append(spec)
     for piece in np.flatnonzero(row["piece.height"][0] > 0.0):
         _add_piece(spec, row, int(piece))
-    if row["ground.slip_compliance"].any():
-        for name in _TREAD:
-            spec.add_numeric(name=name, size=1, data=[row[name][0, 0]])
+    for name in _TREAD:
+        spec.add_numeric(name=name, size=1, data=[row[name][0, 0]])
     spec.delete(spec.body("payload"))
     for leg in LEGS:
         joint = spec.joint(leg)
