@@ -85,11 +85,12 @@ static bool read_all(uint8_t reg, uint8_t *data, uint8_t count) {
 static bool ended(bool good) {
     uint8_t status = TWSR & 0xF8;
     bool locked = !(TWCR & _BV(TWINT)); /* still at it: the data or the clock line is held */
+    uint32_t start = clock_now();
     TWCR = _BV(TWINT) | _BV(TWSTO) | _BV(TWEN);
-    if (good) return true;
-    board.bus_errors++;
-    if (locked || status == 0x00 || status == 0x38) bus_free();
-    return false;
+    while (TWCR & _BV(TWSTO) && !locked) locked = clock_now() - start > PATIENCE;
+    if (!good) board.bus_errors++;
+    if (locked || (!good && (status == 0x00 || status == 0x38))) bus_free();
+    return good;
 }
 
 static bool write_register(uint8_t reg, uint8_t value) { return ended(write_one(reg, value)); }
