@@ -188,7 +188,17 @@ def make_kit(robot: Robot) -> Kit:
     """
     for package in ("manifold3d", "ezdxf"):
         require_package(package, "parts")
-    return Kit(_body(robot), _leg(robot), _wheel(robot))
+    leg = _leg(robot)
+    return Kit(_body(robot, _inside(robot, leg)), leg, _wheel(robot))
+
+
+def _inside(robot: Robot, leg: list[Part]) -> float:
+    """Return how much m y^2 (kg m2) four legs lack because their servos are inside the wheels' planes, where models have them.
+
+    It does not depend on the legs' angles, so the body's ballast makes up for it.
+    """
+    found, plane = together(part.properties() for part in leg), robot.hip_position.y
+    return 4.0 * found.mass * (plane**2 - (plane + float(found.centre[1])) ** 2)
 
 
 def _horn(robot: Robot) -> float:
@@ -196,7 +206,7 @@ def _horn(robot: Robot) -> float:
     return 500.0 * robot.wheel.width + XL430[1] + ARM
 
 
-def _body(robot: Robot) -> list[Part]:
+def _body(robot: Robot, lacking: float) -> list[Part]:
     from manifold3d import Manifold
 
     x, y, height = 1e3 * robot.hip_position.x, 1e3 * robot.hip_position.y, 1e3 * robot.body.size[2]
@@ -232,10 +242,10 @@ def _body(robot: Robot) -> list[Part]:
         Part("cables", "bought: cables, plugs, screws (weigh yours)", _box((150.0, 100.0, 20.0)), None,
              ((0.0, 0.0, 10.0),), mass=0.18),
     ]  # fmt: skip
-    support = _feet(_ballast(robot, parts), gap, half)
+    support = _feet(_ballast(robot, parts, lacking), gap, half)
     for _ in range(2):  # the feet weigh little, and their height is the bars'
-        support = _feet(_ballast(robot, [*parts, support]), gap, half)
-    return [*parts, support, _ballast(robot, [*parts, support])]
+        support = _feet(_ballast(robot, [*parts, support], lacking), gap, half)
+    return [*parts, support, _ballast(robot, [*parts, support], lacking)]
 
 
 def _feet(bar: Part, gap: float, half: float) -> Part:
@@ -248,10 +258,10 @@ def _feet(bar: Part, gap: float, half: float) -> Part:
     return Part("ballast_foot", made, foot, 0.3 * PETG, ((0.0, middle, tall), (0.0, -middle, tall)))
 
 
-def _ballast(robot: Robot, parts: list[Part]) -> Part:
+def _ballast(robot: Robot, parts: list[Part], lacking: float) -> Part:
     """Return two steel bars along x that give the body its mass, its centre and its moments about x and z."""
     given = together(part.properties() for part in parts)
-    target = np.array(robot.body.inertia).sum() / 2.0 - np.array(robot.body.inertia)
+    target = np.array(robot.body.inertia).sum() / 2.0 - np.array(robot.body.inertia) + np.array([0.0, lacking, 0.0])
     mass = robot.body.mass - given.mass
     missing = target - given.spread
     if mass <= 0.0 or missing[0] <= 0.0 or missing[1] <= 0.0:
@@ -316,13 +326,13 @@ def _wheel(robot: Robot) -> list[Part]:
 
 
 def compare(robot: Robot, kit: Kit) -> list[MassDifference]:
-    """Return the robot file's mass properties beside those of the parts."""
+    """Return the robot file's mass properties beside those of the parts, the body's less what makes up for the legs."""
     found = kit.properties()
     body, leg, wheel = found["body"], found["leg"], found["wheel"]
     spin, across = float(wheel.inertia[1, 1]), float(wheel.inertia[0, 0])
     rows: list[tuple[str, float | None, float, str]] = [
         ("body.mass", robot.body.mass, body.mass, "kg"),
-        *_axes("body.inertia", robot.body.inertia, np.diag(body.inertia)),
+        *_axes("body.inertia", robot.body.inertia, np.diag(body.inertia) - _inside(robot, kit.leg) * np.array([1.0, 0.0, 1.0])),
         ("leg.mass", robot.leg.mass, leg.mass, "kg"),
         ("leg.com_along_leg", robot.leg.com_along_leg, -float(leg.centre[2]), "m"),
         *_axes("leg.inertia", robot.leg.inertia, np.diag(leg.inertia)),
