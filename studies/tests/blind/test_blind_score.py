@@ -1,12 +1,14 @@
 """The scorer on made-up results, and the sequence of data sets."""
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from studies.bench.blind import score as scoring
-from studies.bench.blind.cases import LATER, NAMED, SEVERITIES, STRANGE, case, hide, named, strange, tyre_case
+from studies.bench.blind.cases import FIRST_TYRE_SEED, LATER, NAMED, SEVERITIES, STRANGE, case, hide, named, strange, tyre_case
+from studies.bench.gap import Plan
 
 
 def truth(name, kind="effect", severity=2.0, *effects):
@@ -295,6 +297,7 @@ def test_sets_about_tyres():
     assert {effect["name"] for one in cases for effect in one.effects} == {"tyre_brush"}
     assert {one.bumps for one in cases} == {1e-4}
     assert len({one.seed for one in cases} - {case(index).seed for index in range(400)}) == 90
+    assert Plan(Path(), 90, first_seed=FIRST_TYRE_SEED).cases() == cases
 
 
 def test_half_of_all_sets_have_no_camera_and_some_fewer_runs():

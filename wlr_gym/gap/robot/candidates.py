@@ -193,7 +193,7 @@ class _Library:
             surcharge=search.surcharge,
         )
         if own is not None:
-            whole = replace(whole, fixed=fixed | own.fixed, convert=own.parameters, within=own.within)
+            whole = replace(whole, fixed={**fixed, **own.fixed}, convert=own.parameters, within=own.within)
         return [whole, *(_component(whole, k) for k in range(len(unknowns)) if search.components)]
 
     def _unknowns(self, effect: Effect, search: Search) -> list[Unknown]:
