@@ -30,6 +30,9 @@ WHEEL_SLICE = slice(FIRST_WHEEL, len(JOINTS))
 #: Signs of the hip positions (x, y) in the body frame, in corner order.
 CORNER_SIGNS = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
 
+#: Radius (m) of the rods that legs are, from hip to axle.
+SHANK_RADIUS = 0.008
+
 
 def full_name(joint: str) -> str:
     """Return a joint's name with its corner in words: ``leg_lf (left front)``."""
@@ -137,6 +140,10 @@ TABLE: tuple[ParameterSpec, ...] = (
     stated("body.mass", "kg", low=0.05, high=100, tolerance="body.mass", doc="platform without legs, wheels and payload"),
     stated("body.inertia", "kg m2", XYZ, low=1e-5, high=10, tolerance="body.inertia", doc="about its centre of mass"),
     stated("body.com_offset", "m", XYZ, low=-0.2, high=0.2, tolerance="body.com_offset", doc="centre of mass from the origin"),
+    # Where the body's corners and edges and the legs touch the floor, each; bounded by what the physics step resolves.
+    fixed("body.normal_stiffness", "N/m", at=3e4, low=1e3, high=1e6, doc="of a spot of body or legs on the floor, also along it"),
+    fixed("body.normal_damping", "N s/m", at=60.0, low=0, high=1e3, doc="of a spot of body or legs on the floor, also along it"),
+    fixed("body.mu", "-", at=0.6, low=0, high=5, doc="friction of body and legs on the floor, in every direction"),
     # A payload may be several masses; xy = -integral of x y dm.
     fixed("payload.mass", "kg", low=0, high=20, doc="mass fixed to the body"),
     fixed("payload.position", "m", XYZ, low=-0.5, high=0.5, doc="its centre of mass in the body frame"),

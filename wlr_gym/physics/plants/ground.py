@@ -18,7 +18,7 @@ from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Value
 from wlr_gym.physics.model.dynamics import gravity_in_floor
 from wlr_gym.physics.plants.relief import map_lanes, map_value, pack_map, place_in_map
-from wlr_gym.robot import Robot
+from wlr_gym.robot import SHANK_RADIUS, Robot
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
 
@@ -78,10 +78,12 @@ def _inverse(values: Array) -> Array:
     return np.where(values > 0.0, 1.0 / np.where(values > 0.0, values, 1.0), 0.0)
 
 
-#: Parameter lanes of the body: gravity, pulls, the inertial sensors' low-pass, and half the body's size.
+#: Parameter lanes of the body: gravity, pulls, the inertial sensors' low-pass, half the body's size, and how body and legs touch
+#: the floor (:mod:`wlr_gym.physics.plants.body`); ``reach``: of body and shanks from the body's origin.
 BODY_LANES = (
     "gravity_x", "gravity_y", "gravity_z", "external_x", "external_y", "tether_stiffness", "anchor_x", "anchor_y", "low_pass",
     "half_size_x", "half_size_y", "half_size_z",
+    "body_stiffness", "body_damping", "shank_stiffness", "shank_damping", "body_mu", "reach",
 )  # fmt: skip
 
 
@@ -94,6 +96,28 @@ def pack_body(parameters: Parameters, robot: Robot, step: float) -> dict[str, Ar
     lanes |= by_column("half_size_", "xyz", np.tile(0.5 * np.array(robot.body.size), (len(parameters), 1)))
     lanes["tether_stiffness"] = parameters["tether.stiffness"]
     lanes["low_pass"] = 1.0 - np.exp(-2.0 * np.pi * parameters["imu.bandwidth"] * step)
+    return lanes | _pack_springs(parameters, robot, step)
+
+
+#: Of step^2 stiffness/mass (4: unstable) and step damping/mass (2): how much springs and dampers of body and legs have at most.
+_STIFFEST = 1.0
+_MOST_DAMPED = 0.5
+
+
+def _pack_springs(parameters: Parameters, robot: Robot, step: float) -> dict[str, Array]:
+    """Springs of body and legs, bounded by the lightest that moves against one, and how far body and legs reach."""
+    half, inertia = 0.5 * np.array(robot.body.size), parameters["body.inertia"]
+    squares = np.array([half[1] ** 2 + half[2] ** 2, half[0] ** 2 + half[2] ** 2, half[0] ** 2 + half[1] ** 2])
+    on_body = 4.0 / parameters["body.mass"] + 4.0 * (squares / inertia).max(axis=1)  # on four corners at once, 1/kg
+    length, pitching = parameters["leg.length"], parameters["leg.inertia"].reshape(-1, 4, 3)[:, :, 1]
+    about_hip = pitching + parameters["leg.mass"] * parameters["leg.com_along_leg"] ** 2 + parameters["wheel.mass"] * length**2
+    on_leg = on_body + (length**2 / np.maximum(about_hip, 1e-9)).max(axis=1)  # a gear may have play: without its rotor
+    lanes = {"body_mu": parameters["body.mu"]}
+    for name, lightness in (("body", on_body), ("shank", on_leg)):
+        lanes[f"{name}_stiffness"] = np.minimum(parameters["body.normal_stiffness"], _STIFFEST / (step**2 * lightness))
+        lanes[f"{name}_damping"] = np.minimum(parameters["body.normal_damping"], _MOST_DAMPED / (step * lightness))
+    hip = np.linalg.norm(parameters["hip.position"], axis=1)
+    lanes["reach"] = np.maximum(np.linalg.norm(half), hip + length.max(axis=1) + SHANK_RADIUS)
     return lanes
 
 

@@ -50,7 +50,7 @@ BASES = frozenset({"waves", "bumps", "grid"})
 
 _WAVE_FIELDS = ("height", "slope_x", "slope_y", "phase", "steepness_x", "steepness_y")
 _BUMP_FIELDS = ("height", "inverse_spacing", "seed_x", "seed_y", "least", "inverse_share")
-_PIECE_FIELDS = ("x", "y", "z", "across_x", "across_y", "span", "front_u", "front_v", "rear_u", "rear_v", "edge_radius")
+PIECE_FIELDS = ("x", "y", "z", "across_x", "across_y", "span", "front_u", "front_v", "rear_u", "rear_v", "edge_radius")
 _MAP_FIELDS = (
     *(f"address{k}" for k in range(ops.ADDRESS_PARTS)), "columns", "rows", "x", "y", "along_x", "along_y", "scale"
 )  # fmt: skip
@@ -68,7 +68,8 @@ RELIEF_LANES: tuple[str, ...] = (
     *(f"wave_{name}{k}" for name in _WAVE_FIELDS for k in range(len(WAVES))),
     *(f"bump_{name}" for name in _BUMP_FIELDS),
     *map_lanes("grid"),
-    *(f"piece_{name}{k}" for name in _PIECE_FIELDS for k in range(len(PIECES))),
+    *(f"piece_{name}{k}" for name in PIECE_FIELDS for k in range(len(PIECES))),
+    "crest",
 )
 
 
@@ -102,7 +103,14 @@ def pack(parameters: Parameters, robot: Robot) -> dict[str, Array]:
     profile = zip(_WHEEL_FIELDS, wheel_profile(parameters, robot), strict=True)
     lanes = {f"{name}{i}": values[:, i] for name, values in profile for i in range(4)}
     shapes = _pack_waves(parameters) | _pack_bumps(parameters) | pack_map(parameters, "grid") | _pack_pieces(parameters)
-    return lanes | shapes
+    return lanes | shapes | {"crest": _crest(parameters)}
+
+
+def _crest(parameters: Parameters) -> Array:
+    """Return what no base is higher than, (N,), m."""
+    numbers, each = np.unique(parameters["grid.number"], return_inverse=True)
+    grids = np.array([np.abs(map_of(number)).max(initial=0.0) for number in numbers])[each] * np.abs(parameters["grid.scale"])
+    return np.abs(parameters["wave.height"]).sum(axis=1) + parameters["bumps.height"] + grids
 
 
 def _pack_waves(parameters: Parameters) -> dict[str, Array]:
@@ -154,7 +162,7 @@ def _pack_pieces(parameters: Parameters) -> dict[str, Array]:
         "rear_v": np.cos(rear),
         "edge_radius": radius,
     }
-    return {f"piece_{name}{k}": fields[name][:, k] for name in _PIECE_FIELDS for k in range(len(PIECES))}
+    return {f"piece_{name}{k}": fields[name][:, k] for name in PIECE_FIELDS for k in range(len(PIECES))}
 
 
 # ---- maps: numbers in square cells ---------------------------------------------------------------------------------
@@ -363,15 +371,16 @@ def touch_of_base(lanes: Lanes, centre: Vector, axle: Vector, profile: WheelProf
     if not features & BASES:
         _, reach = support(profile, axle, [0.0, 0.0, 1.0])
         return Touch(-(centre[2] + reach[2]), [0.0, 0.0, 1.0], reach)
-    height, normal, reach = 0.0, _normal(*base_height(lanes, centre[0], centre[1], features)[1:]), [0.0] * 3
+    height, normal, reach = 0.0, normal_of(*base_height(lanes, centre[0], centre[1], features)[1:]), [0.0] * 3
     for _ in range(REFINEMENTS):
         _, reach = support(profile, axle, normal)
         height, *slopes = base_height(lanes, centre[0] + reach[0], centre[1] + reach[1], features)
-        normal = _normal(*slopes)
+        normal = normal_of(*slopes)
     return Touch((height - (centre[2] + reach[2])) * normal[2], normal, reach)
 
 
-def _normal(slope_x: Value, slope_y: Value) -> Vector:
+def normal_of(slope_x: Value, slope_y: Value) -> Vector:
+    """Return the unit normal of a surface of slopes along x and y."""
     up = 1.0 / ops.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
     return [-(slope_x * up), -(slope_y * up), up]
 
@@ -438,14 +447,14 @@ def _edge_of(lanes: Lanes, k: int, centre: Vector) -> _Edge:
     v = centre[2] - lanes[f"piece_z{k}"]
     steepest = tuple(ops.where_positive(behind, lanes[f"piece_rear_{a}{k}"], lanes[f"piece_front_{a}{k}"]) for a in "uv")
     inverse = 1.0 / ops.sqrt(u * u + v * v + 1e-18)
-    normal = _within(u * inverse, v * inverse, steepest)
+    normal = within_faces(u * inverse, v * inverse, steepest)
     radius = lanes[f"piece_edge_radius{k}"]
     gap = u * normal[0] + v * normal[1] - radius
     outwards = (turned * across[0], turned * across[1])
     return _Edge(gap, (u, v), outwards, (steepest[0], steepest[1]), normal, radius, k + 2.0)
 
 
-def _within(u: Value, v: Value, steepest: tuple[Value, ...]) -> tuple[Value, Value]:
+def within_faces(u: Value, v: Value, steepest: tuple[Value, ...]) -> tuple[Value, Value]:
     """Limit a direction to the normals between a face and the top."""
     below = steepest[1] * u - steepest[0] * v  # positive: below the face's normal
     # positive: behind straight up, and nearer to it than to the face's normal (inside a piece a direction may be beyond both)
@@ -479,11 +488,11 @@ def _touch_of_edge(edge: _Edge, axle: Vector, profile: WheelProfile) -> Touch:
         turn = ops.clip(first / ops.maximum(curvature, 0.1 * rho), -0.5, 0.5)
         u, v = u - turn * v, v + turn * u
         inverse = 1.0 / ops.sqrt(u * u + v * v)
-        u, v = _within(u * inverse, v * inverse, edge.steepest)
+        u, v = within_faces(u * inverse, v * inverse, edge.steepest)
     facing = ops.where_positive(axle_u * cu + axle_v * cv, 1.0, -1.0)
     aside_u, aside_v = facing * axle_u + 1e-6 * u, facing * axle_v + 1e-6 * v  # an axle along the edge has no such direction
     inverse = 1.0 / ops.sqrt(aside_u * aside_u + aside_v * aside_v + 1e-30)
-    aside = _within(aside_u * inverse, aside_v * inverse, edge.steepest)
+    aside = within_faces(aside_u * inverse, aside_v * inverse, edge.steepest)
     found: list[Touch] = []
     for out, up in ((u, v), aside):
         normal = [out * edge.across[0], out * edge.across[1], up]
@@ -556,12 +565,17 @@ def floor_height(lanes: Lanes, x: Value, y: Value, features: frozenset[str]) -> 
     """Return the height (m) of base and pieces at a place (m, floor frame); edges are taken as sharp."""
     height, *_ = base_height(lanes, x, y, features)
     for k in piece_numbers(features):
-        edge = _edge_of(lanes, k, [x, y, lanes[f"piece_z{k}"]])
-        (u, _), (steep, level) = edge.centre, edge.steepest
-        level = ops.maximum(level, 1e-3)
-        outside = ops.maximum(u * steep - edge.radius * (1.0 - level), 0.0)  # times the face's sine: 0 at the sharp corner
-        height = ops.maximum(height, lanes[f"piece_z{k}"] + edge.radius - outside / level)
+        height = ops.maximum(height, piece_height(lanes, k, x, y))
     return height
+
+
+def piece_height(lanes: Lanes, k: int, x: Value, y: Value, reach: Value = 0.0) -> Value:
+    """Return the height (m) of piece ``k`` at a place, or how high it is at most within a distance ``reach`` (m) of it."""
+    edge = _edge_of(lanes, k, [x, y, lanes[f"piece_z{k}"]])
+    (u, _), (steep, level) = edge.centre, edge.steepest
+    level = ops.maximum(level, 1e-3)
+    outside = ops.maximum((u - reach) * steep - edge.radius * (1.0 - level), 0.0)  # times the face's sine: 0 at the corner
+    return lanes[f"piece_z{k}"] + edge.radius - outside / level
 
 
 def piece_numbers(features: frozenset[str]) -> range:

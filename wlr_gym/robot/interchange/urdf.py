@@ -60,7 +60,7 @@ def _write_leg(
     across_x, pitch, along = numbers["leg.inertia"].reshape(4, 3)[corner]
     com = np.array([numbers["leg.com_along_leg"][corner], 0.0, 0.0])
     link = _link(root, f"{leg}_link", float(numbers["leg.mass"][corner]), com, np.array([along, pitch, across_x]))
-    _shape(link, "cylinder", {"radius": "0.008", "length": repr(length)}, f"{length / 2!r} 0 0", f"0 {math.pi / 2!r} 0")
+    _shape(link, "cylinder", {"radius": repr(SHANK_RADIUS), "length": repr(length)}, f"{length / 2!r} 0 0", f"0 {math.pi / 2!r} 0")
     hip = numbers["hip.position"] * np.array([*signs, 1.0])
     _joint(root, leg, "revolute", "base_link", f"{leg}_link", hip, numbers, corner, robot.leg_limits)
     across = float(numbers["wheel.transverse_inertia"][corner])

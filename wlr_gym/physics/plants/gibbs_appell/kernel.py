@@ -32,7 +32,7 @@ from wlr_gym.physics.codegen import (
 )
 from wlr_gym.physics.model import equations
 from wlr_gym.physics.model.dynamics import inertial_constants
-from wlr_gym.physics.plants import contacts, drive, ground, relief
+from wlr_gym.physics.plants import body, contacts, drive, ground, relief
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.gibbs_appell import gauss, kinematics
 from wlr_gym.physics.plants.gibbs_appell import step as substep
@@ -143,10 +143,15 @@ def trace(features: frozenset[str], precision: str) -> dict[str, dict[str, Any]]
     blocks["setup"] = _without_unread(blocks["setup"], *(blocks[name] for name in blocks if name != "setup"))
     if "forces" in features:
         blocks["sense"] = substep.sense(lanes, step, features)
+    if "piece" in features:
+        blocks["push_of_piece"] = body.push_of_piece(lanes)
     return {
         "prepare": prepare,
         "drift": substep.drift(lanes, owner.input("duration"), features),
         **blocks,
+        "nearness": body.nearness(lanes, features),
+        "push_of_base": body.push_of_base(lanes, features),
+        "touch": substep.touch(inner, step, features),
         "observe": substep.observe(lanes, step, features),
     }
 
@@ -168,6 +173,8 @@ def outputs() -> tuple[str, ...]:
 
 
 _SCALARS = ("step", "time", "duration")
+#: Lanes of the one piece that pushes body and legs.
+_OF_PIECE = frozenset((*body.PIECE_LANES, "near_piece"))
 
 
 def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
@@ -179,6 +186,8 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
     start = _places(blocks, width)
 
     def load(name: str) -> str:
+        if name in _OF_PIECE:  # lanes of pieces lie side by side
+            return f"w[{start[f'{name}0']} + piece * {width} + k]"
         return name if name in _SCALARS else f"w[{start[name]} + k]"
 
     def constant(value: float) -> str:
@@ -187,10 +196,10 @@ def kernel_source(features: frozenset[str], precision: str, width: int) -> str:
     lines = [f"F = np.{precision}", ""]
     for block, results in blocks.items():
         used = inputs_of(results.values())
-        scalars = [name for name in _SCALARS if name in used]
-        body = emit(results, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True, compact=True)
+        scalars = [name for name in _SCALARS if name in used] + ["piece"] * (not used.isdisjoint(_OF_PIECE))
+        text = emit(results, load, lambda name, text: f"w[{start[name]} + k] = {text}", "", constant, fused=True, compact=True)
         lines += [
-            *straight_line_source(f"{block}_of_robot", ["w", "k", *scalars], body),
+            *straight_line_source(f"{block}_of_robot", ["w", "k", *scalars], text),
             "",
             _DECORATOR,
             f"def {block}({', '.join(['W', *scalars])}):",
@@ -213,7 +222,10 @@ def driver_source(features: frozenset[str], precision: str, width: int, blocks: 
 def _places(blocks: Mapping[str, Mapping[str, Any]], width: int) -> dict[str, int]:
     """Where each lane starts in the flat scratch array."""
     formula = (*FORMULA_INPUTS, *FORMULA_OUTPUTS) if "sense" in blocks else ()
-    names = dict.fromkeys([*STORED, *INPUTS, *PARAMETER_LANES, *blocks["prepare"], *blocks["setup"], *outputs(), *formula])
+    touching = (*blocks["nearness"], *body.PUSHES)
+    names = dict.fromkeys(
+        [*STORED, *INPUTS, *PARAMETER_LANES, *blocks["prepare"], *blocks["setup"], *outputs(), *formula, *touching]
+    )
     return {name: index * width for index, name in enumerate(names)}
 
 
@@ -222,6 +234,13 @@ def _driver(start: Mapping[str, int], width: int, precision: str, has_pairs: boo
         "width": width,
         "scratch": len(start) * width,
         "stored": len(STORED) * width,
+        "kept": start[body.SPOT_STATE[0]],
+        "near": start["near"],
+        "near_base": start["near_base"],
+        "near_piece": start.get("near_piece0"),
+        "pieces": sum(name.startswith("near_piece") for name in start),
+        "pushes": start[body.PUSHES[0]],
+        "push_count": len(body.PUSHES) * width,
         "inputs": start[INPUTS[0]],
         "parameters": start[PARAMETER_LANES[0]],
         "parameter_count": len(PARAMETER_LANES) * width,
@@ -254,6 +273,7 @@ def _driver(start: Mapping[str, int], width: int, precision: str, has_pairs: boo
     parts = {
         "apply_formulas": apply_formulas.format(**values),
         "unwrap": _UNWRAP.format(**values) if single else "",
+        "push_of_pieces": _PUSH_OF_PIECES.format(**values) if has_pairs else "",
         "sweeping": (_SWEEP_PAIRS if has_pairs else _SWEEP).format(**values),
         "count_anew": _COUNT_ANEW.format(**values) if single else "",
     }
@@ -280,6 +300,11 @@ _SWEEP_PAIRS = """
                     sweep_pairs(W)
                 else:
                     sweep(W)"""
+#: The pieces that a robot of the tile is near push it.
+_PUSH_OF_PIECES = """
+                for piece in range({pieces}):
+                    if largest(W, {near_piece} + piece * {width}) > F(0.0):
+                        push_of_piece(W, piece)"""
 #: Single precision: the shown wheel angles and place, put together in double precision.
 _UNWRAP = """
         for i in range(4):
@@ -312,6 +337,14 @@ def copy(source, target):
 
 
 {decorator}
+def largest(W, start):
+    found = W[start]
+    for at in range(start + 1, start + {width}):
+        found = max(found, W[at])
+    return found
+
+
+{decorator}
 def scatter(W, TRUTH, RAW, tile, count):
     truth = W[{truth} : {truth} + {truth_count} * {width}].reshape({truth_count}, {width})
     raw = W[{raw} : {raw} + {raw_count} * {width}].reshape({raw_count}, {width})
@@ -332,7 +365,7 @@ def tick(
 ):
     whole_registers()
     W = np.zeros({scratch}, F)
-    stored, parameters = W[:{stored}], W[{parameters} : {parameters} + {parameter_count}]
+    stored, parameters = W[:{kept}], W[{parameters} : {parameters} + {parameter_count}]
     half = F(0.5) * step
     for tile in range(first, last):
         copy(X[tile], stored)
@@ -347,13 +380,25 @@ def tick(
                 W[{inputs} + (24 + j) * {width} + k] = on[row, j]
         prepare(W, step)
         drift(W, half)
+        has_been_near = False
         for s in range(substeps):{apply_formulas}
-            setup(W, step, (F(s) + F(0.5)) * step){sweeping}
+            setup(W, step, (F(s) + F(0.5)) * step)
+            nearness(W)
+            if largest(W, {near}) > F(0.0):
+                if not has_been_near:
+                    copy(X[tile, {kept}:], W[{kept}:{stored}])
+                    has_been_near = True
+                W[{pushes}:{pushes} + {push_count}] = F(0.0)
+                if largest(W, {near_base}) > F(0.0):
+                    push_of_base(W){push_of_pieces}
+                touch(W, step){sweeping}
             finish(W, step)
             drift(W, step if s + 1 < substeps else half){count_anew}
         observe(W, step)
         scatter(W, TRUTH, RAW, tile, count)
-        copy(stored, X[tile])
+        copy(stored, X[tile, :{kept}])
+        if has_been_near:
+            copy(W[{kept}:{stored}], X[tile, {kept}:])
 
 
 {decorator}
@@ -392,7 +437,7 @@ def load_kernel(features: frozenset[str], precision: str, width: int, formulas: 
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    substep, gauss, kinematics, equations, servo, drive, contacts, ground, relief, ops, compilation, sys.modules[__name__]
+    substep, gauss, kinematics, equations, servo, drive, contacts, ground, relief, body, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join(
     [source_of(*TRACED), *PARAMETER_LANES, *FORMULA_INPUTS, *FORMULA_OUTPUTS, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from wlr_gym.physics.codegen.ops import Lanes, Value
-from wlr_gym.physics.plants import drive
+from wlr_gym.physics.plants import body, drive
 from wlr_gym.physics.plants.base import COORDINATES
 from wlr_gym.physics.plants.base import INPUTS as INPUTS_OF_FORMULAS
 from wlr_gym.physics.plants.contacts import AXES, CONTACTS, CORNERS
@@ -57,7 +57,8 @@ RESULTS: tuple[str, ...] = (
     "electrical_energy",
 )
 TICK_SUMS: tuple[str, ...] = RESULTS[-10:]
-STORED: tuple[str, ...] = STATE + RESULTS
+#: Of these the last, those of body and legs on the floor, are only looked at where they are near it.
+STORED: tuple[str, ...] = STATE + RESULTS + body.SPOT_STATE
 #: Written each control tick.
 INPUTS: tuple[str, ...] = (
     *(f"goal{j}" for j in range(8)),

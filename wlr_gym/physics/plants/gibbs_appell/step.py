@@ -27,7 +27,7 @@ from collections.abc import Iterator, Mapping
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
-from wlr_gym.physics.plants import drive, ground, relief
+from wlr_gym.physics.plants import body, drive, ground, relief
 from wlr_gym.physics.plants.contacts import (
     AXES,
     CORNERS,
@@ -130,6 +130,27 @@ def kick_finish(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
         )
         mean_rate = 0.5 * (lanes[f"w{a}"] + u[3 + k])  # over the step: the rate at its end would come half a step early
         out[f"gyro_{a}"] = lanes[f"gyro_{a}"] + lanes["low_pass"] * (mean_rate - lanes[f"gyro_{a}"])
+    return out
+
+
+def touch(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
+    """Add the impulses of body and legs on the floor to the Gauss problem that is set up; where nothing is near, none."""
+    out, push, torque, legs = body.hold(lanes, step, features)
+    momentum = [step * x for x in (*to_body(rotation_rows(lanes), push), *torque)]
+    near = lanes["near"]
+    for i, leg in enumerate(legs):  # a leg's rate is absolute: what turns it does not turn the body
+        momentum[4] = momentum[4] - step * leg
+        on_leg = lanes[f"i11_{i}"] * (step * leg)
+        momentum = [momentum[r] - lanes[f"coupling{i}_{r}"] * on_leg for r in range(6)]
+        for name, change in ((f"y_leg{i}", on_leg), (f"y_wheel{i}", lanes[f"i12_{i}"] * (step * leg))):
+            out[name] = ops.where_positive(near, lanes[name] + change, lanes[name])
+    white: Vector = []
+    for r in range(6):
+        rest = momentum[r]
+        for k in range(r):
+            rest = rest - lanes[f"lower{r}{k}"] * white[k]
+        white.append(rest * lanes[f"inverse_diagonal{r}"])
+        out[f"base{r}"] = ops.where_positive(near, lanes[f"base{r}"] + white[r], lanes[f"base{r}"])
     return out
 
 

@@ -26,7 +26,7 @@ from wlr_gym.physics.codegen import (
     source_of,
     straight_line_source,
 )  # fmt: skip
-from wlr_gym.physics.plants import base, contacts, drive, ground, relief
+from wlr_gym.physics.plants import base, body, contacts, drive, ground, relief
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT
 from wlr_gym.physics.plants.contacts import CONTACTS, CORNERS
 from wlr_gym.physics.plants.gibbs_appell import kinematics
@@ -35,6 +35,7 @@ from wlr_gym.physics.plants.mujoco import step as source
 from wlr_gym.physics.plants.mujoco.step import STATE
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
+from wlr_gym.robot.parameter_table import PIECES
 from wlr_gym.robot.parameters import Parameters
 
 # ---- the parameter table as numbers that the kernel reads: once per change -------------------------------------------
@@ -171,6 +172,13 @@ _PLACES |= {
     )
 }
 _SCALARS = ("step", "time", "duration")
+#: What a step knows of body and legs on the floor, beside the state.
+_TOUCHING = ("near", "near_base", *(f"near_piece{k}" for k in range(len(PIECES))), *body.PUSHES)
+_PLACES |= {name: f"touching[{k}]" for k, name in enumerate(_TOUCHING)}
+#: Lanes of the one piece that pushes; those of all pieces lie side by side.
+_PLACES |= {name: f"{_PLACES[f'{name}0'][:-1]} + piece]" for name in (*body.PIECE_LANES, "near_piece")}
+#: Blocks that are run only where body or legs are near the floor.
+_WHERE_NEAR = ("nearness", "push_of_base", "push_of_piece", "touch")
 
 
 def trace(features: frozenset[str]) -> dict[str, dict[str, Any]]:
@@ -181,6 +189,10 @@ def trace(features: frozenset[str]) -> dict[str, dict[str, Any]]:
     return {
         "drift": source.drift(lanes, owner.input("duration")),
         "before": source.before(lanes, owner.input("time"), step, features),
+        "nearness": source.nearness(lanes, features),
+        "push_of_base": source.push_of_base(lanes, features),
+        "push_of_piece": source.push_of_piece(lanes) if "piece" in features else {},
+        "touch": source.touch(lanes, step, features),
         "after": source.after(lanes, step, features),
         "features": source.formula_inputs(lanes, features),
         "observe": source.observe(lanes, features),
@@ -202,20 +214,22 @@ def kernel_source(features: frozenset[str]) -> str:
     for block, outputs in blocks.items():
         used = inputs_of(outputs.values())
         scalars = [name for name in _SCALARS if name in used]
+        near = ["touching", "piece"] if block in _WHERE_NEAR else []
         own = {"observe": ["truth", "raw"], "features": ["inputs"]}.get(block, [])
         places = _PLACES | {"observe": observed, "features": named}.get(block, {})
 
         def load(name: str) -> str:
             return name if name in _SCALARS else _PLACES[name]
 
-        body = emit(outputs, load, lambda name, text, places=places: f"{places[name]} = {text}", "", fused=True)
+        text = emit(outputs, load, lambda name, text, places=places: f"{places[name]} = {text}", "", fused=True)
         if block == "observe":
-            body.append(f"raw[{RAW_LAYOUT.width - 1}] = math.atan2(heading_sine, heading_cosine)")
+            text.append(f"raw[{RAW_LAYOUT.width - 1}] = math.atan2(heading_sine, heading_cosine)")
+        lines += [*straight_line_source(f"{block}_of_robot", [*names, *own, *near, "i", "count", *scalars], text), ""]
+        if near:
+            continue
         signature = "" if block == "features" else _signature(len(own), len(scalars))
         pointers = [f"numbers_of({name})" if block == "features" else f"numbers_of({name}[i])" for name in own]
         lines += [
-            *straight_line_source(f"{block}_of_robot", [*names, *own, "i", "count", *scalars], body),
-            "",
             f"@njit({signature}cache=True, nogil=True, error_model='numpy')",
             f"def {block}({', '.join(['table', 'rows', *own, *scalars])}):",
             "    count = len(table)",
@@ -224,7 +238,33 @@ def kernel_source(features: frozenset[str]) -> str:
             f"        {block}_of_robot({', '.join([*names, *pointers, 'i', 'count', *scalars])})",
             "",
         ]
-    return "\n".join(["from numba import types", "", *lines])
+    touch_floor = _TOUCH_FLOOR.format(
+        signature=_signature(0, 1),
+        room=len(_TOUCHING),
+        rows="\n".join(rows),
+        arrays=", ".join([*names, "touching"]),
+        pieces=len(relief.piece_numbers(features)),
+    )
+    return "\n".join(["from numba import types", "", *lines, touch_floor])
+
+
+#: Body and legs on the floor, where they are near it.
+_TOUCH_FLOOR = """
+@njit({signature}cache=True, nogil=True, error_model='numpy')
+def touch_floor(table, rows, step):
+    count, room = len(table), np.zeros({room})
+    touching = numbers_of(room)
+    for i in rows:
+{rows}
+        nearness_of_robot({arrays}, 0, i, count)
+        if room[0] > 0.0:
+            if room[1] > 0.0:
+                push_of_base_of_robot({arrays}, 0, i, count)
+            for piece in range({pieces}):
+                if room[2 + piece] > 0.0:
+                    push_of_piece_of_robot({arrays}, piece, i, count)
+            touch_of_robot({arrays}, 0, i, count, step)
+"""
 
 
 def _signature(own: int, scalars: int) -> str:
@@ -242,6 +282,6 @@ def load_kernel(features: frozenset[str]) -> ModuleType:
 
 #: What the kernels are traced from. numba itself notices only that the generated file has changed.
 TRACED = (
-    source, engine, kinematics, base, servo, drive, contacts, ground, relief, ops, compilation, sys.modules[__name__]
+    source, engine, kinematics, base, servo, drive, contacts, ground, relief, body, ops, compilation, sys.modules[__name__]
 )  # fmt: skip
 _SOURCE_KEY = "\0".join([source_of(*TRACED), *PARAMETER_LANES, f"{TRUTH_LAYOUT.width} {RAW_LAYOUT.width}"])

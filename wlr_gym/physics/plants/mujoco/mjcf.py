@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants import relief
-from wlr_gym.robot import CORNER_SIGNS, FIRST_WHEEL, JOINTS, LEGS, WHEELS, Robot, standing_height
+from wlr_gym.robot import CORNER_SIGNS, FIRST_WHEEL, JOINTS, LEGS, SHANK_RADIUS, WHEELS, Robot, standing_height
 from wlr_gym.robot.interchange.recognition import LinkJoint, LinkShape, LinkTree, Placement, RigidLink
 from wlr_gym.robot.parameters import Parameters
 
@@ -179,7 +179,7 @@ def _add_assembly(body: mujoco.MjsBody, robot: Robot, row: Parameters, corner: i
     com = np.array([row["leg.com_along_leg"][0, corner], 0.0, 0.0])
     _set_inertia(leg, row["leg.mass"][0, corner], com, np.array([along, pitch, across_x]))
     _add_joint(leg, row, corner, home)
-    _add_geom(leg, "CAPSULE", fromto=[0, 0, 0, length, 0, 0], size=[0.008, 0, 0], rgba=[0.6, 0.6, 0.6, 1])
+    _add_geom(leg, "CAPSULE", fromto=[0, 0, 0, length, 0, 0], size=[SHANK_RADIUS, 0, 0], rgba=[0.6, 0.6, 0.6, 1])
     wheel = leg.add_body(name=WHEELS[corner], pos=[length, 0.0, 0.0])
     transverse = row["wheel.transverse_inertia"][0, corner]
     inertia = np.array([transverse, row["wheel.spin_inertia"][0, corner], transverse])

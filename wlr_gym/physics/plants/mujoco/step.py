@@ -27,7 +27,7 @@ from operator import add
 
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
-from wlr_gym.physics.plants import drive, ground
+from wlr_gym.physics.plants import body, drive, ground
 from wlr_gym.physics.plants.base import COORDINATES
 from wlr_gym.physics.plants.contacts import (
     AXES,
@@ -95,8 +95,9 @@ STATE: tuple[str, ...] = (
     *(f"slip_displacement_{a}{i}" for i in CORNERS for a in "xy"),
     "mechanical_energy",
     "electrical_energy",
+    *body.SPOT_STATE,
 )
-TICK_SUMS: tuple[str, ...] = STATE[-10:]
+TICK_SUMS: tuple[str, ...] = STATE[-len(body.SPOT_STATE) - 10 : -len(body.SPOT_STATE)]
 
 #: Half the length (m) of the capsule that touches the floor with one end, and how far its axis leans up from the floor (rad).
 CAPSULE_HALF_LENGTH = 0.01
@@ -318,6 +319,31 @@ def _place_plane(lanes: Lanes, contact: Contact, rows: list[Vector], out: Out) -
 def _to_wheel(a: Vector, sine: Value, cosine: Value) -> Vector:
     """Turn a body-frame vector into the frame of a wheel that stands at an angle about y."""
     return [cosine * a[0] - sine * a[2], a[1], sine * a[0] + cosine * a[2]]
+
+
+# ---- body and legs on the floor --------------------------------------------------------------------------------------
+
+
+def nearness(lanes: Lanes, features: frozenset[str]) -> Out:
+    """Return whether body or legs may touch the floor, and sums of pushes to begin with."""
+    return body.nearness(lanes, features) | dict.fromkeys(body.PUSHES, 0.0)
+
+
+def push_of_base(lanes: Lanes, features: frozenset[str]) -> Out:
+    """Let the base push body and legs."""
+    return body.push_of_base(with_engine_rates(lanes), features)
+
+
+def push_of_piece(lanes: Lanes) -> Out:
+    """Let a piece push body and legs."""
+    return body.push_of_piece(with_engine_rates(lanes))
+
+
+def touch(lanes: Lanes, step: Value, features: frozenset[str]) -> Out:
+    """Add the forces of the floor on body and legs to the applied ones."""
+    out, push, torque, legs = body.hold(with_engine_rates(lanes), step, features)
+    more = dict(zip(VELOCITY, (*push, *torque), strict=False)) | {f"joint_rate{i}": leg for i, leg in enumerate(legs)}
+    return out | {f"applied_{name}": lanes[f"applied_{name}"] + value for name, value in more.items()}
 
 
 # ---- after a step ----------------------------------------------------------------------------------------------------
