@@ -96,8 +96,8 @@ class Stage:
 
         Args:
             truth, parameters: of the same robots. row: which one.
-            contacts: of the same robots, for the forces on wheels that touch the floor twice; None = those where each wheel is
-                deepest, which the truth knows.
+            contacts: of the same robots, for the forces on wheels that touch the floor twice, on body and legs; None = those
+                where each wheel is deepest, which the truth knows.
         """
         self.truth, self.parameters = Truth(truth.values[[row]]), Parameters(parameters.values[[row]])
         shape, floor = self._numbers(SHAPING), self._numbers(surface.SHAPING)
@@ -108,7 +108,7 @@ class Stage:
             self.shape = shape
         if floor != self._floor:
             self.relief, self._floor = Relief.of(self.robot, self.parameters), floor
-        self._contacts = self._contacts_of(row, contacts) if self.relief else None
+        self._contacts = self._contacts_of(row, contacts) if self.relief or contacts else None
         self._place()
 
     def _place(self) -> None:

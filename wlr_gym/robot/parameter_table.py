@@ -140,9 +140,9 @@ TABLE: tuple[ParameterSpec, ...] = (
     stated("body.mass", "kg", low=0.05, high=100, tolerance="body.mass", doc="platform without legs, wheels and payload"),
     stated("body.inertia", "kg m2", XYZ, low=1e-5, high=10, tolerance="body.inertia", doc="about its centre of mass"),
     stated("body.com_offset", "m", XYZ, low=-0.2, high=0.2, tolerance="body.com_offset", doc="centre of mass from the origin"),
-    # Where the body's corners and edges and the legs touch the floor, each; bounded by what the physics step resolves.
-    fixed("body.normal_stiffness", "N/m", at=3e4, low=1e3, high=1e6, doc="of a spot of body or legs on the floor, also along it"),
-    fixed("body.normal_damping", "N s/m", at=60.0, low=0, high=1e3, doc="of a spot of body or legs on the floor, also along it"),
+    # Across the floor and along it, as long as the spot sticks; bounded by what the physics step resolves.
+    fixed("body.normal_stiffness", "N/m", at=3e4, low=1e3, high=1e6, doc="of each spot of body or leg on the floor"),
+    fixed("body.normal_damping", "N s/m", at=60.0, low=0, high=1e3, doc="of each spot of body or leg on the floor"),
     fixed("body.mu", "-", at=0.6, low=0, high=5, doc="friction of body and legs on the floor, in every direction"),
     # A payload may be several masses; xy = -integral of x y dm.
     fixed("payload.mass", "kg", low=0, high=20, doc="mass fixed to the body"),

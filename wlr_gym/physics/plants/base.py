@@ -188,15 +188,17 @@ class Truth(_Signals):
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Where the wheels touch the floor, or are nearest to it; contacts i and i + 4 are those of wheel i, the deeper one first.
+    """Where robots touch the floor: K places each. Contacts i and i + 4 are those of wheel i, the deeper one first.
 
-    A wheel has a second contact only where pieces stand on the floor; without one its depth is -inf, all else is 0.
+    From 8 on they are those of body and shanks (:data:`wlr_gym.physics.plants.body.SPOTS`). A wheel has a second contact only
+    where pieces stand on the floor, the others have one only where they touch; without one the depth is -inf, all else is 0.
 
     Attributes:
-        point: (N, 8, 3) of the wheel that is deepest, floor frame, m.
-        depth: (N, 8) how far it is in the floor, m; negative = how far away.
-        normal, heading, lateral: (N, 8, 3) of the floor upwards, of the wheel along it, of its axle along it; floor frame.
-        force: (N, 8, 3) on the wheel along heading, lateral and normal, last substep, N.
+        point: (N, K, 3) of the robot that is deepest, floor frame, m.
+        depth: (N, K) how far it is in the floor, m; negative = how far away.
+        normal, heading, lateral: (N, K, 3) of the floor outwards, of the wheel or body along it, of the axles along it; floor
+            frame.
+        force: (N, K, 3) on the robot along heading, lateral and normal, last substep, N.
     """
 
     point: Array
@@ -205,6 +207,10 @@ class Contacts:
     heading: Array
     lateral: Array
     force: Array
+
+    def with_more(self, other: Contacts) -> Contacts:
+        """Return these contacts, and others of the same robots after them."""
+        return Contacts(*(np.concatenate([vars(self)[name], vars(other)[name]], axis=1) for name in vars(self)))
 
 
 @dataclass(frozen=True)

@@ -1,38 +1,49 @@
 """Where body and shanks touch the floor, defined once for every simulator: corners, edges of the underside, legs.
 
-The body is a box, a shank a rod of radius :data:`SHANK_RADIUS` from hip to axle. They touch at sixteen spots (:data:`SPOTS`):
+The body is a box, a shank a rod of radius :data:`SHANK_RADIUS` from hip to axle. They touch at twenty spots (:data:`SPOTS`):
 
 - the box's eight corners, against the base and the pieces of the floor;
-- the four edges of its underside, each where it crosses the upper edge of a piece;
+- the four edges of its underside and its four upright ones, each where it crosses the upper edge of a piece;
 - the four shanks, at the hip as a corner does, and where they cross the upper edge of a piece. (A shank's lower end is in its
   wheel, which is wider.)
 
 At each spot a spring and a damper push along the floor's normals, and an elastic bristle holds along the floor: it is strained
 by what the spot moves, at most until its force is ``body.mu`` times the push (return mapping). What rests does not creep.
 
-Forces are explicit: with positions at the middle of a step and velocities at its start. Stiffness and damping are bounded by what
-the step resolves (:func:`wlr_gym.physics.plants.ground.pack_body`). All in the floor frame, as scalar source over lanes. A
-simulator first asks :func:`nearness`, then lets the base (:func:`push_of_base`) and each piece (:func:`push_of_piece`) push,
+Forces are explicit: with positions at the middle of a step and velocities at its start. Stiffness and damping are bounded by
+what the step resolves (:func:`wlr_gym.physics.plants.ground.pack_body`). All in the floor frame, as scalar source over lanes.
+A simulator first asks :func:`nearness`, then lets the base (:func:`push_of_base`) and each piece (:func:`push_of_piece`) push,
 and ends with :func:`hold`; where nothing is near it leaves the rest out, and no bit changes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
+import numpy as np
+from numpy.typing import NDArray
+
 from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
-from wlr_gym.physics.plants import relief
-from wlr_gym.physics.plants.contacts import AXES, CORNERS, cross, dot, rotation_rows, to_body, vector
-from wlr_gym.robot import CORNER_SIGNS, SHANK_RADIUS
+from wlr_gym.physics.plants import ground, relief
+from wlr_gym.physics.plants.base import Contacts, Truth
+from wlr_gym.physics.plants.contacts import AXES, CORNERS, cross, dot, lanes_at, rotation_rows, to_body, vector
+from wlr_gym.robot import CORNER_SIGNS, SHANK_RADIUS, Robot
+from wlr_gym.robot.parameters import Parameters
+
+Array = NDArray[np.float64]
 
 #: Corners of the box, by their signs along its axes.
 BOX_CORNERS = tuple((x, y, z) for z in (-1.0, 1.0) for x, y in CORNER_SIGNS)
-#: Edges of the underside: along which axis, and on which side of the other.
-BOX_EDGES = ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0))
-#: Spots: corners 0 to 7, shanks 8 to 11, edges 12 to 15.
+#: Edges of the underside along x and y, and the upright ones: along which axis, and by the signs of their first ends.
+BOX_EDGES = (
+    *((0, (-1.0, y, -1.0)) for y in (1.0, -1.0)),
+    *((1, (x, -1.0, -1.0)) for x in (1.0, -1.0)),
+    *((2, (x, y, -1.0)) for x, y in CORNER_SIGNS),
+)
+#: Spots: corners 0 to 7, shanks 8 to 11, edges 12 to 19.
 SPOTS = range(len(BOX_CORNERS) + len(CORNERS) + len(BOX_EDGES))
 SHANKS = range(len(BOX_CORNERS), len(BOX_CORNERS) + len(CORNERS))
 EDGES = range(SHANKS.stop, SPOTS.stop)
@@ -41,8 +52,8 @@ MARGIN = 0.01
 
 #: What spots keep from step to step: strain of the bristle (m) and the force in the last step that anything was near (N).
 SPOT_STATE: tuple[str, ...] = tuple(f"{name}_{a}{s}" for name in ("spot_strain", "spot_force") for s in SPOTS for a in AXES)
-#: What the floor's parts add up within a step: normal force (N) as a vector, its size, and that times the share of the way along
-#: a shank or edge at which it acts.
+#: What the floor's parts add up within a step: normal force (N) as a vector, its size, and that times the share of the way
+#: along a shank or edge at which it acts.
 PUSHES: tuple[str, ...] = (
     *(f"push_{a}{s}" for s in SPOTS for a in AXES),
     *(f"load{s}" for s in SPOTS),
@@ -109,10 +120,9 @@ def _spots(lanes: Lanes, rows: Sequence[Vector]) -> list[_Spot]:
         turning = cross([turn[k] + bend * axes[1][k] for k in range(3)], leg)
         springs_of_leg = lanes["shank_stiffness"], lanes["shank_damping"]
         found.append(_Spot(number, hip, speed, *springs_of_leg, leg, turning, SHANK_RADIUS, i))
-    for (axis, side), number in zip(BOX_EDGES, EDGES, strict=True):
-        start, speed = place((-1.0, side, -1.0) if axis == 0 else (side, -1.0, -1.0))
+    for (axis, signs), number in zip(BOX_EDGES, EDGES, strict=True):
         way, turning = ([2.0 * x for x in part[axis]] for part in (half, swing))
-        found.append(_Spot(number, start, speed, *springs, way, turning))
+        found.append(_Spot(number, *place(signs), *springs, way, turning))
     return found
 
 
@@ -219,22 +229,32 @@ def push_of_piece(lanes: Lanes) -> Out:
         pushes.add(spot, 0.0, out_of_profile(normal_u, normal_v), spot.speed, ops.minimum(top, face), 1.0)
     sides = [_Edge(1.0, origin, front, edge_radius), _Edge(-1.0, (-(origin[0] + span), origin[1]), rear, edge_radius)]
     box = [in_profile([lanes[f"half_size_{a}"] * row[k] for row in rows]) for k, a in enumerate(AXES)]
+    whole = _Outline((0.0, 0.0), box)
     for spot in spots[SHANKS.start :]:
         assert spot.way is not None
         start, way = in_profile(spot.start), in_profile(spot.way)
         half = 0.5 * way[0], 0.5 * way[1]
-        centre, axes = ((0.0, 0.0), box) if spot.leg is None else ((start[0] + half[0], start[1] + half[1]), [half])
-        inside = reduce(ops.minimum, [edge.inside(centre, axes) for edge in sides]) + (spot.radius + SLACK)
+        outline = whole if spot.leg is None else _Outline((start[0] + half[0], start[1] + half[1]), [half])
+        least = reduce(ops.minimum, [edge.least(outline) for edge in sides])
         for edge in sides:
-            share, (normal_u, normal_v), depth = edge.crossing(start, way, spot.radius)
-            valid = ops.minimum(ops.minimum(share, 1.0 - share), inside - depth)
-            pushes.add(spot, share, out_of_profile(normal_u, normal_v), spot.at(share)[1], depth, valid)
+            depth = edge.depth_of(outline, way)
+            _cross(pushes, spot, edge, start, way, out_of_profile, depth, least)
     return pushes.sums
 
 
 Pair = tuple[Value, Value]
-#: Something crosses an edge only where that is nearer than leaving the piece by face or top, to this much (m).
+#: Something crosses an edge only where that is the shortest way out of the piece, to this much (m).
 SLACK = 1e-4
+#: What is shorter than the root of this across an edge (m2) lies along it, and does not cross it.
+ALONG = 1e-8
+
+
+@dataclass(frozen=True)
+class _Outline:
+    """What a centre (from the body's origin) and half axes span, in the plane across a piece's edges, m."""
+
+    centre: Pair
+    axes: Sequence[Pair]
 
 
 @dataclass(frozen=True)
@@ -253,29 +273,58 @@ class _Edge:
     face: Pair
     radius: Value
 
-    def inside(self, centre: Pair, axes: Sequence[Pair]) -> Value:
-        """How far what has a centre (from the body's origin) and half axes reaches behind the face and below the top, m."""
-        u, v = self.side * centre[0] + self.origin[0], centre[1] + self.origin[1]
-        behind, below = self.radius - u * self.face[0] - v * self.face[1], self.radius - v
-        for way_u, way_v in axes:
-            behind = behind + ops.absolute(self.side * way_u * self.face[0] + way_v * self.face[1])
-            below = below + ops.absolute(way_v)
-        return ops.minimum(behind, below)
+    def normal_to(self, way: Pair) -> Pair:
+        """Return the normal square to a way, limited to those between face and top."""
+        u, v = self.side * way[0], way[1]
+        square = u * u + v * v + 1e-12
+        inverse = ops.where_positive(u * (1.0 + self.face[1]) - v * self.face[0], 1.0, -1.0) / ops.sqrt(square)
+        normal = relief.within_faces(-(v * inverse), u * inverse, self.face)
+        crosses = square - ALONG
+        return ops.where_positive(crosses, normal[0], 0.0), ops.where_positive(crosses, normal[1], 1.0)
 
-    def crossing(self, start: Pair, way: Pair, radius: float) -> tuple[Value, Pair, Value]:
-        """Where what reaches from ``start`` (from the body's origin) along ``way`` crosses the edge.
+    def _reach(self, outline: _Outline, normal: Pair) -> Value:
+        depth = self.radius - (self.side * outline.centre[0] + self.origin[0]) * normal[0]
+        depth = depth - (outline.centre[1] + self.origin[1]) * normal[1]
+        for u, v in outline.axes:
+            depth = depth + ops.absolute(self.side * u * normal[0] + v * normal[1])
+        return depth
 
-        Returns:
-            The share of the way; the normal square to way and edge, limited to those between face and top; the depth, m.
-        """
-        u, v, way_u = self.side * start[0] + self.origin[0], start[1] + self.origin[1], self.side * way[0]
-        square = way_u * way_u + way[1] * way[1] + 1e-12
-        share = -(u * way_u + v * way[1]) / square
-        outwards = way_u * (1.0 + self.face[1]) - way[1] * self.face[0]
-        inverse = ops.where_positive(outwards, 1.0, -1.0) / ops.sqrt(square)
-        normal_u, normal_v = relief.within_faces(-(way[1] * inverse), way_u * inverse, self.face)
-        depth = (self.radius + radius) - (u + share * way_u) * normal_u - (v + share * way[1]) * normal_v
-        return share, (self.side * normal_u, normal_v), depth
+    def depth_of(self, outline: _Outline, way: Pair) -> Value:
+        """How deep an outline is in the piece along the normal square to a way, m."""
+        return self._reach(outline, self.normal_to(way))
+
+    def least(self, outline: _Outline) -> Value:
+        """How deep an outline is along the normals of face and top, and those square to its axes: the least, m."""
+        depths = [self.depth_of(outline, axis) for axis in outline.axes]
+        return reduce(ops.minimum, depths, ops.minimum(self._reach(outline, self.face), self._reach(outline, (0.0, 1.0))))
+
+
+def _cross(
+    pushes: _Pushes,
+    spot: _Spot,
+    edge: _Edge,
+    start: Pair,
+    way: Pair,
+    out_of_profile: Callable[[Value, Value], Vector],
+    depth: Value,
+    least: Value,
+) -> None:
+    """Push a shank or an edge of the box where it crosses the edge of a piece, square to both.
+
+    Args:
+        pushes: taken to. spot: that crosses. edge: that is crossed.
+        start, way: of the spot, in the plane across the edge.
+        out_of_profile: a vector of that plane in the floor frame.
+        depth: of body or shank along that normal, m.
+        least: along any normal, m; where that is less, it does not leave the piece here.
+    """
+    u, v, way_u = edge.side * start[0] + edge.origin[0], start[1] + edge.origin[1], edge.side * way[0]
+    square = way_u * way_u + way[1] * way[1] + 1e-12
+    share = ops.where_positive(square - ALONG, -(u * way_u + v * way[1]) / square, -1.0)
+    normal = edge.normal_to(way)
+    own = (edge.radius + spot.radius) - (u + share * way_u) * normal[0] - (v + share * way[1]) * normal[1]
+    valid = ops.minimum(ops.minimum(share, 1.0 - share), (least + SLACK) - depth)
+    pushes.add(spot, share, out_of_profile(edge.side * normal[0], normal[1]), spot.at(share)[1], own, valid)
 
 
 # ---- what holds along the floor, and the sum of all ------------------------------------------------------------------
@@ -330,6 +379,47 @@ def _held(lanes: Lanes, spot: _Spot, speed: Vector, step: Value, out: Out) -> Ve
         out[f"spot_force_{a}{s}"] = ops.where_positive(lanes["near"], total, lanes[f"spot_force_{a}{s}"])
         pushed.append(ops.where_positive(lanes["near"], total, 0.0))
     return pushed
+
+
+# ---- in numbers: for pictures, logs and tests ------------------------------------------------------------------------
+
+
+def spots_at(robot: Robot, parameters: Parameters, truth: Truth, force: Array) -> Contacts:
+    """Return the contacts of body and shanks of robots (N) in the poses of a truth.
+
+    Args:
+        robot: theirs.
+        parameters: (N).
+        truth: (N) where they are.
+        force: (N, 20, 3) on the spots, floor frame, N.
+    """
+    count, features, still = len(parameters), frozenset(relief.families(parameters)), np.zeros(len(parameters))
+    lanes = lanes_at(robot, parameters, truth) | ground.pack_body(parameters, robot, 1e-6)
+    lanes |= dict.fromkeys((*PUSHES, *(f"{name}{a}" for name in "vw" for a in AXES)), still)
+    lanes |= {f"leg_rate{i}": still for i in CORNERS}
+    lanes |= nearness(lanes, features)
+    lanes |= push_of_base(lanes, features)
+    for k in relief.piece_numbers(features):
+        lanes |= push_of_piece(lanes | {name: lanes[f"{name}{k}"] for name in (*PIECE_LANES, "near_piece")})
+    rows = rotation_rows(lanes)
+    axle = np.stack([row[1] for row in rows], axis=1)
+    point, normal, heading, lateral = np.zeros((4, count, len(SPOTS), 3))
+    depth = np.full((count, len(SPOTS)), -np.inf)
+    for spot in _spots(lanes, rows):
+        s = spot.number
+        push = np.stack([lanes[f"push_{a}{s}"] for a in AXES], axis=1)
+        load = np.maximum(lanes[f"load{s}"], 1e-9)
+        place, _ = spot.at(lanes[f"load_share{s}"] / load)
+        normal[:, s] = push / np.maximum(np.linalg.norm(push, axis=1, keepdims=True), 1e-9)
+        ahead = np.cross(axle, normal[:, s])
+        heading[:, s] = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+        lateral[:, s] = np.cross(normal[:, s], heading[:, s])
+        touches = lanes[f"load{s}"] > 0.0
+        depth[touches, s] = (load / spot.stiffness)[touches]
+        point[touches, s] = (truth.position + np.stack(place, axis=1) - spot.radius * normal[:, s])[touches]
+    axes = np.stack([heading, lateral, normal], axis=2)
+    along = np.einsum("ncij,ncj->nci", axes, force)
+    return Contacts(point, depth, normal, heading, lateral, np.where(np.isfinite(depth)[:, :, None], along, 0.0))
 
 
 def _along(normal: Vector, a: Vector) -> Vector:

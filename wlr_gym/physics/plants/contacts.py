@@ -228,8 +228,20 @@ def contacts_of_plant(plant: Plant) -> ContactsOf | None:
     return getattr(plant, "contacts", None)
 
 
+def lanes_at(robot: Robot, parameters: Parameters, truth: Truth) -> dict[str, Array]:
+    """Return the lanes of floor, geometry and pose of robots (N) in the poses of a truth."""
+    lanes = relief.pack(parameters, robot) | {f"q{a}": truth.quaternion[:, k] for k, a in enumerate("wxyz")}
+    lanes |= {f"p{a}": truth.position[:, k] for k, a in enumerate(AXES)}
+    for i in CORNERS:
+        hip = parameters["hip.position"] * [*CORNER_SIGNS[i], 1.0]
+        lanes |= {f"hip_{a}{i}": hip[:, k] for k, a in enumerate(AXES)}
+        lanes |= {f"length{i}": parameters["leg.length"][:, i], f"radius{i}": parameters["wheel.radius"][:, i]}
+        lanes[f"leg_angle{i}"] = truth.joint_position[:, i]
+    return lanes
+
+
 def contacts_at(robot: Robot, parameters: Parameters, truth: Truth, force: Array) -> Contacts:
-    """Return the contacts of robots (N) in the poses of a truth.
+    """Return the contacts of the wheels of robots (N) in the poses of a truth.
 
     Args:
         robot: theirs.
@@ -238,12 +250,7 @@ def contacts_at(robot: Robot, parameters: Parameters, truth: Truth, force: Array
         force: (N, 8, 3) of the contacts, along their axes, N.
     """
     count, features = len(parameters), frozenset(relief.families(parameters))
-    lanes = relief.pack(parameters, robot)
-    lanes |= {f"p{a}": truth.position[:, k] for k, a in enumerate(AXES)}
-    for i in CORNERS:
-        hip = parameters["hip.position"] * [*CORNER_SIGNS[i], 1.0]
-        lanes |= {f"hip_{a}{i}": hip[:, k] for k, a in enumerate(AXES)}
-        lanes |= {f"length{i}": parameters["leg.length"][:, i], f"radius{i}": parameters["wheel.radius"][:, i]}
+    lanes = lanes_at(robot, parameters, truth)
     turn = rotation_matrix(truth.quaternion)
     rows = [[turn[:, k, m] for m in range(3)] for k in range(3)]
     level = axes_on(rows[2])

@@ -78,8 +78,8 @@ def _inverse(values: Array) -> Array:
     return np.where(values > 0.0, 1.0 / np.where(values > 0.0, values, 1.0), 0.0)
 
 
-#: Parameter lanes of the body: gravity, pulls, the inertial sensors' low-pass, half the body's size, and how body and legs touch
-#: the floor (:mod:`wlr_gym.physics.plants.body`); ``reach``: of body and shanks from the body's origin.
+#: Parameter lanes of the body: gravity, pulls, the inertial sensors' low-pass, half the body's size, and how body and legs
+#: touch the floor (:mod:`wlr_gym.physics.plants.body`); ``reach``: of body and shanks from the body's origin.
 BODY_LANES = (
     "gravity_x", "gravity_y", "gravity_z", "external_x", "external_y", "tether_stiffness", "anchor_x", "anchor_y", "low_pass",
     "half_size_x", "half_size_y", "half_size_z",

@@ -25,6 +25,7 @@ from wlr_gym.physics.plants.base import (
     hold_where_off,
     standing_state,
 )
+from wlr_gym.physics.plants.body import spots_at
 from wlr_gym.physics.plants.contacts import contacts_at
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel, check_flow
 from wlr_gym.robot import LEG_SLICE, Robot
@@ -246,9 +247,14 @@ class Simulator(ABC):
     def _contact_forces(self) -> Array:
         """Return the forces (N, 8, 3) on the wheels at their contacts, along the contacts' axes, N."""
 
+    @abstractmethod
+    def _spot_forces(self) -> Array:
+        """Return the forces (N, 20, 3) on body and shanks, floor frame, N."""
+
     def contacts(self) -> Contacts:
-        """Return where the wheels touch the floor now, and the forces of the last step there."""
-        return contacts_at(self.robot, self.parameters, self._truth, self._contact_forces())
+        """Return where wheels, body and legs touch the floor now, and the forces of the last step there."""
+        robots = self.robot, self.parameters, self._truth
+        return contacts_at(*robots, self._contact_forces()).with_more(spots_at(*robots, self._spot_forces()))
 
     def truth(self) -> Truth:
         """Return the true state after the last step or reset; overwritten by the next step."""

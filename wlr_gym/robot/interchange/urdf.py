@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.robot.description import Robot
 from wlr_gym.robot.interchange.recognition import JointKind, LinkJoint, LinkShape, LinkTree, Placement, RigidLink
-from wlr_gym.robot.parameter_table import CORNER_SIGNS, LEGS, WHEELS
+from wlr_gym.robot.parameter_table import CORNER_SIGNS, LEGS, SHANK_RADIUS, WHEELS
 from wlr_gym.robot.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -60,7 +60,8 @@ def _write_leg(
     across_x, pitch, along = numbers["leg.inertia"].reshape(4, 3)[corner]
     com = np.array([numbers["leg.com_along_leg"][corner], 0.0, 0.0])
     link = _link(root, f"{leg}_link", float(numbers["leg.mass"][corner]), com, np.array([along, pitch, across_x]))
-    _shape(link, "cylinder", {"radius": repr(SHANK_RADIUS), "length": repr(length)}, f"{length / 2!r} 0 0", f"0 {math.pi / 2!r} 0")
+    rod = {"radius": repr(SHANK_RADIUS), "length": repr(length)}
+    _shape(link, "cylinder", rod, f"{length / 2!r} 0 0", f"0 {math.pi / 2!r} 0")
     hip = numbers["hip.position"] * np.array([*signs, 1.0])
     _joint(root, leg, "revolute", "base_link", f"{leg}_link", hip, numbers, corner, robot.leg_limits)
     across = float(numbers["wheel.transverse_inertia"][corner])

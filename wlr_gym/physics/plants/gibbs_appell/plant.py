@@ -15,6 +15,7 @@ from wlr_gym.base.snapshot import RowStore, Snapshot
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import drive, ground, relief
 from wlr_gym.physics.plants.base import MEMORY, Capabilities, PlantOptions, PlantState, Sensors
+from wlr_gym.physics.plants.body import SPOTS
 from wlr_gym.physics.plants.contacts import CONTACTS
 from wlr_gym.physics.plants.gibbs_appell import kernel
 from wlr_gym.physics.plants.gibbs_appell.kinematics import STORED, TURN
@@ -51,6 +52,7 @@ _PLACE = {
 
 
 _FRICTION = np.array([STORED.index(f"friction_{a}{c}") for c in CONTACTS for a in "xy"])
+_SPOT_FORCE = np.array([STORED.index(f"spot_force_{a}{s}") for s in SPOTS for a in "xyz"])
 _NORMAL = np.array([STORED.index(f"normal{c}") for c in CONTACTS])
 
 
@@ -253,6 +255,9 @@ class GibbsAppellPlant(Simulator):
         values = _gather(self._lanes, self._width, self._all).astype(np.float64)
         friction = values[:, _FRICTION].reshape(self._count, -1, 2) / self.options.physics_step
         return np.concatenate([friction, values[:, _NORMAL][:, :, None]], axis=2)
+
+    def _spot_forces(self) -> Array:
+        return _gather(self._lanes, self._width, self._all)[:, _SPOT_FORCE].astype(np.float64).reshape(self._count, -1, 3)
 
     def _fits(self) -> dict[str, Any]:
         return super()._fits() | {"sweeps": self.sweeps}

@@ -14,6 +14,7 @@ from wlr_gym.base.snapshot import RowStore
 from wlr_gym.physics.model.dynamics import gravity_in_floor, rotation_matrix
 from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import COORDINATES, INPUTS, MEMORY, Capabilities, PlantOptions, PlantState, Sensors
+from wlr_gym.physics.plants.body import SPOTS
 from wlr_gym.physics.plants.contacts import CONTACTS
 from wlr_gym.physics.plants.forces import Force, compile_forces
 from wlr_gym.physics.plants.mujoco.kernel import PARAMETER_LANES, addresses, load_kernel, pack
@@ -33,6 +34,7 @@ _ROTOR_LEAD = np.array([_LANE[f"rotor_lead{j}"] for j in range(8)])
 _ROTOR_RATE = np.array([_LANE[f"rotor_rate{j}"] for j in range(8)])
 _SHEAR = np.array([_LANE[f"shear_{a}{c}"] for c in CONTACTS for a in "xy"])
 _FORCES = np.array([_LANE[f"force_{a}{c}"] for c in CONTACTS for a in "xyz"])
+_SPOT_FORCES = np.array([_LANE[f"spot_force_{a}{s}"] for s in SPOTS for a in "xyz"])
 _SUMS = slice(_LANE[TICK_SUMS[0]], _LANE[TICK_SUMS[-1]] + 1)
 
 
@@ -154,6 +156,9 @@ class MujocoPlant(Simulator):
 
     def _contact_forces(self) -> Array:
         return self._state[:, _FORCES].reshape(self._count, -1, 3).copy()
+
+    def _spot_forces(self) -> Array:
+        return self._state[:, _SPOT_FORCES].reshape(self._count, -1, 3)
 
     def _engine_stores(self) -> dict[str, RowStore]:
         inputs = {f"input{number}": values for number, values in enumerate(self._inputs)}
