@@ -179,7 +179,7 @@ def _add_assembly(body: mujoco.MjsBody, robot: Robot, row: Parameters, corner: i
     com = np.array([row["leg.com_along_leg"][0, corner], 0.0, 0.0])
     _set_inertia(leg, row["leg.mass"][0, corner], com, np.array([along, pitch, across_x]))
     _add_joint(leg, row, corner, home)
-    _add_geom(leg, "CAPSULE", fromto=[0, 0, 0, length, 0, 0], size=[SHANK_RADIUS, 0, 0], rgba=[0.6, 0.6, 0.6, 1])
+    _add_geom(leg, "CAPSULE", name=leg.name, fromto=[0, 0, 0, length, 0, 0], size=[SHANK_RADIUS, 0, 0], rgba=[0.6, 0.6, 0.6, 1])
     wheel = leg.add_body(name=WHEELS[corner], pos=[length, 0.0, 0.0])
     transverse = row["wheel.transverse_inertia"][0, corner]
     inertia = np.array([transverse, row["wheel.spin_inertia"][0, corner], transverse])
@@ -231,11 +231,12 @@ def _set_contact_springs(model: mujoco.MjModel, row: Parameters) -> None:
     """Set ``solref`` so that a wheel's contacts together are the spring and damper of the parameters."""
     for pair in range(model.npair):
         geom = model.pair_geom2[pair]
-        wheel = WHEELS.index(model.geom(geom).name)
-        sharing = 2 if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE else 1
+        name = model.geom(geom).name
+        group, index = ("ground", (0, WHEELS.index(name))) if name in WHEELS else ("body", 0)
+        sharing = 2 if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE and name in WHEELS else 1
         # MuJoCo: force = (K d pos + B vel) / R with K = solref0 / d^2, B = solref1 / d, R = (1 - d) / d / apparent mass.
         scale = (1.0 - CONTACT_IMPEDANCE) * model.body_invweight0[model.geom_bodyid[geom], 0] / sharing
-        stiffness, damping = row["ground.normal_stiffness"][0, wheel], row["ground.normal_damping"][0, wheel]
+        stiffness, damping = (row[f"{group}.{name}"][index] for name in ("normal_stiffness", "normal_damping"))
         model.pair_solref[pair] = -scale * stiffness, -scale * damping
 
 
@@ -296,6 +297,7 @@ def mjcf_text(robot: Robot, parameters: Parameters | None = None) -> str:
 def _complete(spec: Any, robot: Robot, row: Parameters, kept: list[Any]) -> None:
     """Add what the plant does not need, take away what only it needs."""
     kept.append(spec)
+    _add_body_contacts(spec, row, "floor")
     for piece in np.flatnonzero(row["piece.height"][0] > 0.0):
         _add_piece(spec, row, int(piece))
     for name in _TREAD:
@@ -331,6 +333,21 @@ def _add_piece(spec: Any, row: Parameters, index: int) -> None:
         spec.worldbody.add_geom(type=_GEOM.mjGEOM_MESH, meshname=name, **place, **look)
     for wheel in range(len(WHEELS)):
         _add_contact(spec, row, wheel, name)
+    _add_body_contacts(spec, row, name)
+
+
+def _add_body_contacts(spec: Any, row: Parameters, floor: str) -> None:
+    """Add the contacts of body and legs with the floor or a piece of it."""
+    mu = float(row["body.mu"][0])
+    for name in ("body", *LEGS):
+        spec.add_pair(
+            geomname1=floor,
+            geomname2=name,
+            condim=3,
+            friction=[mu, mu, 0.0, 0.0, 0.0],
+            solimp=[CONTACT_IMPEDANCE, CONTACT_IMPEDANCE, 0.001, 0.5, 2.0],
+            solreffriction=[-1.0, -FRICTION_DAMPING * CONTACT_IMPEDANCE],
+        )
 
 
 def _write_full_digits(root: ElementTree.Element, model: Any) -> None:
