@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
 from energy import mechanical_energy
-from rig import BACKENDS, G, ROBOT, WEIGHT, drive, lock, make_plant
+from rig import BACKENDS, ROBOT, WEIGHT, G, drive, lock, make_plant
 from scipy.spatial.transform import Rotation
 
 from wlr_gym.physics import plants
@@ -16,6 +18,9 @@ from wlr_gym.physics.plants.body import spots_at
 from wlr_gym.robot import CORNER_SIGNS, SHANK_RADIUS
 from wlr_gym.robot.parameters import Parameters
 
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo fills its namespace when it is imported.)
+
 BELLY = 0.5 * ROBOT.body.size[2]
 #: Legs that point up: wheels are off the floor, and the robot lies on its belly.
 UP = np.array([-0.6] * 4 + [0.0] * 4)
@@ -24,7 +29,7 @@ KERB = 0.1
 SIDES = np.array([1.0, -1.0])
 
 
-def _lying(count, edit=None, backend="gibbs_appell", height=BELLY, speed=None, attitude=None, **options):
+def _lying(count, edit=None, backend="gibbs_appell", height: Any = BELLY, speed=None, attitude=None, **options):
     """Return robots with their legs up whose belly is at a height."""
 
     def place(state):
@@ -113,7 +118,7 @@ def test_the_body_touches_first_where_mujocos_box_does():
         pose = np.concatenate([position[row], quaternion[row]])
         position[row, 2], _ = _drop_until(model, data, ["box"], ["floor", "kerb"], pose, legs)
     parameters, legs = _sharp_kerb(count), np.tile(legs, (count, 1))
-    above, below = (_depths(parameters, position + [0, 0, rise], quaternion, legs) for rise in (1e-4, -5e-4))
+    above, below = (_depths(parameters, position + np.array([0, 0, rise]), quaternion, legs) for rise in (1e-4, -5e-4))
     assert np.isneginf(above).all()
     assert np.isfinite(below[:, :8]).any(axis=1).sum() > count / 2
     assert np.isfinite(below[:, 12:]).any(axis=1).sum() > 5
@@ -139,7 +144,7 @@ def test_a_shank_touches_a_kerb_where_mujocos_capsule_does():
         share = data.xmat[leg].reshape(3, 3)[:, 0] @ (where - data.xpos[leg]) / ROBOT.leg.length
         is_between[row] = 0.02 < share < 0.98  # at its end is the wheel
     parameters = _sharp_kerb(count)
-    above, below = (_depths(parameters, position + [0, 0, rise], quaternion, legs)[:, 8] for rise in (2e-4, -5e-4))
+    above, below = (_depths(parameters, position + np.array([0, 0, rise]), quaternion, legs)[:, 8] for rise in (2e-4, -5e-4))
     assert is_between.sum() > count / 3
     assert np.isneginf(above[is_between]).all()
     assert (below[is_between] > 0.0).all()
@@ -152,7 +157,8 @@ def test_what_touches_a_kerb_between_the_axles():
         count, leg, radius = 400, np.arccos(-0.115 / ROBOT.leg.length), ROBOT.wheel.radius
         turn = Rotation.from_euler("y", -np.arcsin(height / (2 * ROBOT.hip_position.x)))
         front, back = (
-            turn.apply([x + ROBOT.leg.length * np.cos(leg), 0, -ROBOT.leg.length * np.sin(leg)]) for x in ROBOT.hip_position.x * SIDES
+            turn.apply([x + ROBOT.leg.length * np.cos(leg), 0, -ROBOT.leg.length * np.sin(leg)])
+            for x in ROBOT.hip_position.x * SIDES
         )
         x = np.linspace(-front[0], -radius - back[0], count)
         position = np.stack([x, 0 * x, np.full(count, radius - back[2])], axis=1)
@@ -234,16 +240,17 @@ def test_a_bouncing_fall_never_gains_energy():
         lock(parameters)
         parameters["body.normal_damping"], parameters["body.mu"] = rng.uniform(0, 30, count), rng.uniform(0, 0.8, count)
 
-    plant = _lying(count, edit, height=0.35, attitude=quaternion, period=0.001)
+    plant = _lying(count, edit, height=0.35, attitude=quaternion, period=0.005)
     energy, in_air = [], []
-    for _ in range(1500):
+    for _ in range(200):
         plant.step(np.tile(UP, (count, 1)))
         energy.append(mechanical_energy(plant.parameters, plant.truth()))
-        in_air.append(np.isneginf(plant.contacts().depth[:, 8:]).all(axis=1) & (plant.contacts().depth[:, :4] < 0).all(axis=1))
+        depth = plant.contacts().depth
+        in_air.append(np.isneginf(depth[:, 8:]).all(axis=1) & (depth[:, :4] < 0).all(axis=1))
     energy, in_air = np.array(energy), np.array(in_air)
     flying = np.where(in_air, energy, np.inf)
     gained = np.where(in_air, energy - np.minimum.accumulate(flying, axis=0), 0.0)
-    assert in_air[200:].any()
+    assert in_air[80:].any()
     assert gained.max() < 2e-3 * energy[0].max()
 
 
@@ -260,7 +267,8 @@ def test_both_simulators_agree(floor):
             parameters["piece.height[piece_1]"], parameters["piece.x[piece_1]"] = 0.06, 0.25
 
     ours, theirs = (
-        drive(_lying(count, edit, backend, height=0.2, speed=[0.4, 0.1, 0.0], attitude=quaternion), 0.5, UP) for backend in BACKENDS
+        drive(_lying(count, edit, backend, height=0.2, speed=[0.4, 0.1, 0.0], attitude=quaternion), 0.5, UP)
+        for backend in BACKENDS
     )
     assert ours.position == pytest.approx(theirs.position, abs=1e-3 if floor == "plane" else 3e-3)
 
@@ -269,7 +277,8 @@ def test_both_simulators_agree(floor):
 
 
 @pytest.mark.parametrize(
-    ("backend", "precision"), [("gibbs_appell", "float64"), ("gibbs_appell", "float32"), ("mujoco", "float64")]
+    ("backend", "precision"),
+    [("gibbs_appell", "float64"), pytest.param("gibbs_appell", "float32", marks=pytest.mark.slow), ("mujoco", "float64")],
 )
 def test_bits_depend_on_no_neighbour_thread_or_place_in_the_batch(backend, precision):
     """Robots that lie, fall and drive beside each other; on a plane, on waves, at a kerb."""
@@ -285,7 +294,7 @@ def test_bits_depend_on_no_neighbour_thread_or_place_in_the_batch(backend, preci
         state = standing_state(ROBOT, parameters)
         state.position[:, 2] += rng.uniform(-0.1, 0.1, count)[rows]
         state.joint_position[:, :4] = state.reference_position[:, :4] = rng.uniform(-0.5, 2.0, (count, 4))[rows]
-        plant = plants.make_plant(backend, ROBOT, len(rows), PlantOptions(precision=precision, threads=threads))
+        plant: Any = plants.make_plant(backend, ROBOT, len(rows), PlantOptions(precision=precision, threads=threads))
         plant.reset(rows.astype(np.uint64), parameters, state=state)
         for draw in rng.uniform(-1.0, 1.0, (30, count, 8))[:, rows]:
             plant.step(np.array([0.5] * 4 + [6.0] * 4) + draw)
