@@ -17,9 +17,11 @@ from wlr_gym.base.settings import read_json
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption
 from wlr_gym.cli.terminal import print_json
+from wlr_gym.data.watch import truth_of
 from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
+from wlr_gym.physics.plants.contacts import CONTACTS, contacts_at
 from wlr_gym.robot import FIRST_WHEEL, Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -96,8 +98,7 @@ def fuzz(
         laid.write(parameters, seeds)
         parameters["ground.mu_x"] = parameters["ground.mu_y"] = rng.uniform(0.0, 1.5, (ROBOTS, 1))
         state = throw(robot, parameters, rng)
-        plant.reset(seeds, parameters, state=state)
-        deepest = plant.contacts().depth.max(axis=1)
+        deepest = contacts_at(robot, parameters, truth_of(state), np.zeros((ROBOTS, len(CONTACTS), 3))).depth.max(axis=1)
         state.position[:, 2] += np.maximum(deepest, 0.0) - rng.uniform(-0.05, 0.003, ROBOTS)
         plant.reset(seeds, parameters, state=state)
         fastest = found.fastest

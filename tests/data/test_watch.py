@@ -45,6 +45,17 @@ def test_the_measured_robot_is_where_the_camera_and_the_encoders_say():
     assert recording.length == pytest.approx(4.0, abs=0.03)
 
 
+def test_a_measured_robot_stands_on_the_floor_that_is_given():
+    """On a ramp it is as steep, and slips by what its wheels turn more than they go."""
+    ramp = {"pieces": [{"kind": "ramp", "at": [-2.0, 0.0], "slope": 0.2, "height": 1.0}]}
+    level, steep = (RunRecording(run_of(), backend=None, floor=floor).at(2.0).truth for floor in ("flat", ramp))
+    _, pitch, _ = euler_angles(steep.quaternion)
+    assert pitch[0] == pytest.approx(-0.2, abs=0.02)
+    assert steep.position[0, 2] - level.position[0, 2] == pytest.approx(0.2 * (2.0 + steep.position[0, 0]), rel=0.05)
+    assert np.isfinite(steep.slip_velocity).all()
+    assert steep.slip_velocity == pytest.approx(level.slip_velocity, abs=0.02)
+
+
 def test_without_a_camera_it_moves_as_its_wheels_roll():
     run, robot = read_run(RUN), load_robot()
     t = np.arange(100) * 0.02

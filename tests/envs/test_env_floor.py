@@ -149,6 +149,13 @@ def test_the_checker_of_gymnasium_has_no_warning():
         check_env(make(**ON_STEP), skip_render_check=True)
 
 
+def test_the_checker_of_stable_baselines3_has_no_warning():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(make(**ON_STEP).unwrapped, warn=True)
+
+
 def test_the_contract_says_on_which_floor():
     assert make(**ON_STEP).contract()["floor"] == STEP
     assert "floor" not in make(randomization="none").contract()

@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.data.runs import Run
+from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import PlantState, settle, standing_state
+from wlr_gym.physics.plants.contacts import slip_on_relief
 from wlr_gym.physics.plants.sensors import imu_to_body, rotation
 from wlr_gym.physics.servo import reference_per_effort, reference_per_rate
 from wlr_gym.robot import CORNER_SIGNS, JOINTS, LEG_SLICE, LEGS, WHEEL_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameters import Parameters
+from wlr_gym.robot.slip import contact_slip_velocity
 
 Array = NDArray[np.float64]
 
@@ -164,6 +167,14 @@ def measured_state(run: Run, times: Array, background: PlantState, parameters: P
     state.position[seen, :2] -= (turn @ offset)[seen, :2]
     state.linear_velocity_in_body[seen] -= np.cross(state.angular_velocity_in_body, offset)[seen]
     return state
+
+
+def slip_of(robot: Robot, parameters: Parameters, state: PlantState) -> Array:
+    """Return the slip velocities (N, 4, 2) of wheels, m/s: of robots on the floor, also where that is not flat."""
+    motion = (state.linear_velocity_in_body, state.angular_velocity_in_body, state.joint_position, state.joint_velocity)
+    if relief.families(parameters):
+        return slip_on_relief(robot, parameters, state)
+    return contact_slip_velocity(parameters, state.quaternion, *motion)
 
 
 def standing_at(setpoints: Array, robot: Robot, parameters: Parameters) -> PlantState:

@@ -1,7 +1,7 @@
 """Runs to be watched: a film of a measured run beside its simulation, and recordings that a page plays.
 
 In a film both sides are drawn from the same channels in the same way: joints from the encoders, x, y and yaw from the camera
-(smoothed), height and tilt from the legs, as of a robot with all wheels on a flat floor. Slip is not measured, so none is
+(smoothed), height and tilt from the legs, as of a robot that stands on the floor there. Slip is not measured, so none is
 drawn, and no friction. Both cameras look at the place of the measured robot: a simulated one that drifts is seen to drift.
 
 A page opens at once; what takes a simulator is worked out by a thread while it is watched:
@@ -27,17 +27,16 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.format import CHANNELS, COLUMNS
 from wlr_gym.data.replay import ReplayResult, prepare, replayed_rows, simulated_rows
-from wlr_gym.data.run_states import frame_near, has_camera, measured_state, rolled_poses
+from wlr_gym.data.run_states import frame_near, has_camera, measured_state, rolled_poses, slip_of
 from wlr_gym.data.runs import Run
 from wlr_gym.physics.effects import Patch
 from wlr_gym.physics.floor import FloorSource
-from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, standing_state
+from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, settle, standing_state
 from wlr_gym.render.view import View
 from wlr_gym.render.web.page import Curve
 from wlr_gym.render.web.player import Moment
 from wlr_gym.robot import Robot
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.robot.slip import contact_slip_velocity
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -65,7 +64,10 @@ def replay_film(result: ReplayResult, parameters: Parameters, backend: str, view
     simulated = replace(result.run, table=result.run.table.assign(**result.full))
     times = _film_times(result.run)
     many = Parameters(np.repeat(parameters.values, len(times), axis=0))
-    truths = [truth_of(measured_state(run, times, standing_state(result.robot, many), many)) for run in (result.run, simulated)]
+    states = [measured_state(run, times, standing_state(result.robot, many), many) for run in (result.run, simulated)]
+    for state in states:
+        settle(result.robot, many, state)
+    truths = [truth_of(state) for state in states]
     titles = ("recorded: camera and encoders", f"simulated ({backend}): same commands, open loop")
     middle = truths[0].position[:, :2]
     left, right = (_pictures(result, truth, many, times, middle, view) for truth in truths)
@@ -248,11 +250,11 @@ class RunRecording:
         background.position[0, :2] = x, y
         background.quaternion[0] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
         state = measured_state(near, when, background, self._model)
+        settle(self.robot, self._model, state)
         seen = has_camera(near) and bool(frame_near(near, when, self._model["camera.delay"][0])[0])
         truth = truth_of(state)
         if seen:
-            motion = (state.linear_velocity_in_body, state.angular_velocity_in_body, state.joint_position, state.joint_velocity)
-            truth["slip_velocity"][:] = contact_slip_velocity(self._model, state.quaternion, *motion).reshape(1, 8)
+            truth["slip_velocity"][:] = slip_of(self.robot, self._model, state).reshape(1, 8)
         return Moment(truth, self._model, slip=seen, forces=False)
 
     # ---- what is worked out -----------------------------------------------------------------------------------------

@@ -57,6 +57,20 @@ def drive(backend, robot, period, seconds, parameters, setpoints):
     return np.array(readings), np.array(truths)
 
 
+def test_an_edge_under_the_body_moves_nothing():
+    """Pitched by 0.1 rad and level at 0.2 m/s; from the tenth tick on the floor is 40 mm higher: the flow grows, no more."""
+    raw, columns = gliding([0.2, 0.0], 20), RAW_LAYOUT.slices
+    raw[..., columns["quaternion"]] = [np.cos(0.05), 0.0, np.sin(0.05), 0.0]
+    higher = np.where(np.arange(20) < 10, 0.0, 0.04)[:, None, None]
+    raw[..., columns["height"]] -= higher
+    raw[..., columns["floor"]] = higher
+    flow = channel(record(raw), "flow")[2:, 0, 0]
+    before, after = flow[5], flow[-1]
+    assert 1.2 * before < after
+    assert (flow > before - 0.01).all()
+    assert (flow < after + 0.01).all()
+
+
 def instantaneous_flow(truths, lens):
     """Flow (rows, 2) by its definition from true velocities; height along the optical axis to the plane z = 0."""
     rotation = rotation_matrix(truths[:, 3:7])

@@ -32,9 +32,10 @@ from wlr_gym.base.text import row_words
 from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, FLOW, RunMeta
 from wlr_gym.data.logs.readers import quiet, read_logs
 from wlr_gym.data.logs.topics import LOG, Share
-from wlr_gym.data.run_states import euler_angles, has_camera, measured_state, quaternion
-from wlr_gym.data.runs import Run, Simulation, is_shipped, own_robot, robot_of
-from wlr_gym.physics.plants.base import standing_state
+from wlr_gym.data.run_states import euler_angles, has_camera, measured_state, quaternion, slip_of
+from wlr_gym.data.runs import Run, Simulation, floor_of, is_shipped, own_robot, robot_of
+from wlr_gym.physics.floor import lay_floor
+from wlr_gym.physics.plants.base import settle, standing_state
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import (
     CORNER_NAMES,
@@ -52,7 +53,6 @@ from wlr_gym.robot import (
 from wlr_gym.robot.interchange.urdf import urdf_text
 from wlr_gym.robot.parameter_table import XYZ
 from wlr_gym.robot.parameters import Parameters
-from wlr_gym.robot.slip import contact_slip_velocity
 
 Array = NDArray[np.float64]
 
@@ -290,12 +290,11 @@ def _camera_pose(run: Run, row: int, time: int) -> Sent:
 
 
 def _motion(run: Run, robot: Robot, rows: NDArray[np.intp], times: list[int]) -> list[list[Sent]]:
-    many = Parameters(np.repeat(Parameters.nominal(robot).values, len(rows), axis=0))
+    on_floor = lay_floor(floor_of(run), Parameters.nominal(robot))
+    many = Parameters(np.repeat(on_floor.values, len(rows), axis=0))
     state = measured_state(run, run["t"][rows], standing_state(robot, many), many)
-    slip = contact_slip_velocity(
-        many, state.quaternion, state.linear_velocity_in_body, state.angular_velocity_in_body, state.joint_position,
-        state.joint_velocity,
-    )  # fmt: skip
+    settle(robot, many, state)
+    slip = slip_of(robot, many, state)
     yaw, _, _ = euler_angles(state.quaternion)
     legs, level = state.joint_position[:, LEG_SLICE], rotation(yaw, np.zeros_like(yaw), np.zeros_like(yaw))
     along = np.stack([np.cos(legs), np.zeros_like(legs), -np.sin(legs)], axis=-1) * many["leg.length"][:, :, None]

@@ -43,6 +43,7 @@ from wlr_gym.physics.plants.base import (
     PlantState,
     Sensors,
     Truth,
+    settle,
     standing_state,
 )
 from wlr_gym.physics.plants.forces import Force
@@ -223,7 +224,7 @@ def _anchor(
     state.joint_position[mine, LEG_SLICE] = _standing_legs(robot, own, anchors, window, legs, references)
     state.reference_position[mine, WHEEL_SLICE] += missing * reference_per_effort(robot, own)[:, WHEEL_SLICE]
     if np.isfinite(anchors.pose[window]).all():
-        _place(state, clock, window, mine, lanes)
+        _place(robot, state, clock, window, mine, lanes)
     kept = {name: readings[name][mine].copy() for name in ("joint_effort", "gyro", "accelerometer", "supply_voltage")}
     fresh = plant.reset(state=state, mask=mine)
     for name, values in kept.items():  # a reset has no torque and no acceleration yet
@@ -258,8 +259,8 @@ def _standing_legs(robot: Robot, parameters: Parameters, anchors: Anchors, row: 
     return np.where(stands, np.where(np.isfinite(held), held, reading), legs)
 
 
-def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters) -> None:
-    """Move robots to the measured pose: x, y and heading; height, pitch and roll stay."""
+def _place(robot: Robot, state: PlantState, clock: RunClock, window: int, mine: NDArray[np.bool_], lanes: Parameters) -> None:
+    """Move robots to the measured pose: x, y and heading; height, pitch and roll stay, but on relief are those of the place."""
     delay = lanes["camera.delay"][mine][:, None]
     x, y, heading = (clock.anchors.pose[window] + clock.anchors.pose_rate[window] * delay).T
     mount, scale = lanes["camera.mount_yaw"][mine], lanes["camera.scale"][mine]
@@ -269,6 +270,9 @@ def _place(state: PlantState, clock: RunClock, window: int, mine: NDArray[np.boo
     state.position[mine, 0] = cosine * x - sine * y - offset[:, 0]
     state.position[mine, 1] = sine * x + cosine * y - offset[:, 1]
     state.quaternion[mine] = quaternion(heading, pitch, roll)
+    placed = PlantState(**{name: value[mine] for name, value in vars(state).items() if value is not None})
+    settle(robot, Parameters(lanes.values[mine]), placed)
+    state.position[mine], state.quaternion[mine] = placed.position, placed.quaternion
 
 
 def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
@@ -295,6 +299,7 @@ def _start(clock: RunClock, robot: Robot, parameters: Parameters) -> PlantState:
     per_rate, own_rate = (reference_per_rate(robot, each)[:, WHEEL_SLICE] for each in (base, parameters))
     reference[...] = wheels + (reference - wheels - per_rate * rates) * own_effort / per_effort + own_rate * rates
     state.time = np.full(count, clock.begin - clock.t[0])
+    settle(robot, parameters, state)
     return PlantState(**{name: value[1:] for name, value in vars(state).items() if value is not None})
 
 

@@ -17,7 +17,7 @@ from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.files import replace_file, write_json
 from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, tidy
 from wlr_gym.data.run_states import rest_pose
-from wlr_gym.data.runs import Run, own_robot, robot_of, write_run
+from wlr_gym.data.runs import Run, floor_of, own_robot, robot_of, write_run
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.detection import detect
 from wlr_gym.perception.markers.pose import sheet_fault
@@ -34,6 +34,8 @@ from wlr_gym.perception.vision.self_calibration import (
 from wlr_gym.perception.vision.slip import SlipResult, measure_slip
 from wlr_gym.perception.vision.tracking import IMPOSSIBLE, LOST, MOVED, OK, PARTIAL, REPEATED, Sample, VideoFrame, track
 from wlr_gym.perception.vision.video import Frames
+from wlr_gym.physics.floor import lay_floor
+from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.sensors import rotation
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameter_table import CORNER_NAMES
@@ -140,10 +142,12 @@ def analyse(
         around: s, where ``offset`` is looked for, within 1 s.
 
     Raises:
-        InputError: wrong image size, no floor frame, too few poses, no motion to align on, video and run apart.
+        InputError: a floor with relief, wrong image size, no floor frame, too few poses, no motion to align on, video and run
+            apart.
     """
     check_name("origin", origin, ORIGINS)
     found = robot_of(run, robot)
+    _require_level(run, found)
     parameters = Parameters.nominal(found)
     for_tracking, for_watching = tee(frames)  # they are apart no longer than until the floor is located
     tracked: list[Sample] = []
@@ -176,6 +180,13 @@ def analyse(
     return VideoAnalysis(
         measured, samples, alignment, offset, slip, found, origin, height_error, missing, findings, calibration
     )
+
+
+def _require_level(run: Run, robot: Robot) -> None:
+    """Refuse a floor with relief: height, tilt and contacts of the robot are taken from its legs, as on a plane."""
+    found = floor_of(run)
+    if relief.families(lay_floor(found, Parameters.nominal(robot))):
+        raise InputError(f"{run.path}: its floor, '{found.name}', has relief: expected a flat one; slip in films needs a plane")
 
 
 def camera_columns(

@@ -102,7 +102,7 @@ TRUTH_LAYOUT = Layout(
         Channel("friction_torque", JOINTS, "N m", "gear friction on each joint, last substep"),
         Channel("rolling_torque", WHEELS, "N m", "rolling resistance on each wheel about its axle, last substep"),
         Channel(
-            "contact_force", _WHEEL_XYZ, "N", "on the wheel: along its heading, along its axle (left), normal; last substep"
+            "contact_force", _WHEEL_XYZ, "N", "on the wheel, in all: along its heading, along its axle, normal; last substep"
         ),
         Channel(
             "slip_velocity", _WHEEL_XY, "m/s", "of the contact point over the floor: along the wheel's heading, along its axle"

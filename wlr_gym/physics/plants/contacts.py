@@ -15,7 +15,7 @@ from wlr_gym.physics.codegen import ops
 from wlr_gym.physics.codegen.ops import Lanes, Out, Value, Vector
 from wlr_gym.physics.model.dynamics import rotation_matrix
 from wlr_gym.physics.plants import relief
-from wlr_gym.physics.plants.base import Contacts, Plant, Truth
+from wlr_gym.physics.plants.base import Contacts, Plant, PlantState, Truth
 from wlr_gym.robot import CORNER_SIGNS, Robot
 from wlr_gym.robot.parameters import Parameters
 
@@ -228,7 +228,7 @@ def contacts_of_plant(plant: Plant) -> ContactsOf | None:
     return getattr(plant, "contacts", None)
 
 
-def lanes_at(robot: Robot, parameters: Parameters, truth: Truth) -> dict[str, Array]:
+def lanes_at(robot: Robot, parameters: Parameters, truth: Truth | PlantState) -> dict[str, Array]:
     """Return the lanes of floor, geometry and pose of robots (N) in the poses of a truth."""
     lanes = relief.pack(parameters, robot) | {f"q{a}": truth.quaternion[:, k] for k, a in enumerate("wxyz")}
     lanes |= {f"p{a}": truth.position[:, k] for k, a in enumerate(AXES)}
@@ -249,20 +249,42 @@ def contacts_at(robot: Robot, parameters: Parameters, truth: Truth, force: Array
         truth: (N) where they are.
         force: (N, 8, 3) of the contacts, along their axes, N.
     """
-    count, features = len(parameters), frozenset(relief.families(parameters))
-    lanes = lanes_at(robot, parameters, truth)
-    turn = rotation_matrix(truth.quaternion)
-    rows = [[turn[:, k, m] for m in range(3)] for k in range(3)]
-    level = axes_on(rows[2])
+    lanes, turn, found = _contacts_now(robot, parameters, truth)
+    count = len(parameters)
     point, normal, heading, lateral = np.zeros((4, count, len(CONTACTS), 3))
     depth = np.full((count, len(CONTACTS)), -np.inf)
-    for i in CORNERS:
-        angle = truth.joint_position[:, i]
-        for contact in contacts_of(lanes, i, rows, level, (np.sin(angle), np.cos(angle)), features):
-            c = contact.number
-            depth[:, c] = -contact.gap(lanes)
-            for target, vector in zip((point, normal, heading, lateral), (contact.point, *contact.axes[:3]), strict=True):
-                in_body = np.stack([np.broadcast_to(value, count) for value in vector], axis=1)
-                target[:, c] = np.einsum("nij,nj->ni", turn, in_body)
-            point[:, c] += truth.position
+    for contact in found:
+        c = contact.number
+        depth[:, c] = -contact.gap(lanes)
+        for target, vector in zip((point, normal, heading, lateral), (contact.point, *contact.axes[:3]), strict=True):
+            in_body = np.stack([np.broadcast_to(value, count) for value in vector], axis=1)
+            target[:, c] = np.einsum("nij,nj->ni", turn, in_body)
+        point[:, c] += truth.position
     return Contacts(point, depth, normal, heading, lateral, np.where(np.isfinite(depth)[:, :, None], force, 0.0))
+
+
+def slip_on_relief(robot: Robot, parameters: Parameters, state: PlantState) -> Array:
+    """Return the slip velocities (N, 4, 2) of wheels where each is deepest in the floor, along heading and axle, m/s."""
+    rate, joint_rates = state.angular_velocity_in_body, state.joint_velocity
+    slip, twist = np.zeros((len(parameters), len(CORNERS), 2)), [*state.linear_velocity_in_body.T, *rate.T]
+    lanes, _, found = _contacts_now(robot, parameters, state)
+    for contact in found:
+        i = contact.wheel
+        if contact.number == i:
+            leg_rate = rate[:, 1] + joint_rates[:, i]
+            moving = {**lanes, f"leg_rate{i}": leg_rate, f"wheel_rate{i}": leg_rate + joint_rates[:, len(CORNERS) + i]}
+            slip[:, i] = np.stack(slip_velocity(moving, contact, twist, frozenset()), axis=1)
+    return slip
+
+
+def _contacts_now(
+    robot: Robot, parameters: Parameters, pose: Truth | PlantState
+) -> tuple[dict[str, Array], Array, list[Contact]]:
+    """Return the lanes of robots (N), their rotations (N, 3, 3) body -> floor, and every contact of theirs."""
+    features, lanes = frozenset(relief.families(parameters)), lanes_at(robot, parameters, pose)
+    turn, joints = rotation_matrix(pose.quaternion), pose.joint_position
+    rows = [[turn[:, k, m] for m in range(3)] for k in range(3)]
+    level, found = axes_on(rows[2]), []
+    for i in CORNERS:
+        found += contacts_of(lanes, i, rows, level, (np.sin(joints[:, i]), np.cos(joints[:, i])), features)
+    return lanes, turn, found

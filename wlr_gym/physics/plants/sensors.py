@@ -31,7 +31,7 @@ from wlr_gym.robot.parameters import Parameters
 
 # The sensor looks along body -z and measures how fast the floor turns about it, rad/s along its own x and y (nominally the
 # body's): flow_x = v_x/h - w_y, flow_y = v_y/h + w_x, with the velocity v of its lens over the floor, the body's angular
-# velocity w, and the distance h from the lens to the floor along its axis. The floor is the plane z = 0 of the floor frame,
+# velocity w, and the distance h from the lens to the floor along its axis. The floor is as high as under the body's origin,
 # on a slope too. Frames come at a rate of their own. A reading is what was counted between the last frame before the tick and
 # the last before the tick before, over the time between these two frames: drivers that poll faster than the frames know it
 # (wlr_gym.hardware.flow). Both are linear in the pose between two ticks.
@@ -41,8 +41,9 @@ from wlr_gym.robot.parameters import Parameters
 FLOW_ERRORS = ("flow.present", "flow.scale", "flow.mount_yaw", "flow.dropout", "flow.poor_floor")
 _PRESENT, _FLOW_SCALE, _FLOW_MOUNT_YAW, _DROPOUT, _POOR_FLOOR = range(len(FLOW_ERRORS))
 #: First columns of a robot's state, and all of them. Beyond ``_FLOW_PHASE``, cleared by a reset: tick, place and attitude when
-#: last looked; image shift since the last frame; shown flow and quality, and when its interval ended.
-_FLOW_PHASE, _SEEN, _PLACE, _CARRIED, _SHOWN, _QUALITY, _END, FLOW_WIDTH = accumulate((5, 1, 1, 7, 2, 2, 1, 1))
+#: last looked (the floor's height there comes last); image shift since the last frame; shown flow and quality, and when its
+#: interval ended.
+_FLOW_PHASE, _SEEN, _PLACE, _CARRIED, _SHOWN, _QUALITY, _END, FLOW_WIDTH = accumulate((5, 1, 1, 8, 2, 2, 1, 1))
 
 #: First entries of the settings, and all of them: place of the lens, one count, frame rate, noises, quality and limits.
 (
@@ -99,24 +100,25 @@ def _uniform(seed: Any, stream: Any, counter: Any, block: Any) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _place(height: float, quaternion: Any, pose: Any, settings: Any, out: Any) -> None:
-    """Write the lens's place in the floor frame, and the attitude, into ``out`` (7)."""
+def _place(height: float, floor: float, quaternion: Any, pose: Any, settings: Any, out: Any) -> None:
+    """Write the lens's place (x, y, and height over the floor), the attitude, and the floor's height into ``out`` (8)."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     a, b, c = settings[_LENS], settings[_LENS + 1], settings[_LENS + 2]
     out[0] = pose[0] + (1.0 - 2.0 * (y * y + z * z)) * a + 2.0 * (x * y - w * z) * b + 2.0 * (x * z + w * y) * c
     out[1] = pose[1] + 2.0 * (x * y + w * z) * a + (1.0 - 2.0 * (x * x + z * z)) * b + 2.0 * (y * z - w * x) * c
     out[2] = height + 2.0 * (x * z - w * y) * a + 2.0 * (y * z + w * x) * b + (1.0 - 2.0 * (x * x + y * y)) * c
     out[3], out[4], out[5], out[6] = w, x, y, z
+    out[7] = floor
 
 
 @njit(cache=True, nogil=True)
 def _shift(before: Any, after: Any) -> Any:
-    """Image shift (x, y; rad) between two places of the lens (7), and the distance to the floor along its axis (m).
+    """Image shift (x, y; rad) between two places of the lens (8), and the distance to the floor along its axis (m).
 
     Displacement along the mean axes over the mean distance, and the turn of one attitude against the other: exact to second
     order in the turn. A distance of 0 says that the sensor does not look at the floor.
     """
-    d = (after[0] - before[0], after[1] - before[1], after[2] - before[2])
+    d = (after[0] - before[0], after[1] - before[1], (after[2] + after[7]) - (before[2] + before[7]))
     along, across, distance = 0.0, 0.0, 0.0
     for place in (before, after):
         w, x, y, z = place[3], place[4], place[5], place[6]
@@ -148,7 +150,7 @@ def _texture(seed: Any, x: float, y: float, poor_floor: float) -> float:
 
 @njit(cache=True, nogil=True)
 def measure_flow(
-    seed: Any, tick: int, period: float, height: float, turn: Any, pose: Any, settings: Any, state: Any, out: Any
+    seed: Any, tick: int, period: float, height: float, floor: float, turn: Any, pose: Any, settings: Any, state: Any, out: Any
 ) -> None:
     """Look at the floor at a tick; write flow (x, y), quality, age and whether it is new into ``out`` (5).
 
@@ -156,7 +158,7 @@ def measure_flow(
         seed: of the robot's noise.
         tick: 0 at the reset.
         period: of control (s).
-        height: of the body origin over the floor (m).
+        height: of the body origin over the floor (m). floor: height of that (m).
         turn: (4) quaternion, body to floor frame.
         pose: (x, y, yaw) of the body origin in the floor frame.
         settings: see :func:`flow_settings`.
@@ -166,12 +168,12 @@ def measure_flow(
     now = tick * period
     is_new = 0.0
     if state[_PRESENT] > 0.5:
-        place = np.empty(7)
-        _place(height, turn, pose, settings, place)
+        place = np.empty(8)
+        _place(height, floor, turn, pose, settings, place)
         if tick > 0 and state[_SEEN] == tick - 1:
             is_new = _read(seed, tick, period, place, settings, state)
         state[_SEEN] = tick
-        for k in range(7):
+        for k in range(8):
             state[_PLACE + k] = place[k]
     out[0], out[1], out[2] = state[_SHOWN], state[_SHOWN + 1], state[_QUALITY]
     out[3] = now - state[_END]
@@ -181,7 +183,7 @@ def measure_flow(
 @njit(cache=True, nogil=True)
 def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state: Any) -> float:
     """Count the shift since the last tick; read what the frames up to now give. Returns 1 when that is a new valid reading."""
-    shift_x, shift_y, distance = _shift(state[_PLACE : _PLACE + 7], place)
+    shift_x, shift_y, distance = _shift(state[_PLACE:_CARRIED], place)
     rate, phase = settings[_RATE], state[_FLOW_PHASE]
     frame = math.floor(tick * period * rate - phase)
     frames = frame - math.floor((tick - 1) * period * rate - phase)
@@ -237,6 +239,7 @@ RAW_LAYOUT = Layout(
         Channel("accelerometer", XYZ, "m/s2", "low-passed specific force at the body origin, body frame"),
         Channel("supply_voltage", (), "V", "at the servos"),
         Channel("height", (), "m", "body origin over the floor at the tick's end"),
+        Channel("floor", (), "m", "height of the floor under the body origin, in the floor frame"),
         Channel("quaternion", ("w", "x", "y", "z"), "-", "body to floor frame at the tick's end"),
         Channel("pose", ("x", "y", "yaw"), "m, m, rad", "body origin in the floor frame at the tick's end; yaw may wrap"),
     )
@@ -258,10 +261,11 @@ _CALIBRATION = (
 ) = accumulate((0, *[1] * 6, len(JOINTS), *[1] * 5, len(JOINTS)))  # fmt: skip
 
 # First columns of the signals, as plain numbers for the kernel.
-_RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_HEIGHT, _RAW_TURN, _RAW_POSE = (
-    RAW_LAYOUT.slices[name].start
-    for name in ("joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "height", "quaternion", "pose")
-)
+_RAW_VELOCITY, _RAW_EFFORT, _RAW_GYRO, _RAW_ACCEL, _RAW_VOLT, _RAW_HEIGHT, _RAW_FLOOR, _RAW_TURN, _RAW_POSE = (
+    RAW_LAYOUT.slices[name].start for name in (
+        "joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "height", "floor", "quaternion", "pose",
+    )
+)  # fmt: skip
 _OUT_VELOCITY, _OUT_EFFORT, _OUT_GYRO, _OUT_ACCEL, _OUT_VOLT, _OUT_CAMERA, _OUT_AGE, _OUT_FLOW = (
     SENSOR_LAYOUT.slices[name].start for name in (
         "joint_velocity", "joint_effort", "gyro", "accelerometer", "supply_voltage", "camera_pose", "joint_age", "flow",
@@ -390,6 +394,7 @@ def measure_rows(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, o
             ticks[i],
             settings[_PERIOD],
             row[_RAW_HEIGHT],
+            row[_RAW_FLOOR],
             row[_RAW_TURN : _RAW_TURN + 4],
             row[_RAW_POSE : _RAW_POSE + 3],
             settings[_FLOW_SETTINGS:],

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore, Snapshot, check_fit, read_rows, take_snapshot, write_snapshot
+from wlr_gym.physics.plants import relief
 from wlr_gym.physics.plants.base import (
     SENSOR_LAYOUT,
     TRUTH_LAYOUT,
@@ -26,9 +27,9 @@ from wlr_gym.physics.plants.base import (
     standing_state,
 )
 from wlr_gym.physics.plants.body import spots_at
-from wlr_gym.physics.plants.contacts import contacts_at
+from wlr_gym.physics.plants.contacts import CONTACTS, contacts_at
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel, check_flow
-from wlr_gym.robot import LEG_SLICE, Robot
+from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
 from wlr_gym.robot.parameter_table import SPECS
 from wlr_gym.robot.parameters import Parameters
 
@@ -126,8 +127,26 @@ class Simulator(ABC):
         self._time[rows] = 0.0 if start.time is None else start.time[rows]
         self._setpoints.reset(rows, start, self.parameters)
         self._look(rows)
+        if state is not None:
+            self._check_depth(rows)
         self._sensors.reset(self._raw, self._readings.values, seeds, mask=mask)
         return self._readings
+
+    def _check_depth(self, rows: Rows) -> None:
+        """Refuse robots that start with an axle below the surface of a floor with relief: nothing says which way is out."""
+        chosen = Parameters(self.parameters.values[rows])
+        if not relief.families(chosen):
+            return
+        found = contacts_at(self.robot, chosen, Truth(self._truth.values[rows]), np.zeros((len(rows), len(CONTACTS), 3)))
+        excess = found.depth - np.tile(chosen["wheel.radius"], 2)
+        robot, contact = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        if excess[robot, contact] > 0.0:
+            wheel = int(contact) % len(WHEELS)
+            deep, radius = found.depth[robot, contact], chosen["wheel.radius"][robot, wheel]
+            raise InputError(
+                f"state: {WHEELS[wheel]} of robot {rows[robot]} is {deep:.3g} m deep in the floor: expected less than its "
+                f"radius, {radius:.3g} m; settle() puts standing robots on their floor"
+            )
 
     def set_parameters(self, parameters: Parameters, mask: NDArray[np.bool_] | None = None) -> None:
         """Change parameters in mid-run (interval randomisation, drifting friction); the state stays."""

@@ -31,6 +31,7 @@ from wlr_gym.physics.plants import body, drive, ground, relief
 from wlr_gym.physics.plants.contacts import (
     AXES,
     CORNERS,
+    Contact,
     axes_on,
     contact_numbers,
     contact_place,
@@ -201,8 +202,11 @@ def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -
         for a in "xy":
             out[f"contact_force_{i}_{a}"] = lanes[f"friction_{a}{i}"] * (1.0 / step)
         out[f"contact_force_{i}_z"] = lanes[f"normal{i}"]
-    for i in CORNERS:  # where there are two contacts: at the deeper one
-        contact = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)[0]
+    for i in CORNERS:  # where there are two contacts: the forces of both, along the axes of the deeper one, and its slip
+        contact, *others = contacts_of(lanes, i, rows, level, ops.sin_cos(lanes[f"leg_angle{i}"]), features)
+        for other in others:
+            for a, share in zip(AXES, _turned(_force_at(lanes, other, step), other, contact), strict=True):
+                out[f"contact_force_{i}_{a}"] = out[f"contact_force_{i}_{a}"] + share
         slip = slip_velocity(lanes, contact, [*v, *w], features)
         out[f"slip_velocity_{i}_x"], out[f"slip_velocity_{i}_y"] = slip
         place = contact_place(lanes, rows, contact)
@@ -222,12 +226,26 @@ def observe(lanes: Lanes, step: Value, features: frozenset[str] = frozenset()) -
     out |= {f"raw_gyro_{a}": lanes[f"gyro_{a}"] for a in AXES}
     out |= {f"raw_acceleration_{a}": lanes[f"acceleration_{a}"] for a in AXES}
     out["raw_supply"] = drive.supply_voltage(lanes, features)
-    height = lanes["pz"]
+    height, floor = lanes["pz"], 0.0
     if "relief" in features:
-        height = height - relief.floor_height(lanes, lanes["px"], lanes["py"], features)
-    out |= {"raw_height": height} | {f"raw_quaternion_{a}": lanes[f"q{a}"] for a in "wxyz"}
+        floor = relief.floor_height(lanes, lanes["px"], lanes["py"], features)
+        height = height - floor
+    out |= {"raw_height": height, "raw_floor": floor} | {f"raw_quaternion_{a}": lanes[f"q{a}"] for a in "wxyz"}
     out |= {"raw_x": lanes["px"], "raw_y": lanes["py"], "heading_cosine": rows[0][0], "heading_sine": rows[1][0]}
     return out
+
+
+def _force_at(lanes: Lanes, contact: Contact, step: Value) -> Vector:
+    """Force of the last step at a contact, along its heading, its lateral axis and its normal, N."""
+    along = [lanes[f"friction_{a}{contact.number}"] * (1.0 / step) for a in "xy"]
+    return [*along, lanes[f"normal{contact.number}"]]
+
+
+def _turned(force: Vector, own: Contact, other: Contact) -> Vector:
+    """Return a force along one contact's heading, lateral axis and normal along those of another."""
+    (n, heading, lateral, _), (up, ahead, aside, _) = own.axes, other.axes
+    in_body = [force[0] * heading[k] + force[1] * lateral[k] + force[2] * n[k] for k in range(3)]
+    return [dot(in_body, axis) for axis in (ahead, aside, up)]
 
 
 def _clearance(lanes: Lanes, rows: list[Vector], features: frozenset[str]) -> Value:

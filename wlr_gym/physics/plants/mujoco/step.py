@@ -416,8 +416,8 @@ def _add_slip(lanes: Lanes, step: Value, features: frozenset[str], out: Out) -> 
 def observe(lanes: Lanes, features: frozenset[str] = FEATURES) -> Out:
     """Columns of the truth matrix, then the raw sensor channels: the engine's observation of the same state."""
     lanes = with_engine_rates(lanes)
-    renamed: Out = {f"friction_{a}{i}": lanes[f"force_{a}{i}"] for i in CORNERS for a in "xy"}
-    renamed |= {f"normal{i}": lanes[f"force_z{i}"] for i in CORNERS}
+    renamed: Out = {f"friction_{a}{c}": lanes[f"force_{a}{c}"] for c in CONTACTS for a in "xy"}
+    renamed |= {f"normal{c}": lanes[f"force_z{c}"] for c in CONTACTS}
     renamed |= {f"gear_friction{j}": lanes[f"gear_torque{j}"] for j in range(8)}
     renamed |= {f"rolling_friction{i}": lanes[f"rolling_torque{i}"] for i in CORNERS}
     out = engine.observe(over(renamed, lanes), 1.0, features)  # impulses over a step of 1 are forces
