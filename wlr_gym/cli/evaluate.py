@@ -64,8 +64,8 @@ class EvaluateOptions(ProgressOption, JsonOption, ForceOption, PatchOption, Floo
     env: str | None = None
     """Environment id (see: wlr envs); default: the one the policy was trained in, else WLR-Velocity-v0."""
     baselines: tuple[str, ...] | None = None
-    """What to compare with, on the same episodes; as the policy. Default: do_nothing, pid and a trained policy's controller, with
-    --full every agent without learning and the environment's shipped policies."""
+    """What to compare with, on the same episodes; as the policy. Default: do_nothing, pid and a trained policy's controller;
+    with --full every agent without learning and the environment's shipped policies."""
     full: bool = False
     """The whole card: 5 blocks of 256 episodes, every sweep, both simulators. Minutes per policy; options below still count."""
     episodes: Count | None = None
