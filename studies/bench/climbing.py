@@ -26,7 +26,7 @@ LEGS = {"lf": [0], "rf": [1], "lr": [2], "rr": [3], "front": [0, 1], "rear": [2,
 #: Where the kerb's face is, m.
 KERB = 0.35
 #: How far ahead of its hip a wheel stands in the first of two poses, and behind it in the second (m).
-REACH = 0.115
+REACH = 0.11
 #: How fast legs turn from the first to the second (rad/s).
 LEG_SPEED = 1.5
 
@@ -199,10 +199,16 @@ def climb_straight(
 
 
 def climb_by_two_poses(
-    backend: str, robot: Robot, height: ArrayLike, friction: ArrayLike, edit: Edit = nothing, seconds: float = 12.0
+    backend: str,
+    robot: Robot,
+    height: ArrayLike,
+    friction: ArrayLike,
+    edit: Edit = nothing,
+    seconds: float = 12.0,
+    reach: float = REACH,
 ) -> Flags:
-    """Return which kerbs (N,) robots climb at 0.1 m/s with their wheels :data:`REACH` ahead of the hips, then behind them."""
-    ahead = float(np.degrees(np.arccos(REACH / robot.leg.length)))
+    """Return which kerbs (N,) robots climb at 0.1 m/s with their wheels ``reach`` (m) ahead of the hips, then behind them."""
+    ahead = float(np.degrees(np.arccos(reach / robot.leg.length)))
     climber = Climber(backend, robot, height, friction, legs=ahead, gap=0.03, edit=edit)
     return climber.drive_over(0.1 / robot.wheel.radius, seconds, then=180.0 - ahead)
 
