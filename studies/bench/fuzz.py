@@ -130,7 +130,7 @@ class FuzzOptions(JsonOption):
 
 def run(options: FuzzOptions) -> int:
     """Throw robots on to floors in random states; say how many were lost to numbers that are not finite."""
-    kept = Progress(options)
+    kept = FuzzFile(options)
     for floor in options.floors:
         fuzzed = fuzz(
             floor, options.substeps, options.seed, precision=options.precision, threads=options.threads,
@@ -145,7 +145,7 @@ def run(options: FuzzOptions) -> int:
     return OK if not any(one.lost for one in kept.found.values()) else 1
 
 
-class Progress:
+class FuzzFile:
     """What was found so far on every floor, kept in a file every :data:`KEPT_EVERY` batches where the options name one.
 
     Attributes:

@@ -16,7 +16,10 @@ HARDWARE = find_config("hardware", "nominal").read_text(encoding="utf-8")
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("folder", "folder: is a folder; expected a .yaml file, or a name in configs/robot/: emanual, flow, nominal, paper"),
+        (
+            "folder",
+            "folder: is a folder; expected a .yaml file, or a name in configs/robot/: emanual, flow, kit, nominal, paper",
+        ),
         ("folder.yaml", "folder.yaml: is a folder; expected a .yaml file"),
         ("run_01.parquet", "run_01.parquet: expected a .yaml file, or a name in configs/robot/"),
         ("/dev/null", "/dev/null: expected a .yaml file"),

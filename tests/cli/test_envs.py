@@ -71,7 +71,7 @@ def test_description_has_meanings_and_units(capsys, monkeypatch):
         "below_friction_limit uniform 0.0262..0.21 rad",
         "add normal +- sensors.imu.gyro_bias rad/s, cut at 3",
         "leg_angle +-0.05 rad",
-        "contact_force             on the wheel: along its heading",
+        "contact_force             on the wheel, in all: along its heading",
         "env.unwrapped.contract()",
     ):
         assert text in shown

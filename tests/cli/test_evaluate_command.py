@@ -59,6 +59,12 @@ def test_full_means_blocks_sweeps_and_both_simulators(tmp_path, monkeypatch, cap
     assert "on both simulators" in capsys.readouterr().out
 
 
+def test_a_named_policy_meets_the_controller_that_could_replace_it():
+    pytest.importorskip("onnxruntime")
+    options = evaluate._complete(evaluate.EvaluateOptions(("mine=velocity_blind",)))
+    assert options.baselines == ("do_nothing", "pid", "slip_compensating_no_camera")
+
+
 def test_what_is_left_open_is_decided_by_full():
     quick, full = (evaluate._complete(evaluate.EvaluateOptions(("pid",), full=full)) for full in (False, True))
     assert quick.baselines == ("do_nothing", "pid")

@@ -194,7 +194,7 @@ def test_export_writes_the_pieces(step, tmp_path, capsys):
     assert main(["robot", "export", "nominal", "--floor", "ramps", "--out", str(tmp_path / "ramps.xml"), "--json"]) == 0
     assert "edge radii of pieces" in json.loads(capsys.readouterr().out)["not_held"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "ramps.xml"))
-    assert model.npair == 12
+    assert model.npair == 3 * 9  # the floor and two ramps, each with four wheels, four legs and the body
     assert model.mesh_vertnum.tolist() == [8, 8]
     assert main(["robot", "export", "nominal", "--floor", str(step), "--out", str(tmp_path / "step.xml")]) == 0
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "step.xml"))

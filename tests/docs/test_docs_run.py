@@ -17,6 +17,7 @@ from wlr_gym.data import read_dataset
 
 #: Page -> number of its blocks that nothing runs; each says why. All others are run.
 NOT_RUN = {
+    "docs/build.md": 2,  # a board
     "docs/camera.md": 1,  # a camera
     "docs/evaluation.md": 1,  # runs of one training with several seeds
     "docs/gap.md": 4,  # minutes each; the quickstart has one
@@ -24,7 +25,8 @@ NOT_RUN = {
     "docs/gap_benchmark.md": 1,  # hours
     "docs/paper.md": 1,  # minutes
     "docs/pictures.md": 1,  # a window
-    "docs/own_robot.md": 4,  # examples/own_robot.py goes the same way
+    "docs/own_robot.md": 5,  # examples/own_robot.py goes the same way
+    "docs/first_day.md": 2,  # a robot
     "docs/own_logs.md": 1,  # logs of somebody else's
     "docs/policy_file.md": 1,  # an archive of somebody else's
     "docs/own_rig.md": 2,  # examples/linear_axis.py goes the same way

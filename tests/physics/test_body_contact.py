@@ -292,7 +292,7 @@ def test_bits_depend_on_no_neighbour_thread_or_place_in_the_batch(backend, preci
         parameters["piece.x"] = 0.3
         parameters = Parameters(parameters.values[rows])
         state = standing_state(ROBOT, parameters)
-        state.position[:, 2] += rng.uniform(-0.1, 0.1, count)[rows]
+        state.position[:, 2] += rng.uniform(-0.03, 0.1, count)[rows]
         state.joint_position[:, :4] = state.reference_position[:, :4] = rng.uniform(-0.5, 2.0, (count, 4))[rows]
         plant: Any = plants.make_plant(backend, ROBOT, len(rows), PlantOptions(precision=precision, threads=threads))
         plant.reset(rows.astype(np.uint64), parameters, state=state)

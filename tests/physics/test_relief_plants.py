@@ -64,8 +64,8 @@ def test_mujoco_climbs_twice_its_wheel_radius_with_one_wheel_at_a_time():
     assert climb_one_by_one("mujoco", ROBOT, 0.07, 0.3)[0].all()
 
 
-#: Height and friction of a kerb, and how far ahead and behind the wheels stand: further than that, rear legs touch its edge; less
-#: far, friction does not lift the rear wheels.
+#: Height and friction of a kerb, and how far ahead and behind the wheels stand: with more, rear legs touch its edge; with less,
+#: friction does not lift the rear wheels.
 TWO_POSES = ((0.055, 0.6, 0.11), (0.08, 0.9, 0.08))
 
 

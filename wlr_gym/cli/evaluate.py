@@ -64,7 +64,7 @@ class EvaluateOptions(ProgressOption, JsonOption, ForceOption, PatchOption, Floo
     env: str | None = None
     """Environment id (see: wlr envs); default: the one the policy was trained in, else WLR-Velocity-v0."""
     baselines: tuple[str, ...] | None = None
-    """What to compare with, on the same episodes; as the policy. Default: do_nothing, pid and a trained policy's controller;
+    """What to compare with, on the same episodes; as the policy. Default: do_nothing, pid, slip_compensating if trained;
     with --full every agent without learning and the environment's shipped policies."""
     full: bool = False
     """The whole card: 5 blocks of 256 episodes, every sweep, both simulators. Minutes per policy; options below still count."""
@@ -216,7 +216,7 @@ def _complete(options: EvaluateOptions) -> EvaluateOptions:
     }
     if options.baselines is None:
         names = FULL_BASELINES if full else BASELINES
-        fitting = scoring.default_baselines(options.policy[0], environment, names)
+        fitting = scoring.default_baselines(read_subjects([options.policy])[0].sources[0], environment, names)
         if not set(names) <= set(fitting):
             print(f"no baseline here, made for other tasks: {', '.join(name for name in names if name not in fitting)}")
         shipped = shipped_names() if full else ()  # reading them needs onnxruntime

@@ -312,7 +312,7 @@ class Pid:
         return self.turn(observations) + steer + self.config.uphill * self.leftward_force(observations)
 
     def pace(self) -> Array | float:
-        """Return how many times faster than within ``lean_time`` the legs (N, 4) reach under the body."""
+        """Return how many times as fast as ``lean_time`` says the legs (N, 4) reach under the body."""
         return 1.0
 
     def legs(self, observations: NDArray[np.floating]) -> tuple[Array, Array]:
@@ -362,16 +362,17 @@ class SlipGains(PidGains):
         load_shift_time: time constant of that difference, s.
         largest_shift: of the share.
         warp: largest angle by which the legs of one side lean one way and those of the other side the other, rad; 0 = never.
+            Not where legs sweep.
         warp_rise: of the warp's level (0 to 1) per s and rad/s of yaw rate error beyond ``warp_threshold`` (rad/s).
         warp_forget: s in which the level falls to 1/e.
-        warp_reach: how many times faster, more, the unloaded legs reach under the body at the whole level.
+        warp_reach: at the whole level the legs that the warp unloads reach under the body 1 + so many times as fast.
     """
 
     slip_limit: float = Field(1.0, gt=0)
     load_shift: float = Field(0.0, ge=0)
     load_shift_time: float = Field(0.5, gt=0)
     largest_shift: float = Field(0.14, ge=0, lt=0.3)
-    warp: float = Field(0.0, ge=-0.2, le=0.2)
+    warp: float = Field(0.0, ge=0, le=0.2)
     warp_rise: float = Field(60.0, ge=0)
     warp_threshold: float = Field(0.015, ge=0)
     warp_forget: float = Field(5.0, gt=0)
@@ -404,6 +405,8 @@ class SlipCompensating(Pid):
         self.settings = config
         self.velocity = self.readings.first((ESTIMATED_FORWARD,))
         self._slip = [self.readings.first((f"estimated_slip_velocity[{wheel},x]",)) for wheel in WHEELS]
+        if self._sweeping and config.warp:
+            raise InputError(f"agent 'slip_compensating': warp = {config.warp:g}: expected 0 where legs sweep")
         self._warp = Warp(config, contract["control_period"])
         self._share = min(1.0, contract["control_period"] / config.load_shift_time)
         self._difference: Array = np.zeros(0)
@@ -418,8 +421,8 @@ class SlipCompensating(Pid):
         return np.clip(wanted, travel - allowed[:, None], travel + allowed[:, None])
 
     def pace(self) -> Array:
-        """Return how many times faster than within ``lean_time`` the legs (N, 4) reach under the body: while warped, those
-        that the warp unloads hurry."""
+        """Return how many times as fast as ``lean_time`` says the legs (N, 4) reach under the body: those that the warp unloads
+        go faster."""
         unloaded = self.chassis.front * self.chassis.left < 0
         return 1.0 + self.settings.warp_reach * self._warp.level[:, None] * unloaded
 

@@ -414,6 +414,14 @@ def test_controller_needs_gains():
         load_task("velocity", None, {"controller": {"yaw_rate_pp": 1.0}})
 
 
+def test_memory_that_a_gain_needs():
+    terms = {"velocity_controller": {}}
+    with pytest.raises(InputError, match=r"controller.turn_lead is not 0: 'velocity_controller' needs .*'velocity_memory'"):
+        load_task("velocity", None, {"controller": {"turn_lead": 0.1}, "observations": terms})
+    with pytest.raises(InputError, match=r"controller.warp is not 0: 'posture_controller' cannot do it: its legs sweep"):
+        load_task("posture", None, {"controller": {"warp": 0.1}, "observations": {"posture_controller": {}}})
+
+
 def test_controller_of_another_task_is_refused():
     with pytest.raises(InputError, match=r"'path_controller' needs the command 'path_"):
         load_task("velocity", None, {"controller": {}, "observations": {"path_controller": {}}})

@@ -107,6 +107,13 @@ CHANGES = [
 ]
 
 
+def test_a_tread_keeps_what_the_robot_file_says_of_it():
+    soft = load_robot({"base": "nominal", "name": "soft", "ground": {"slip_compliance": 0.1, "relaxation_length": 0.015}})
+    patch = load_patch([{"name": "tyre_brush", "where": ["wheel_lf"], "parameters": {"slip_compliance": 0.1}}])
+    nominal = Parameters.nominal(soft, 2)
+    np.testing.assert_array_equal(apply_patch(patch, nominal).values, nominal.values)
+
+
 @pytest.mark.parametrize(("effect", "expected"), CHANGES)
 def test_each_effect_changes_exactly_its_parameters(effect, expected):
     name, where, parameters = effect

@@ -158,7 +158,7 @@ def constants(task: Task) -> Mapping[str, float]:
 
 def number(task: Task, name: str) -> float:
     """Return the run-time number ``name`` (``reward.slip.weight``, ``robot.leg.length``); what no term keeps is 0."""
-    if name.startswith("remembered."):
+    if name.startswith("remembered.") and "_memory[" in name:
         return 0.0
     if not name.startswith("robot."):
         return constants(task)[name]

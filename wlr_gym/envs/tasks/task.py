@@ -296,7 +296,8 @@ def _check_commands(config: TaskConfig, where: str) -> None:
         needed = f"{name.removesuffix(CONTROLLER)}_memory"
         for gain in ("warp", "forward_lead", "turn_lead"):
             if name.endswith(CONTROLLER) and getattr(config.controller, gain, 0.0) and needed not in used:
-                raise InputError(f"{where}: controller.{gain} is not 0: {name} then needs the observation term '{needed}'")
+                how = f"needs the observation term '{needed}'" if needed in COMPUTED else "cannot do it: its legs sweep"
+                raise InputError(f"{where}: controller.{gain} is not 0: '{name}' {how}")
     functions |= {f"observation term '{name}'": COMPUTED[name].function for name in used}
     for term, function in functions.items():
         if config.controller is None and any(name.startswith("controller.") for name in signals_of(function)):

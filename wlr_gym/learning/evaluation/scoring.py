@@ -153,7 +153,8 @@ def fitting_baselines(environment: str, names: Sequence[str] = BASELINES) -> tup
 
 
 def default_baselines(policy: Source, environment: str, names: Sequence[str] = BASELINES) -> tuple[str, ...]:
-    """Return what a policy is compared with where nothing is chosen: agents that fit, and the controller of a trained one."""
+    """Return what a policy is compared with where nothing is chosen: agents that fit, beside a trained one also the controller
+    of :func:`controller_of`."""
     own = () if trained_environment(policy) is None else fitting_baselines(environment, (controller_of(policy),))
     return tuple(dict.fromkeys((*fitting_baselines(environment, names), *own)))
 
@@ -303,7 +304,7 @@ def references_of(policy: Source, environment: str) -> tuple[str, ...]:
 
 
 def controller_of(policy: Source) -> str:
-    """Return the hand-written controller that a trained policy acts on or could be replaced by."""
+    """Return the shipped controller, with a camera or without, that could replace a trained policy; its gains are its own."""
     observer = policy_environment(policy).get("task", {}).get("observer") or {}
     return "slip_compensating" if observer.get("camera", True) else "slip_compensating_no_camera"
 
@@ -314,11 +315,13 @@ def fingerprint(
     """Return the SHA-256 of what is played: the policies' content, the task, the robot, the randomisations and their floor."""
     config = read_task(task_source_of(environment))
     own = load_robot(config.robot if robot is None else robot)
+    # of treads that are rigid nothing is said, as before robot files stated them
+    rigid = {"slip_compliance", "relaxation_length", "tread_damping"} - own.ground.model_dump(exclude_defaults=True).keys()
     played = {
         "policies": [identity(subject, config.name) for subject in read_subjects(list(policies))],
         "task": config.model_dump(mode="json", exclude={"floor"}),
         "floors": [load_randomization(family, own).config.model_dump(mode="json") for family in floors],
-        "robot": own.model_dump(mode="json"),
+        "robot": own.model_dump(mode="json", exclude={"ground": rigid}),
     }
     floor = load_floor(config.floor if relief is None else relief)
     if not floor.is_flat:  # of a plane nothing is said, as before there were other floors

@@ -32,7 +32,7 @@ class EffectParameter:
         neutral: the value that changes nothing, or the name of the parameter whose nominal value changes nothing.
         prior: range a real robot may plausibly have: what a search for missing effects covers and randomisation may draw.
         severity: a clear, realistic case, for tests and demonstrations.
-        optional: may be left out, and is then neutral.
+        optional: may be left out, and is then neutral: the number, or whatever the robot has.
         is_size: whether it says how large the effect is, not where it acts or over what it fades.
     """
 
@@ -45,6 +45,11 @@ class EffectParameter:
     severity: float
     optional: bool = False
     is_size: bool = True
+
+    @property
+    def has_default(self) -> bool:
+        """Whether it may be left out and then has a number."""
+        return self.optional and not isinstance(self.neutral, str)
 
     def neutral_in(self, parameters: Parameters) -> float:
         """Return the value that changes nothing about a model with these parameters."""
@@ -101,6 +106,12 @@ def multiply(target: str, parameter: str) -> Apply:
 def put(target: str, parameter: str) -> Apply:
     """Set ``target`` of the named joints or wheels to the effect's parameter."""
     return _on_each(target, parameter, lambda before, value: value)
+
+
+def put_given(target: str, parameter: str) -> Apply:
+    """The same, where the effect says something of the parameter."""
+    whole = put(target, parameter)
+    return lambda parameters, where, values: whole(parameters, where, values) if parameter in values else None
 
 
 def _on_each(target: str, parameter: str, change: Callable[[Array, float], Any]) -> Apply:

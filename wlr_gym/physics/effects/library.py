@@ -34,6 +34,7 @@ from wlr_gym.physics.effects.effect import (
     multiply,
     one_step,
     put,
+    put_given,
     steps,
     together,
     xyz,
@@ -424,10 +425,18 @@ GROUND_EFFECTS: tuple[Effect, ...] = (
                 "-", "slip per friction over load", 0, 5, "ground.slip_compliance", (0, 0.3), 0.06
             ),
             "relaxation_length": EffectParameter(
-                "m", "way over which it builds up", 5e-4, 0.1, 0.005, (0.002, 0.02), 0.005, optional=True, is_size=False
+                "m",
+                "way over which it builds up",
+                5e-4,
+                0.1,
+                "ground.relaxation_length",
+                (0.002, 0.02),
+                0.005,
+                optional=True,
+                is_size=False,
             ),
         },
-        together(put("ground.slip_compliance", "slip_compliance"), put("ground.relaxation_length", "relaxation_length")),
+        together(put("ground.slip_compliance", "slip_compliance"), put_given("ground.relaxation_length", "relaxation_length")),
         "level",
         search=Search(
             CONTACT,

@@ -202,7 +202,7 @@ def apply_patch(patch: Patch, parameters: Parameters) -> Parameters:
     kinds = _library() if named else {}
     for effect in sorted(named, key=lambda effect: kinds[effect.name].order):
         kind = kinds[effect.name]
-        neutral = {name: float(spec.neutral) for name, spec in kind.parameters.items() if spec.optional}
+        neutral = {name: float(spec.neutral) for name, spec in kind.parameters.items() if spec.has_default}
         try:
             kind.apply(patched, effect.where, {**neutral, **effect.parameters})
             patched.validate()
@@ -275,11 +275,13 @@ def _parse_parameters(entry: Mapping[str, Any], effect: EffectKind, place: str) 
     if not isinstance(given, Mapping):
         raise InputError(f"{place}: 'parameters' must be a mapping of {', '.join(effect.parameters)}, got {given!r}")
     _require_keys(given, effect.parameters, place)
-    return {name: _number(given.get(name), name, spec, place) for name, spec in effect.parameters.items()}
+    left = {name for name, spec in effect.parameters.items() if spec.optional and not spec.has_default} - set(given)
+    read = {name: spec for name, spec in effect.parameters.items() if name not in left}
+    return {name: _number(given.get(name), name, spec, place) for name, spec in read.items()}
 
 
 def _number(value: Any, name: str, spec: EffectParameter, place: str) -> float:
-    if value is None and spec.optional:
+    if value is None and spec.has_default:
         return float(spec.neutral)
     if value is None:
         raise InputError(f"{place}: parameter '{name}' ({unit_in_words(spec.unit)}) is missing")

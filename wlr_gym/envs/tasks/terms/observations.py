@@ -452,7 +452,7 @@ class WantedMotion:
     Attributes:
         forward: velocity, m/s. turn: yaw rate, rad/s.
         legs: angle from home (rad) and rate (rad/s) of each leg. sweeping: integrate their errors.
-        commanded_turn: what of the yaw rate is a command.
+        commanded_turn: yaw rate without what leads back to a path, rad/s.
     """
 
     forward: Value
@@ -622,7 +622,7 @@ def _reach_under(signals: Signals, action: str, leg: int, shifted: Value, level:
 
     Args:
         action: name of the leg's action in what the controller remembers: it says where the leg was sent.
-        leg: index. shifted: what of that was load shift and warp, rad. level: of the warp, whose unloaded legs hurry.
+        leg: index. shifted: what of that was load shift and warp, rad. level: of the warp; the legs it unloads go faster.
     """
     gain, period = signals.gain, signals.control_period
     wanted, within = gain("legs_inward") * CORNER_SIGNS[leg][0], gain("lean_time")

@@ -365,7 +365,10 @@ def _write_full_digits(root: ElementTree.Element, model: Any) -> None:
                 _write_joint(joint, model)
     for index, element in enumerate(root.iter("numeric")):
         _write(element, data=model.numeric_data[model.numeric_adr[index] :][:1])
-    for index, element in enumerate(root.iter("pair")):
+    names = [(model.geom(int(a)).name, model.geom(int(b)).name) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)]
+    pairs = {frozenset(both): index for index, both in enumerate(names)}  # MuJoCo sorts them
+    for element in root.iter("pair"):
+        index = pairs[frozenset((element.get("geom1"), element.get("geom2")))]
         element.set("solref", "")  # set after compiling, so that it is not in the text
         _write(element, friction=model.pair_friction[index], solref=model.pair_solref[index])
     for element in root.iter("general"):  # as MuJoCo writes every actuator; with its defaults it is a motor
@@ -586,11 +589,13 @@ def _scene_numbers(model: Any, base: int, source: str) -> dict[str, float | list
 
 def _contact_numbers(model: Any) -> dict[str, float | list[float]]:
     """Friction and springs of the pairs that :func:`wlr_gym.physics.plants.mujoco.mjcf.build_model` writes, undone."""
-    geom = int(model.pair_geom2[0])
+    names = [model.geom(int(geom)).name for geom in model.pair_geom2]
+    pair = next((k for k, name in enumerate(names) if name in WHEELS), 0)  # MuJoCo sorts pairs; those of the body may be first
+    geom = int(model.pair_geom2[pair])
     sharing = 2 if model.geom_type[geom] == _GEOM.mjGEOM_CAPSULE else 1
     scale = (1.0 - CONTACT_IMPEDANCE) * float(model.body_invweight0[model.geom_bodyid[geom], 0]) / sharing
-    stiffness, damping = (-float(value) / scale for value in model.pair_solref[0])
-    along_axle, along_heading = (float(value) for value in model.pair_friction[0, :2])
+    stiffness, damping = (-float(value) / scale for value in model.pair_solref[pair])
+    along_axle, along_heading = (float(value) for value in model.pair_friction[pair, :2])
     return {
         "ground.mu_x": along_heading,
         "ground.mu_y": along_axle,
