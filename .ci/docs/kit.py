@@ -13,8 +13,8 @@ from wlr_gym.robot.parts import make_kit, posed
 
 FIGURES = Path(__file__).resolve().parents[2] / "docs" / "figures"
 COLOURS = {
-    **dict.fromkeys(("body_plate", "leg_arm"), "0.85 0.75 0.45 1"),
-    **dict.fromkeys(("hip_block", "wheel", "ballast_foot"), "0.25 0.45 0.75 1"),
+    **dict.fromkeys(("body_plate_lower", "body_plate_upper", "leg_arm"), "0.85 0.75 0.45 1"),
+    **dict.fromkeys(("hip_block", "wheel", "ballast_foot", "imu_stand"), "0.25 0.45 0.75 1"),
     **dict.fromkeys(("hip_servo", "wheel_servo"), "0.2 0.2 0.22 1"),
     **dict.fromkeys(("ballast", "post"), "0.65 0.67 0.7 1"),
     "marker_plate": "0.95 0.95 0.95 1",
@@ -24,8 +24,14 @@ ELECTRONICS = ("power_hub", "adapter", "sensor_board", "imu", "flow_sensor")
 #: Picture -> which pieces are there, camera's distance (mm), azimuth and elevation (deg), and what it looks at (mm).
 STEPS = {
     "kit_1_legs": (("leg_arm", "wheel_servo", "wheel", "tyre"), 330, 150, -15, (175, 130, -70)),
-    "kit_2_hips": (("body_plate_below", "hip_block", "hip_servo"), 750, 130, -35, (0, 0, 0)),
-    "kit_3_inside": (("body_plate_below", "hip_block", "hip_servo", "post", "ballast", *ELECTRONICS), 750, 130, -40, (0, 0, 0)),
+    "kit_2_hips": (("body_plate_lower", "hip_block", "hip_servo"), 750, 130, -35, (0, 0, 0)),
+    "kit_3_inside": (
+        ("body_plate_lower", "hip_block", "hip_servo", "post", "imu_stand", *ELECTRONICS),
+        750,
+        130,
+        -40,
+        (0, 0, 0),
+    ),
     "kit_4_whole": (("",), 900, 130, -20, (0, 0, -50)),
 }
 
@@ -43,9 +49,8 @@ def pictures() -> None:
             rgb1=[1, 1, 1], rgb2=[1, 1, 1], width=8, height=48,
         )  # fmt: skip
         for k, (piece, solid) in enumerate(pieces):
-            below = "body_plate_below" if piece == "body_plate" and solid.bounding_box()[2] < 0 else piece
             one_leg = name != "kit_1_legs" or (solid.bounding_box()[0] > 0 and solid.bounding_box()[1] > 0)
-            if piece in ("cables", "leg_screws") or not one_leg or not any(below.startswith(word) for word in wanted):
+            if piece in ("cables", "leg_screws") or not one_leg or not any(piece.startswith(word) for word in wanted):
                 continue
             shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             mesh = solid.to_mesh()

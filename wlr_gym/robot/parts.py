@@ -4,7 +4,10 @@ Axes of each assembly are the body's (x forward, y left, z up): ``body`` from it
 that hangs straight down, with y = 0 in the wheel's middle plane, ``wheel`` from its centre. Lengths of solids are in mm.
 
 Free sizes are solved so that the parts weigh what the file says: two ballast bars give the body its mass and moments of
-inertia, rim, boss and webs give the wheel its own. A leg cannot be matched where the file's is lighter than its wheel's servo.
+inertia, rim and spokes give the wheel its own. A leg cannot be matched where the file's is lighter than its wheel's servo.
+
+Sizes of servos and horns are those of ROBOTIS's drawings XM540/XH540/XD540 (HINGE) of 2019-03-18, HN13-N101 of 2019-05-22 and
+XL-430 of 2018-03-24, as public projects quote them. Nobody here has held the drawings or the servos.
 """
 
 from __future__ import annotations
@@ -29,15 +32,66 @@ Place = tuple[float, float, float]
 
 #: kg/m3. What is printed has walls and infill: weigh a print and correct it here.
 ALUMINIUM, STEEL, GLASS_FIBRE, FOAM_BOARD, PETG, RUBBER = 2670.0, 7850.0, 1850.0, 600.0, 1270.0, 1000.0
-#: Servos, as their manuals say, mm: length, along the axle, width; then kg; then mm from the axle to the near end.
-XM540, XL430 = (58.5, 44.0, 33.5, 0.165, 16.75), (46.5, 34.0, 28.5, 0.0572, 14.25)
-#: mm: thickness of plates and leg arms; from the wheel's middle to its servo's horn; hole of an M3 and of an M2.5 screw.
+#: mm: thickness of plates and leg arms; hole of an M3 and of an M2.5 screw.
 PLATE, ARM, M3, M25 = 2.0, 3.0, 3.2, 2.7
 #: Part within which computed numbers count as those of the robot file.
 TOLERANCE = 0.03
 #: mm: a higher ballast bar would be in the way of a leg at its limit.
 HIGHEST_BAR = 40.0
+#: mm: hole of an M5 screw; from a ballast bar's middle to its two.
+M5, BAR_SCREW = 5.5, 25.0
 _CIRCLE = 96
+
+
+class Hole(NamedTuple):
+    """A round hole in a sheet, mm."""
+
+    x: float
+    y: float
+    diameter: float
+
+
+class Servo(NamedTuple):
+    """Case and horn of a servo, mm; ``u`` is along the case from the axle to the near end, ``v`` across."""
+
+    size: Place  #: along the case, along the axle, across
+    mass: float  #: kg
+    near: float  #: from the axle to the near end
+    horn: float  #: how far the horn's face stands out of the case
+    circle: float  #: diameter of the horn's circle of threads
+    threads: int
+    screw: float  #: clearance hole of the horn's screws
+    centre: float  #: hole that clears the horn's centre
+    case: tuple[tuple[float, float], ...]  #: threads of the case that the kit uses
+
+    def horn_holes(self, x: float = 0.0) -> list[Hole]:
+        """Return the holes that a part on the horn needs, the axle at ``x``: the centre's first."""
+        turns = np.arange(self.threads) * 2.0 * np.pi / self.threads
+        ring = [Hole(x + 0.5 * self.circle * np.cos(turn), 0.5 * self.circle * np.sin(turn), self.screw) for turn in turns]
+        return [Hole(x, 0.0, self.centre), *ring]
+
+
+#: Threads of the case: of each flat side (u, mm behind the front; M2.5, 4 deep at most), of the back (u, v; M2.5 case screws).
+XM540 = Servo((58.5, 44.0, 33.5), 0.165, 13.75, 2.6, 22.0, 8, M25, 10.2, ((-6, 14), (-6, 30), (-38, 14), (-38, 30)))
+XL430 = Servo((46.5, 34.0, 28.5), 0.0572, 11.25, 2.0, 16.0, 4, 2.2, 11.0, ((8, 11), (8, -11), (-32, 11), (-32, -11)))
+#: mm: diameter and height of the hub at the XL430's back; height of the ring on its horn's face.
+HUB, RING = (7.9, 3.9), 1.0
+
+
+class Sheet(NamedTuple):
+    """What is cut out of a plate, mm."""
+
+    outline: CrossSection
+    holes: tuple[Hole, ...]
+
+    def solid(self, thickness: float) -> Manifold:
+        """Return the plate, its middle at z = 0."""
+        from manifold3d import CrossSection
+
+        flat = self.outline
+        for x, y, diameter in self.holes:
+            flat -= CrossSection.circle(diameter / 2.0, 48).translate((x, y))
+        return flat.extrude(thickness).translate((0.0, 0.0, -thickness / 2.0))
 
 
 class Mass(NamedTuple):
@@ -60,11 +114,11 @@ class Part:
 
     Args:
         name: also of its files.
-        made: how it comes about: ``cut``, ``print``, ``bought``, with material.
+        made: ``cut``, ``print`` or ``bought``, with material.
         solid: its shape, mm, at the origin of its own.
         density: kg/m3, or None where ``mass`` (kg) is known.
         places: where its copies are, mm, axes of the assembly.
-        profile: what is cut out of a sheet; None = it is not cut.
+        sheet: what is cut out of a plate; None = it is not cut.
     """
 
     name: str
@@ -73,7 +127,7 @@ class Part:
     density: float | None
     places: tuple[Place, ...]
     mass: float | None = None
-    profile: CrossSection | None = None
+    sheet: Sheet | None = None
 
     def properties(self) -> Mass:
         """Return the mass properties of all copies."""
@@ -95,10 +149,11 @@ class Kit:
 
     def bill(self) -> list[tuple[str, int, float, str]]:
         """Return name, number in a whole robot, mass of one (kg) and how it is made, of each part."""
-        parts = [(part, 1) for part in self.body] + [(part, 4) for part in (*self.leg, *self.wheel)]
-        return [
-            (part.name, times * len(part.places), part.properties().mass / len(part.places), part.made) for part, times in parts
-        ]
+        found: dict[str, tuple[str, int, float, str]] = {}
+        for part, times in [*((part, 1) for part in self.body), *((part, 4) for part in (*self.leg, *self.wheel))]:
+            pieces = times * len(part.places) + (found[part.name][1] if part.name in found else 0)
+            found[part.name] = (part.name, pieces, part.properties().mass / len(part.places), part.made)
+        return list(found.values())
 
     def properties(self) -> dict[str, Mass]:
         """Return the mass properties of ``body``, ``leg`` and ``wheel``, their centres in the assembly's axes."""
@@ -162,14 +217,19 @@ def _disc(radius: float, width: float, middle: float = 0.0) -> Manifold:
     return cylinder.rotate((90.0, 0.0, 0.0)).translate((0.0, middle, 0.0))
 
 
-def _sheet(length: float, width: float, corner: float, holes: Iterable[tuple[float, float, float]]) -> CrossSection:
-    """Return a rounded rectangle (mm) with holes: x, y, diameter."""
+def _sheet(length: float, width: float, corner: float, holes: Iterable[Hole]) -> Sheet:
+    """Return a rounded rectangle (mm) with holes."""
     from manifold3d import CrossSection, JoinType
 
     flat = CrossSection.square((length - 2 * corner, width - 2 * corner), True).offset(corner, JoinType.Round, 2.0, _CIRCLE)
-    for x, y, diameter in holes:
-        flat -= CrossSection.circle(diameter / 2.0, 48).translate((x, y))
-    return flat
+    return Sheet(flat, tuple(holes))
+
+
+def _hole(diameter: float, length: float, x: float, y: float, z: float = 0.0) -> Manifold:
+    """Return what a drill along z takes away; ``z`` is its middle."""
+    from manifold3d import Manifold
+
+    return Manifold.cylinder(length, diameter / 2.0, circular_segments=24, center=True).translate((x, y, z))
 
 
 def _mirrored(x: float, y: float, z: float = 0.0) -> tuple[Place, ...]:
@@ -203,59 +263,105 @@ def _inside(robot: Robot, leg: list[Part]) -> float:
 
 def _horn(robot: Robot) -> float:
     """Return how far (mm) a hip servo's horn is inside the wheel's middle plane: half the wheel, its servo, the arm."""
-    return 500.0 * robot.wheel.width + XL430[1] + ARM
+    return 500.0 * robot.wheel.width + XL430.horn + XL430.size[1] + ARM
+
+
+#: mm, x and y of holes in the lower plate: spacers of the sensor board, screws of the IMU's stand, straps of hubs and adapters.
+SENSOR_BOARD, STAND = tuple((95.0 + x, y) for x in (21.0, -21.0) for y in (16.0, -16.0)), ((26.0, 0.0), (-26.0, 0.0))
+STRAPS = tuple((x, s * y) for s in (1, -1) for x, y in ((36.0, 40.0), (-36.0, 40.0), (0.0, 68.0), (0.0, 92.0)))
+#: mm: holes of the hip block's inserts, from the middle of its servo's case, on the left front; hole of an insert for M3.
+INSERTS, INSERT = ((21.0, 12.0), (21.0, -12.0), (-10.0, 12.0), (-10.0, -12.0)), 4.0
 
 
 def _body(robot: Robot, lacking: float) -> list[Part]:
-    from manifold3d import Manifold
-
     x, y, height = 1e3 * robot.hip_position.x, 1e3 * robot.hip_position.y, 1e3 * robot.body.size[2]
-    long, deep, wide, servo_mass, near = XM540
+    long, deep, _ = XM540.size
     horn, gap, middle = y - _horn(robot), height - 2 * PLATE, height / 2 - PLATE / 2
-    servo = (x + near - long / 2, horn - deep / 2)
-    half = horn - 3.0
-    screws = [(sx * (servo[0] + dx), sy * (servo[1] - 12.0), M3) for sx in (1, -1) for sy in (1, -1) for dx in (-20.0, 20.0)]
-    posts = [(sx * 60.0, sy * (half - 10.0), M3) for sx in (1, -1) for sy in (1, -1)]
+    servo, edge = (x + XM540.near - long / 2, horn - XM540.horn - deep / 2), horn - 3.0
+    posts = [Hole(px, py, M3) for px, py, _ in _mirrored(60.0, edge - 10.0)]
+    common = [Hole(sx * (servo[0] + dx), sy * (servo[1] + dy), M3) for sx in (1, -1) for sy in (1, -1) for dx, dy in INSERTS]
+    common += [*posts, *(Hole(px, py, 25.0) for px, py, _ in _mirrored(100.0, 40.0))]
+    tied = [Hole(0.0, 0.0, 15.0), *(Hole(*at, M3) for at in (*SENSOR_BOARD, *STAND)), *(Hole(*at, 4.0) for at in STRAPS)]
+    length = 2.0 * (x + 14.0)
+    outline = _sheet(length, 2 * edge, 8.0, []).outline
+    for side in (1, -1):  # open between the hips: light ends, and a way for cables
+        outline -= _sheet(90.0, 60.0, 8.0, []).outline.translate((side * length / 2, 0.0))
+    lower, marker = Sheet(outline, (*common, *tied)), _sheet(2 * x, 270.0, 8.0, posts)
+    stand = _box((60.0, 22.0, gap / 2 - 1.5)) - _box((44.0, 23.0, gap / 2)).translate((0.0, 0.0, -6.0))
+    for at in STAND:
+        stand -= _hole(INSERT, 16.0, *at, -gap / 4)
     sides = lambda py, pz: ((0.0, py, pz), (0.0, -py, pz))  # noqa: E731
-    windows = [(sx * 0.5 * x, 0.0, 80.0) for sx in (1, -1)]
-    feet = [(sx * 20.0, sy * (half - 7.0), M3) for sx in (1, -1) for sy in (1, -1)]
-    plate = _sheet(2 * x, 2 * half, 8.0, [*screws, *posts, *windows, *feet])
-    block = _box((long + 4.0, deep - 6.0, gap)) - _box((long + 0.4, deep, wide + 0.4))
-    for dx in (-20.0, 20.0):
-        block -= Manifold.cylinder(2 * gap, 1.25, circular_segments=24, center=True).translate((dx, -9.0, 0.0))
-    sheet = _sheet(2 * x, 270.0, 8.0, [(sx * 60.0, sy * (half - 10.0), M3) for sx in (1, -1) for sy in (1, -1)])
+    block = _hip_block(gap)
     parts = [
-        Part("body_plate", "cut: glass fibre (G10) 2 mm", plate.extrude(PLATE).translate((0, 0, -PLATE / 2)), GLASS_FIBRE,
-             ((0.0, 0.0, middle), (0.0, 0.0, -middle)), profile=plate),
-        Part("hip_block", "print: PETG, 2 walls, 15 % infill", block, 0.3 * PETG, tuple(
-            (px, py - 3.0 * np.sign(py), pz) for px, py, pz in _mirrored(*servo))),
-        Part("hip_servo", "bought: XM540-W150-R", _box((long, deep, wide)), None, _mirrored(*servo), mass=servo_mass),
-        Part("post", "bought: M3 hexagonal spacer, aluminium", _box((5.5, 5.0, gap)), ALUMINIUM, _mirrored(60.0, half - 10.0)),
-        Part("marker_plate", "cut: PVC foam board 2 mm", sheet.extrude(2.0).translate((0, 0, -1)), FOAM_BOARD,
-             ((0.0, 0.0, height / 2 + 4.0),), profile=sheet),
-        Part("power_hub", "bought: U2D2 power hub board", _box((64.0, 48.0, 18.0)), None, sides(30.0, -20.0), mass=0.035),
-        Part("adapter", "bought: U2D2", _box((48.0, 18.0, 14.6)), None, sides(30.0, 0.0), mass=0.009),
+        Part("body_plate_lower", "cut: glass fibre (G10) 2 mm", lower.solid(PLATE), GLASS_FIBRE,
+             ((0.0, 0.0, -middle),), sheet=lower),
+        Part("hip_block", "print: PETG, 2 walls, 15 % infill", block, 0.3 * PETG,
+             ((servo[0], servo[1], 0.0),)),
+        Part("hip_servo", "bought: XM540-W150-R", _box(XM540.size), None, _mirrored(*servo), mass=XM540.mass),
+        Part("post", "bought: M3 hexagonal spacers, aluminium, 50 and 16 mm", _box((5.5, 5.0, gap)), ALUMINIUM,
+             _mirrored(60.0, edge - 10.0)),
+        Part("marker_plate", "cut: PVC foam board 2 mm", marker.solid(2.0), FOAM_BOARD, ((0.0, 0.0, height / 2 + 4.0),),
+             sheet=marker),
+        Part("power_hub", "bought: U2D2 power hub board", _box((64.0, 48.0, 18.0)), None, sides(40.0, -23.0), mass=0.035),
+        Part("adapter", "bought: U2D2", _box((48.0, 18.0, 14.6)), None, sides(80.0, -25.0), mass=0.009),
         Part("sensor_board", "bought: Arduino Nano and level shifters on strip board", _box((50.0, 40.0, 15.0)), None,
-             ((95.0, 0.0, -20.0),), mass=0.025),
+             ((95.0, 0.0, -20.5),), mass=0.025),
+        Part("imu_stand", "print: PETG, 2 walls, 15 % infill", stand, 0.3 * PETG, ((0.0, 0.0, -gap / 4 - 0.75),)),
         Part("imu", "bought: MPU-6050 (GY-521)", _box((21.0, 16.0, 3.0)), None, ((0.0, 0.0, 0.0),), mass=0.002),
         Part("flow_sensor", "bought: PMW3901 board", _box((28.0, 28.0, 4.0)), None, ((0.0, 0.0, 2.0 - gap / 2),), mass=0.003),
         Part("cables", "bought: cables, plugs, screws (weigh yours)", _box((150.0, 100.0, 20.0)), None,
              ((0.0, 0.0, 10.0),), mass=0.18),
     ]  # fmt: skip
-    support = _feet(_ballast(robot, parts, lacking), gap, half)
-    for _ in range(2):  # the feet weigh little, and their height is the bars'
-        support = _feet(_ballast(robot, [*parts, support], lacking), gap, half)
-    return [*parts, support, _ballast(robot, [*parts, support], lacking)]
+    for sx, sy in ((1, -1), (-1, 1), (-1, -1)):  # one print: turned over, it fits the other side
+        solid = block.scale((sx, sy, 1.0))
+        parts.append(Part("hip_block", parts[1].made, solid, 0.3 * PETG, ((sx * servo[0], sy * servo[1], 0.0),)))
+    upper: list[Part] = []
+    for _ in range(6):  # plate and feet reach as far as the bars, which weigh what these leave
+        bar = _ballast(robot, [*parts, *upper], lacking)
+        upper = _bar_carriers(bar, gap, middle, Sheet(outline, tuple(common)))
+    return [*parts, *upper, _ballast(robot, [*parts, *upper], lacking)]
 
 
-def _feet(bar: Part, gap: float, half: float) -> Part:
-    """Return the two feet that carry the ballast bars over the edges of the lower plate."""
+def _hip_block(gap: float) -> Manifold:
+    """Return the front left hip's block around its servo's case, which stands out 6 mm: eight screws into the case, inserts."""
+    long, deep, wide = XM540.size
+    block = (_box((long + 4.0, deep - 6.0, gap)) - _box((long + 0.4, deep + 9.0, wide + 0.4))).translate((0.0, -3.0, 0.0))
+    near, floor = long / 2 - XM540.near, wide / 2 + 3.2
+    for side in (1, -1):
+        for u, behind in XM540.case:
+            at = (near + u, deep / 2 - behind)
+            block -= _hole(M25, gap, *at, side * gap / 2)
+            block -= _hole(5.5, gap, *at, side * (floor + gap / 2))
+        for at in INSERTS:
+            block -= _hole(INSERT, 28.0, *at, side * gap / 2)
+    return block
+
+
+def _bar_carriers(bar: Part, gap: float, middle: float, plate: Sheet) -> list[Part]:
+    """Return the upper plate, wide enough for the ballast bars, and the feet between both."""
+    from manifold3d import CrossSection
+
     _, y, z = bar.places[0]
-    below, edge = z + bar.solid.bounding_box()[2], y + bar.solid.bounding_box()[4]
-    foot, tall = _box((56.0, edge - half + 14.0, below + gap / 2)), (below - gap / 2) / 2
-    middle = (edge + half - 14.0) / 2
-    made = "print: PETG, 2 walls, 15 % infill; under a ballast bar"
-    return Part("ballast_foot", made, foot, 0.3 * PETG, ((0.0, middle, tall), (0.0, -middle, tall)))
+    long, thick = bar.solid.bounding_box()[3] * 2, bar.solid.bounding_box()[4] * 2
+    top = z + bar.solid.bounding_box()[5]
+    tab = CrossSection.square((long + 4.0, 2 * y + thick), True)
+    screws = [Hole(px, py, M5) for px, py, _ in _mirrored(BAR_SCREW, y)]
+    upper = Sheet(plate.outline + tab, (*plate.holes, *screws))
+    foot = _box((long, thick, gap / 2 - top))
+    for side in (1, -1):
+        foot -= _hole(M5, gap, side * BAR_SCREW, 0.0)
+    at = (gap / 2 + top) / 2
+    return [
+        Part(
+            "body_plate_upper",
+            "cut: glass fibre (G10) 2 mm",
+            upper.solid(PLATE),
+            GLASS_FIBRE,
+            ((0.0, 0.0, middle),),
+            sheet=upper,
+        ),
+        Part("ballast_foot", "print: PETG, 2 walls, 15 % infill", foot, 0.3 * PETG, ((0.0, y, at), (0.0, -y, at))),
+    ]
 
 
 def _ballast(robot: Robot, parts: list[Part], lacking: float) -> Part:
@@ -270,55 +376,76 @@ def _ballast(robot: Robot, parts: list[Part], lacking: float) -> Part:
         raise InputError(f"{robot.name}: the body's parts without ballast have {found}; expected {wanted}")
     long = 1e3 * np.sqrt(12.0 * missing[0] / mass)
     high = min(1e3 * np.sqrt(12.0 * max(missing[2], 0.0) / mass), HIGHEST_BAR)
-    thick = 0.5 * mass / (long * high * STEEL * 1e-9)
+    threads = 2.0 * np.pi * 2.1**2 * 18.0
+    thick = (0.5 * mass / (STEEL * 1e-9) + threads) / (long * high)
     y = np.sqrt(1e6 * missing[1] / mass - thick**2 / 12.0)
     z = 1e3 * (robot.body.mass * robot.body.com_offset[2] - given.mass * given.centre[2]) / mass
     bar = _box((long, thick, high))
-    return Part("ballast", f"cut: steel bar {long:.0f} x {thick:.1f} x {high:.0f} mm", bar, STEEL, ((0.0, y, z), (0.0, -y, z)))
+    for side in (1, -1):
+        bar -= _hole(4.2, 36.0, side * BAR_SCREW, 0.0, high / 2)
+    return Part(
+        "ballast",
+        f"cut: steel bar {long:.1f} x {thick:.1f} x {high:.0f} mm, two M5 threads 18 deep",
+        bar,
+        STEEL,
+        ((0.0, y, z), (0.0, -y, z)),
+    )
 
 
 def _leg(robot: Robot) -> list[Part]:
-    length, horn = 1e3 * robot.leg.length, _horn(robot)
-    long, deep, wide, servo_mass, near = XL430
-    hip = [(8.0 * np.cos(a) - length / 2, 8.0 * np.sin(a), M25) for a in np.arange(8) * np.pi / 4]
-    servo = [(length / 2 - dx, sy * 8.0, M25) for dx in (6.0, 30.0) for sy in (1, -1)]
-    flat = _sheet(length + 28.0, 26.0, 12.0, [*hip, *servo, (-length / 2, 0.0, 8.0), (-10.0, 0.0, 14.0)])
-    arm = flat.extrude(ARM).translate((0, 0, -ARM / 2)).rotate((90.0, 90.0, 0.0))
-    places = {"arm": (0.0, ARM / 2 - horn, -length / 2), "servo": (0.0, -500.0 * robot.wheel.width - deep / 2, 0.0)}
-    servo_middle = (0.0, places["servo"][1], -length + long / 2 - near)
+    length, inside = 1e3 * robot.leg.length, 500.0 * robot.wheel.width + XL430.horn
+    long, deep, wide = XL430.size
+    case = [Hole(length / 2 + u, v, M25) for u, v in XL430.case]
+    middle = [Hole(length / 2, 0.0, HUB[0] + 0.5), Hole(-10.0, 0.0, 14.0)]
+    sheet = _sheet(length + 32.0, 30.0, 8.0, [*XM540.horn_holes(-length / 2), *case, *middle])
+    arm = sheet.solid(ARM).rotate((90.0, 90.0, 0.0))
+    places = {"arm": (0.0, ARM / 2 - _horn(robot), -length / 2), "servo": (0.0, -inside - deep / 2, 0.0)}
+    servo = _box((wide, deep, long)) + _disc(HUB[0] / 2, HUB[1], -(deep + HUB[1]) / 2).translate(
+        (0.0, 0.0, XL430.near - long / 2)
+    )
+    servo_middle = (0.0, places["servo"][1], -length + long / 2 - XL430.near)
     return [
-        Part("leg_arm", "cut: glass fibre (G10) 3 mm", arm, GLASS_FIBRE, (places["arm"],), profile=flat),
-        Part("wheel_servo", "bought: XL430-W250-T", _box((wide, deep, long)), None, (servo_middle,), mass=servo_mass),
+        Part("leg_arm", "cut: glass fibre (G10) 3 mm", arm, GLASS_FIBRE, (places["arm"],), sheet=sheet),
+        Part("wheel_servo", "bought: XL430-W250-T", servo, None, (servo_middle,), mass=XL430.mass),
         Part("leg_screws", "bought: screws of a leg", _box((16.0, ARM, length)), None, (places["arm"],), mass=0.004),
     ]
 
 
 def _wheel(robot: Robot) -> list[Part]:
-    """Return wheel and tyre; rim, length of the boss and distance of the webs are solved for mass and both inertias."""
+    """Return wheel and tyre: rim and spokes of full width, solved for mass and spin inertia; that across follows.
+
+    The boss sits on the horn, level with the rim's inner face; from outside, screws go in through its counterbores.
+    """
     from scipy.optimize import least_squares
 
-    wheel, tread, web, boss = robot.wheel, 0.5, 0.8, 10.5
+    wheel, tread, boss, long, floor, spokes = robot.wheel, 0.5, 12.0, 12.0, 5.0, 6
     radius, width = 1e3 * wheel.radius - tread, 1e3 * wheel.width
+    inner = -width / 2
     ring = _disc(radius + tread, width) - _disc(radius, width + 1.0)
     tyre = Part("tyre", f"cut: rubber strip {tread} mm, glued on", ring, RUBBER, ((0.0, 0.0, 0.0),))
-    targets = np.array([wheel.mass, wheel.spin_inertia, wheel.transverse_inertia])
+    targets = np.array([wheel.mass, wheel.spin_inertia])
 
     def printed(sizes: Array) -> Part:
-        rim, long, apart = sizes
-        solid = _disc(radius, width) - _disc(radius - rim, width + 1.0) + _disc(boss, long)
-        for side in (1, -1):
-            solid += _disc(radius - rim / 2, web, side * apart / 2)
-        for angle in np.arange(4) * 90.0:
-            solid -= _disc(M25 / 2, width + 1.0).translate((8.0, 0.0, 0.0)).rotate((0.0, angle, 0.0))
-        made = f"print: PETG, solid: rim {rim:.2f}, webs {web} thick and {apart:.1f} apart, boss {long:.1f} long (mm)"
+        rim, thick = sizes
+        solid = _disc(radius, width) - _disc(radius - rim, width + 1.0)
+        for turn in np.arange(spokes) * 360.0 / spokes:
+            solid += (
+                _box((radius - rim / 2, width, thick)).translate(((radius - rim / 2) / 2, 0.0, 0.0)).rotate((0.0, turn, 0.0))
+            )
+        solid -= _disc(boss, width, long)  # spokes end at the boss
+        solid += _disc(boss, long, inner + long / 2)
+        for x, y, diameter in XL430.horn_holes()[1:]:
+            solid -= _disc(diameter / 2, 2 * width).translate((x, 0.0, y))
+            solid -= _disc(2.1, width, inner + floor + width / 2).translate((x, 0.0, y))
+        solid -= _disc(XL430.centre / 2, 2 * (RING + 0.5), inner)
+        made = f"print: PETG, solid: rim {rim:.2f}, {spokes} spokes {thick:.2f}, boss {long:.1f} long (mm)"
         return Part("wheel", made, solid, PETG, ((0.0, 0.0, 0.0),))
 
     def errors(sizes: Array) -> Array:
         found = together(part.properties() for part in (printed(sizes), tyre))
-        return np.array([found.mass, found.inertia[1, 1], found.inertia[0, 0]]) / targets - 1.0
+        return np.array([found.mass, found.inertia[1, 1]]) / targets - 1.0
 
-    bounds = [0.4, 3.0, 2.0], [0.4 * radius, width, width - web]
-    solved = least_squares(errors, [1.0, 0.7 * width, 0.6 * width], bounds=bounds, diff_step=1e-3)
+    solved = least_squares(errors, [1.0, 1.0], bounds=([0.4, 0.4], [0.4 * radius, 0.2 * radius]), diff_step=1e-3)
     return [printed(solved.x), tyre]
 
 
@@ -364,14 +491,14 @@ def write_kit(kit: Kit, folder: Path) -> list[Path]:
     lines = ["part,pieces,kg_each,made", *(f'{name},{count},{mass:.5f},"{made}"' for name, count, mass, made in kit.bill())]
     write_text(folder / "parts.csv", "\n".join(lines) + "\n")
     written = [folder / "parts.csv"]
-    for part in (*kit.body, *kit.leg, *kit.wheel):
+    for part in {part.name: part for part in (*kit.leg, *kit.wheel, *reversed(kit.body))}.values():  # the first of a name
         if part.made.startswith("bought"):
             continue
         written.append(folder / f"{part.name}.stl")
         written[-1].write_bytes(stl(part.solid))
-        if part.profile is not None:
+        if part.sheet is not None:
             written.append(folder / f"{part.name}.dxf")
-            write_text(written[-1], dxf(part.profile))
+            write_text(written[-1], dxf(part.sheet))
     return written
 
 
@@ -400,8 +527,8 @@ def stl(solid: Manifold) -> bytes:
     return b"wlr_gym, mm".ljust(80) + np.uint32(len(corners)).tobytes() + record.tobytes()
 
 
-def dxf(profile: CrossSection) -> str:
-    """Return the outlines of a cut as DXF, mm."""
+def dxf(sheet: Sheet) -> str:
+    """Return the outline and the holes of a cut as DXF, mm."""
     import io
 
     import ezdxf
@@ -409,8 +536,10 @@ def dxf(profile: CrossSection) -> str:
 
     drawing = ezdxf.new("R2010")  # type: ignore[attr-defined]
     drawing.units = units.MM
-    for outline in profile.to_polygons():
+    for outline in sheet.outline.to_polygons():
         drawing.modelspace().add_lwpolyline([(float(x), float(y)) for x, y in outline], close=True)
+    for x, y, diameter in sheet.holes:
+        drawing.modelspace().add_circle((x, y), diameter / 2.0)
     text = io.StringIO()
     drawing.write(text)
     return text.getvalue()
