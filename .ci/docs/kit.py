@@ -77,58 +77,70 @@ def pictures() -> None:
 # ---- wiring ----
 
 RED, BLACK, BLUE, GREEN, GREY = "#c62828", "#222", "#1565c0", "#2e7d32", "#777"
-NANO = ["Arduino Nano, 5 V", "5V, GND", "A4 SDA, A5 SCL", "D8 INT", "D10 NCS", "D11 MOSI, D12 MISO", "D13 SCK"]
+NANO = ["Arduino Nano, 5 V", "5V, GND", "A4 SDA, A5 SCL", "D8 INT", "D12 MISO", "D10 NCS", "D11 MOSI, D13 SCK"]
 #: Box -> x, y, width, height, lines of text.
 BOXES = {
-    "supply": (10, 40, 160, 74, ["Supply", "12.0 V, 10 A or more", "battery: 12 V at most"]),
-    "stop": (230, 40, 160, 74, ["EMERGENCY STOP", "locking, opens +", "25 A DC or more"]),
-    "fuse1": (450, 30, 110, 38, ["Fuse 10 A"]),
-    "fuse2": (450, 190, 110, 38, ["Fuse 10 A"]),
-    "hub1": (620, 20, 150, 58, ["U2D2 power hub", "legs"]),
-    "hub2": (620, 180, 150, 58, ["U2D2 power hub", "wheels"]),
-    "legs": (830, 20, 200, 76, ["4 x XM540-W150-R", "ids 2, 3, 1, 4, chained", "1 GND  2 +12 V  3 D+  4 D-"]),
-    "wheels": (830, 180, 200, 76, ["4 x XL430-W250-T", "ids 6, 7, 5, 8, chained", "1 GND  2 +12 V  3 DATA"]),
-    "u1": (620, 110, 150, 38, ["U2D2, RS-485"]),
-    "u2": (620, 270, 150, 38, ["U2D2, TTL"]),
-    "computer": (230, 350, 160, 90, ["Computer", "3 x USB: feeds both", "U2D2 and the Nano"]),
-    "nano": (450, 370, 150, 150, NANO),
-    "shift": (660, 395, 130, 100, ["5 V to 3.3 V", "SDA, SCL: MOSFET", "SPI: 74LVC125"]),
-    "imu": (850, 340, 180, 86, ["MPU-6050 (GY-521)", "VCC 5 V, AD0 to GND", "SDA, SCL, INT"]),
-    "flow": (850, 450, 180, 86, ["PMW3901 board", "3.3 V from the Nano", "NCS, MOSI, MISO, SCK"]),
+    "supply": (10, 40, 150, 74, ["Supply", "12.0 V, 10 A or more", "battery: 12 V at most"]),
+    "fuse": (190, 47, 110, 60, ["Main fuse", "15 A, 32 V DC", "at the plus pole"]),
+    "stop": (330, 40, 150, 74, ["EMERGENCY STOP", "locking, opens +", "25 A DC or more"]),
+    "hub1": (550, 20, 140, 58, ["U2D2 power hub", "legs"]),
+    "hub2": (550, 180, 140, 58, ["U2D2 power hub", "wheels"]),
+    "fuses1": (720, 16, 125, 36, ["2 fuses T 3.15 A", "one per branch"]),
+    "fuses2": (720, 176, 125, 36, ["2 fuses T 3.15 A", "one per branch"]),
+    "legs": (880, 16, 190, 92, ["4 x XM540-W150-R", "ids 2 then 1, 3 then 4", "1 GND  2 +12 V", "3 D+  4 D-"]),
+    "wheels": (880, 176, 190, 92, ["4 x XL430-W250-T", "ids 6 then 5, 7 then 8", "1 GND  2 +12 V", "3 DATA"]),
+    "u1": (550, 110, 140, 38, ["U2D2, RS-485"]),
+    "u2": (550, 270, 140, 38, ["U2D2, TTL"]),
+    "computer": (170, 375, 140, 90, ["Computer", "3 x USB: feeds both", "U2D2 and the Nano"]),
+    "nano": (370, 360, 150, 170, NANO),
+    "shift": (620, 350, 150, 36, ["MOSFET shifter", "5 V - 3.3 V"]),
+    "up": (620, 396, 150, 48, ["74AHCT125 on 5 V", "3.3 V to 5 V"]),
+    "down": (620, 458, 150, 48, ["74LVC125 on 3.3 V", "5 V to 3.3 V"]),
+    "regulator": (620, 520, 150, 36, ["MCP1700-3302", "5 V to 3.3 V"]),
+    "imu": (880, 345, 190, 86, ["MPU-6050 (GY-521)", "VCC 5 V, AD0 to GND", "SDA, SCL, INT"]),
+    "flow": (880, 450, 190, 86, ["PMW3901 board", "3.3 V", "NCS, MOSI, MISO, SCK"]),
 }  # fmt: skip
+GROUND = "GND: Nano, both sensors, shifter, both 74 and their OE, regulator"
 #: Wires: points, colour, label, and where it stands.
 WIRES = [
-    ([(170, 65), (230, 65)], RED, "+12 V", (178, 58)),
-    ([(390, 65), (420, 65), (420, 49), (450, 49)], RED, "", None),
-    ([(420, 65), (420, 209), (450, 209)], RED, "+12 V", (426, 170)),
-    ([(560, 49), (620, 49)], RED, "+12 V", (568, 42)),
-    ([(560, 209), (620, 209)], RED, "", None),
-    (
-        [(95, 114), (95, 325), (600, 325), (600, 70), (620, 70)],
-        BLACK,
-        "GND of supply and both hubs",
-        (110, 318),
-    ),
-    ([(600, 230), (620, 230)], BLACK, "", None),
-    ([(770, 35), (830, 35)], RED, "", None),
-    ([(770, 195), (830, 195)], RED, "", None),
-    ([(695, 110), (695, 78)], BLUE, "data", (702, 98)),
-    ([(695, 270), (695, 238)], BLUE, "data", (702, 258)),
-    ([(770, 50), (830, 50)], BLUE, "", None),
-    ([(770, 210), (830, 210)], BLUE, "", None),
-    ([(390, 372), (405, 372), (405, 129), (620, 129)], GREY, "USB", (520, 124)),
-    ([(390, 384), (430, 384), (430, 289), (620, 289)], GREY, "USB", (520, 284)),
-    ([(390, 410), (450, 410)], GREY, "USB", (400, 426)),
-    ([(600, 440), (660, 440)], GREEN, "5 V", (615, 433)),
-    ([(790, 425), (820, 425), (820, 383), (850, 383)], GREEN, "", None),
-    ([(790, 465), (820, 465), (820, 493), (850, 493)], GREEN, "3.3 V", (783, 510)),
-]
+    ([(160, 77), (190, 77)], RED, "", None),
+    ([(300, 77), (330, 77)], RED, "", None),
+    ([(480, 77), (510, 77), (510, 37), (550, 37)], RED, "+12 V", (508, 30)),
+    ([(510, 77), (510, 197), (550, 197)], RED, "+12 V", (470, 170)),
+    ([(85, 114), (85, 332), (530, 332), (530, 65), (550, 65)], BLACK, "GND of supply and both hubs", (100, 325)),
+    ([(530, 226), (550, 226)], BLACK, "", None),
+    *(([(690, y + 34), (720, y + 34)], RED, "", None) for y in (0, 160)),
+    *(([(845, y + 34), (880, y + 34)], RED, "", None) for y in (0, 160)),
+    *(([(690, y + 60), (880, y + 60)], BLACK, "GND", (850, y + 57)) for y in (0, 160)),
+    *(([(690, y + 72), (880, y + 72)], BLUE, "data", (850, y + 84)) for y in (0, 160)),
+    ([(615, 110), (615, 78)], BLUE, "data, GND", (622, 98)),
+    ([(615, 270), (615, 238)], BLUE, "data, GND", (622, 258)),
+    ([(310, 390), (325, 390), (325, 129), (550, 129)], GREY, "USB", (440, 124)),
+    ([(310, 402), (345, 402), (345, 289), (550, 289)], GREY, "USB", (440, 284)),
+    ([(310, 430), (370, 430)], GREY, "USB", (326, 446)),
+    ([(520, 368), (620, 368)], GREEN, "SDA, SCL", (530, 363)),
+    ([(770, 368), (880, 368)], GREEN, "SDA, SCL", (786, 363)),
+    ([(520, 409), (620, 409)], GREEN, "INT", (530, 404)),
+    ([(770, 409), (880, 409)], GREEN, "INT", (786, 404)),
+    ([(520, 432), (620, 432)], GREEN, "MISO", (530, 427)),
+    ([(770, 432), (820, 432), (820, 466), (880, 466)], GREEN, "MISO", (828, 461)),
+    ([(520, 484), (620, 484)], GREEN, "NCS, MOSI, SCK", (522, 479)),
+    ([(770, 490), (880, 490)], GREEN, "NCS, MOSI, SCK", (776, 485)),
+    ([(520, 516), (600, 516), (600, 538), (620, 538)], RED, "5 V", (530, 511)),
+    ([(600, 516), (600, 338), (860, 338), (860, 388), (880, 388)], RED, "5 V", (790, 333)),
+    ([(600, 376), (620, 376)], RED, "", None),
+    ([(600, 420), (620, 420)], RED, "", None),
+    ([(770, 538), (850, 538), (850, 520), (880, 520)], RED, "3.3 V, also to shifter and 74LVC125", (700, 572)),
+    ([(445, 530), (445, 585), (1085, 585), (1085, 400), (1070, 400)], BLACK, GROUND, (455, 600)),
+    ([(1085, 500), (1070, 500)], BLACK, "", None),
+    ([(690, 585), (690, 556)], BLACK, "", None),
+]  # fmt: skip
 
 
 def wiring() -> str:
     """Return the wiring diagram as SVG."""
-    parts = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1050 560" font-family="sans-serif" font-size="13">']
-    parts.append('<rect width="1050" height="560" fill="#fff"/>')
+    parts = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1100 612" font-family="sans-serif" font-size="13">']
+    parts.append('<rect width="1100" height="612" fill="#fff"/>')
     for points, colour, label, place in WIRES:
         path = " ".join(f"{x},{y}" for x, y in points)
         parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2.5"/>')

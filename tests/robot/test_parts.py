@@ -1,7 +1,9 @@
 """The robot's parts: what they weigh against the robot file, their files, and whether they fit into each other."""
 
+import importlib.util
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -191,3 +193,12 @@ def test_a_body_too_light_for_its_parts():
     light = robot.model_copy(update={"body": robot.body.model_copy(update={"mass": 1.0})})
     with pytest.raises(InputError, match=r"the body's parts without ballast have 1\.\d+ kg.*expected less than 1\.000 kg"):
         make_kit(light)
+
+
+def test_the_wiring_diagram_is_what_its_script_draws():
+    spec = importlib.util.spec_from_file_location("kit_figures", Path(__file__).parents[2] / ".ci/docs/kit.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    assert (script.FIGURES / "wiring.svg").read_text() == script.wiring()
