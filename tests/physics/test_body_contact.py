@@ -11,6 +11,7 @@ from energy import mechanical_energy
 from rig import BACKENDS, ROBOT, WEIGHT, G, drive, lock, make_plant
 from scipy.spatial.transform import Rotation
 
+from wlr_gym.base.errors import InputError
 from wlr_gym.physics import plants
 from wlr_gym.physics.plants import body
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantOptions, Truth, standing_state
@@ -252,6 +253,44 @@ def test_a_bouncing_fall_never_gains_energy():
     gained = np.where(in_air, energy - np.minimum.accumulate(flying, axis=0), 0.0)
     assert in_air[80:].any()
     assert gained.max() < 2e-3 * energy[0].max()
+
+
+@pytest.mark.slow
+def test_robots_dropped_on_a_plank_gain_no_energy():
+    """In any attitude, with undamped tyres: corners and edges hand over without a kick."""
+    count, rng = 32, np.random.default_rng(0)
+    attitude = Rotation.random(count, random_state=0).as_quat(scalar_first=True)
+    legs = rng.uniform(-3.1, 3.1, (count, 4))
+
+    def edit(parameters):
+        lock(parameters)
+        plank = {"height": 0.08, "x": -0.03, "length": 0.06}
+        for name, value in plank.items():
+            parameters[f"piece.{name}[piece_1]"] = value
+        parameters["ground.normal_damping"] = 0.0
+
+    def place(state):
+        state.position[:, 2], state.position[:, 0] = 0.45, rng.uniform(-0.1, 0.1, count)
+        state.quaternion[:], state.angular_velocity_in_body[:] = attitude, rng.uniform(-3.0, 3.0, (count, 3))
+        state.joint_position[:, :4] = state.reference_position[:, :4] = legs
+
+    plant = make_plant(count, edit, place, period=0.001)
+    setpoints, energy = np.concatenate([legs, np.zeros((count, 4))], axis=1), []
+    for _ in range(1000):
+        plant.step(setpoints)
+        energy.append(mechanical_energy(plant.parameters, plant.truth()))
+    assert (np.max(energy, axis=0) < 1.001 * energy[0]).all()
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_start_inside_the_floor_is_refused(backend):
+    with pytest.raises(
+        InputError, match=r"state: the body or a leg of robot 1 is 0.02\d* m deep in the floor: expected at most"
+    ):
+        _lying(2, backend=backend, height=[BELLY, BELLY - 0.02])
+    kerb = {"piece.height[piece_1]": KERB, "piece.x[piece_1]": 0.1}
+    with pytest.raises(InputError, match=r"robot 0 is 0.0\d+ m deep in the floor"):
+        _lying(1, kerb, backend=backend, height=BELLY + 0.04)
 
 
 @pytest.mark.parametrize("floor", ["plane", "kerb"])

@@ -176,6 +176,11 @@ class _Pushes:
         for k, a in enumerate(AXES):
             self._sum(f"push_{a}{spot.number}", push * normal[k])
 
+    def before(self, spot: _Spot) -> Value:
+        """Positive where a spot was pushed in the step before."""
+        force = [self._lanes[f"spot_force_{a}{spot.number}"] for a in AXES]
+        return dot(force, force)
+
     def _sum(self, name: str, value: Value) -> None:
         self.sums[name] = self.sums.get(name, self._lanes[name]) + value
 
@@ -245,6 +250,8 @@ def push_of_piece(lanes: Lanes) -> Out:
 Pair = tuple[Value, Value]
 #: Something crosses an edge only where that is the shortest way out of the piece, to this much (m).
 SLACK = 1e-4
+#: Nothing begins to cross an edge deeper than this (m): the shortest way out may turn to an edge that is far away.
+SHALLOW = 0.005
 #: What is shorter than the root of this across an edge (m2) lies along it, and does not cross it.
 ALONG = 1e-8
 
@@ -324,6 +331,7 @@ def _cross(
     normal = edge.normal_to(way)
     own = (edge.radius + spot.radius) - (u + share * way_u) * normal[0] - (v + share * way[1]) * normal[1]
     valid = ops.minimum(ops.minimum(share, 1.0 - share), (least + SLACK) - depth)
+    valid = ops.minimum(valid, ops.where_positive(pushes.before(spot), 1.0, SHALLOW - own))
     pushes.add(spot, share, out_of_profile(edge.side * normal[0], normal[1]), spot.at(share)[1], own, valid)
 
 
@@ -397,6 +405,7 @@ def spots_at(robot: Robot, parameters: Parameters, truth: Truth, force: Array) -
     lanes = lanes_at(robot, parameters, truth) | ground.pack_body(parameters, robot, 1e-6)
     lanes |= dict.fromkeys((*PUSHES, *(f"{name}{a}" for name in "vw" for a in AXES)), still)
     lanes |= {f"leg_rate{i}": still for i in CORNERS}
+    lanes |= {f"spot_force_{a}{s}": force[:, s, k] for s in SPOTS for k, a in enumerate(AXES)}
     lanes |= nearness(lanes, features)
     lanes |= push_of_base(lanes, features)
     for k in relief.piece_numbers(features):
@@ -420,6 +429,12 @@ def spots_at(robot: Robot, parameters: Parameters, truth: Truth, force: Array) -
     axes = np.stack([heading, lateral, normal], axis=2)
     along = np.einsum("ncij,ncj->nci", axes, force)
     return Contacts(point, depth, normal, heading, lateral, np.where(np.isfinite(depth)[:, :, None], along, 0.0))
+
+
+def lowest_corner(robot: Robot, truth: Truth) -> Array:
+    """Return how high (N,) the lowest corners of bodies are, m; ``truth``: of robots (N)."""
+    up = np.abs(np.stack(rotation_rows(dict(zip(("qw", "qx", "qy", "qz"), truth.quaternion.T, strict=True)))[2], axis=1))
+    return truth.position[:, 2] - up @ (0.5 * np.array(robot.body.size))
 
 
 def _along(normal: Vector, a: Vector) -> Vector:

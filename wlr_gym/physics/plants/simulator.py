@@ -26,7 +26,7 @@ from wlr_gym.physics.plants.base import (
     hold_where_off,
     standing_state,
 )
-from wlr_gym.physics.plants.body import spots_at
+from wlr_gym.physics.plants.body import SHALLOW, SPOTS, lowest_corner, spots_at
 from wlr_gym.physics.plants.contacts import CONTACTS, contacts_at
 from wlr_gym.physics.plants.sensors import RAW_LAYOUT, SensorModel, check_flow
 from wlr_gym.robot import LEG_SLICE, WHEELS, Robot
@@ -133,11 +133,22 @@ class Simulator(ABC):
         return self._readings
 
     def _check_depth(self, rows: Rows) -> None:
-        """Refuse robots that start with an axle below the surface of a floor with relief: nothing says which way is out."""
-        chosen = Parameters(self.parameters.values[rows])
-        if not relief.families(chosen):
+        """Refuse robots that start with an axle below the surface of a floor with relief, or with body or legs in the floor:
+        nothing says which way is out."""
+        chosen, truth = Parameters(self.parameters.values[rows]), Truth(self._truth.values[rows])
+        is_plane = not relief.families(chosen)
+        if is_plane and (lowest_corner(self.robot, truth) > 0.0).all():
             return
-        found = contacts_at(self.robot, chosen, Truth(self._truth.values[rows]), np.zeros((len(rows), len(CONTACTS), 3)))
+        found = spots_at(self.robot, chosen, truth, np.zeros((len(rows), len(SPOTS), 3)))
+        robot, spot = np.unravel_index(int(np.argmax(found.depth)), found.depth.shape)
+        if found.depth[robot, spot] > SHALLOW:
+            raise InputError(
+                f"state: the body or a leg of robot {rows[robot]} is {found.depth[robot, spot]:.3g} m deep in the floor: "
+                f"expected at most {SHALLOW:g} m"
+            )
+        if is_plane:
+            return
+        found = contacts_at(self.robot, chosen, truth, np.zeros((len(rows), len(CONTACTS), 3)))
         excess = found.depth - np.tile(chosen["wheel.radius"], 2)
         robot, contact = np.unravel_index(int(np.argmax(excess)), excess.shape)
         if excess[robot, contact] > 0.0:

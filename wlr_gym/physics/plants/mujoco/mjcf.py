@@ -365,7 +365,9 @@ def _write_full_digits(root: ElementTree.Element, model: Any) -> None:
                 _write_joint(joint, model)
     for index, element in enumerate(root.iter("numeric")):
         _write(element, data=model.numeric_data[model.numeric_adr[index] :][:1])
-    names = [(model.geom(int(a)).name, model.geom(int(b)).name) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)]
+    names = [
+        (model.geom(int(a)).name, model.geom(int(b)).name) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)
+    ]
     pairs = {frozenset(both): index for index, both in enumerate(names)}  # MuJoCo sorts them
     for element in root.iter("pair"):
         index = pairs[frozenset((element.get("geom1"), element.get("geom2")))]
