@@ -198,6 +198,9 @@ def test_a_map_that_no_floor_brought_is_told():
         (np.zeros(3), r"has shape \(3,\): expected rows and columns"),
         (np.zeros((300, 300)), "has 300 x 300 cells: expected at most 65536"),
         ([[0.0, np.nan]], "holds nan: expected finite numbers"),
+        (np.full((2, 2), 1 + 2j), "map.npy: holds values of type complex128: expected real numbers"),
+        (np.zeros((2, 2), "datetime64[s]"), r"holds values of type datetime64\[s\]: expected real numbers"),
+        (np.zeros((2, 2), [("z", float)]), r"holds values of type \[\('z', '<f8'\)\]: expected real numbers"),
         (np.eye(9), "its curvature reaches .*: expected at most 0.25 over 0.034 m"),
     ],
 )
@@ -214,12 +217,46 @@ def test_grids_that_cannot_be(tmp_path, values, words):
         ({"file": "map.nyp"}, r"'.nyp' is no kind of map \(did you mean '.npy'\?\)"),
         ({}, "has neither 'file' nor 'data': expected the file of a map"),
         ({"data": "3x3_nonsense"}, "data = '3x3_nonsense'...: is no map"),
+        ({"data": "5x0_eJwDAAAAAAE="}, "data = '5x0_eJwDAAAAAAE='...: is no map"),
+        ({"data": maps.map_text(np.eye(2)).replace("2x2", "-1x2")}, "data = '-1x2_.*: is no map"),
+        (
+            {"data": maps.map_text(np.eye(2)), "random": {"height": 0.01, "length": 0.5}},
+            "base = .*: has both 'data' and 'random': expected one of them",
+        ),
         ({"random": {"height": 0.01, "length": 0.5, "size": [90.0, 90.0]}}, "1800 x 1800 cells of 0.05 m: expected at most"),
     ],
 )
 def test_grids_that_say_nothing_sensible(content, words):
     with pytest.raises(InputError, match=words):
         load_floor({"base": {"kind": "grid", "cell": 0.05, **content}})
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("map.npy", b"", "map.npy: cannot be read as NPY: .*; expected a table of numbers"),
+        ("map.npy", b"PK\3\4 an archive", "map.npy: cannot be read as NPY: .*; expected a table of numbers"),
+        ("map.png", b"no picture", "map.png: cannot be read as PNG: .*; expected a table of numbers"),
+        ("map.csv", b"1,two", "map.csv: cannot be read as CSV: .*'two'.*; expected a table of numbers"),
+        ("map.csv", b"", r"map.csv: has shape \(0, 1\): expected rows and columns"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_broken_files_of_maps_are_told(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        maps.read_map(tmp_path / name)
+
+
+def test_a_spreadsheets_byte_order_mark_is_skipped(tmp_path):
+    (tmp_path / "map.csv").write_bytes(b"\xef\xbb\xbf0,1\r\n2,3\r\n")
+    assert maps.map_values(maps.read_map(tmp_path / "map.csv")).tolist() == [[2.0, 3.0], [0.0, 1.0]]
+
+
+def test_a_grid_has_one_source(tmp_path):
+    base = {"kind": "grid", "cell": 0.1, "file": str(_save(tmp_path, "csv")), "random": {"height": 0.01, "length": 0.5}}
+    with pytest.raises(InputError, match=r"base = .*: has both 'file' and 'random': expected one of them"):
+        load_floor({"base": base})
 
 
 def test_friction_that_cannot_be(tmp_path):
@@ -314,6 +351,15 @@ def test_what_the_file_leaves_out_can_be_drawn():
             },
             "randomise: 'base.random.seed': heights cannot be drawn; expected base.at.0",
         ),
+        (
+            {
+                "base": {"kind": "grid", "cell": 0.1, "random": {"height": 0.01, "length": 0.5}},
+                "randomise": {"base.cell": [0.1, 0.2]},
+            },
+            "randomise: 'base.cell': would also stretch base.random.length = 0.5 m; expected base.at.0",
+        ),
+        ({"friction": "x"}, "friction = 'x'"),
+        ({"friction": [0.5]}, r"friction = \[0.5\]"),
     ],
 )
 def test_files_that_say_nothing_sensible(content, words):

@@ -123,11 +123,17 @@ class Grid(Map):
 
     def text(self) -> str:
         """Return its heights as text."""
-        if self.data or self.random is None:
+        if self.random is None:
             return self.data
         from wlr_gym.physics.maps import random_heights
 
         return random_heights(cell=self.cell, **self.random.model_dump())
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Grid:
+        if self.random is not None and (self.file or self.data):
+            raise ValueError(f"has both '{'file' if self.file else 'data'}' and 'random': expected one of them")
+        return self
 
 
 class Kerb(SettingsModel):
@@ -224,9 +230,12 @@ class Floor(SettingsModel):
             raise InputError(
                 f"randomise: '{place}': no number of this floor{nearest(place, numbers)}; it has {', '.join(numbers)}"
             )
+        places = "base.at.0, base.at.1, base.heading or base.scale"
         if ".random." in place:
-            places = "base.at.0, base.at.1, base.heading or base.scale"
             raise InputError(f"randomise: '{place}': heights cannot be drawn; expected {places}")
+        if place == "base.cell" and "base.random.length" in numbers:
+            length = numbers["base.random.length"]
+            raise InputError(f"randomise: '{place}': would also stretch base.random.length = {length:g} m; expected {places}")
         if (drawn == EACH_EPISODE) != place.endswith(".seed"):
             wanted = f"'{EACH_EPISODE}'" if place.endswith(".seed") else "[low, high]"
             raise InputError(f"randomise: {place} = {drawn!r}: expected {wanted}")
@@ -511,8 +520,8 @@ def load_floor(source: FloorSource, robot: Robot | None = None, where: str = "fl
 def _with_maps(data: Any, place: str) -> Any:
     """Return a floor's content with what is in the files of its maps, where it does not have that yet."""
     data = copy.deepcopy(data)
-    holders = (data.get("base"), (data.get("friction") or {}).get("map")) if isinstance(data, dict) else ()
-    for held in holders:
+    base, friction = (data.get("base"), data.get("friction")) if isinstance(data, dict) else (None, None)
+    for held in (base, friction.get("map") if isinstance(friction, dict) else None):
         if isinstance(held, dict) and isinstance(held.get("file"), str | Path) and not held.get("data"):
             from wlr_gym.physics.maps import read_map
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import base64
 import binascii
+import warnings
 import zlib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,18 +43,22 @@ def read_map(path: Path) -> str:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; expected a map of the floor")
     try:
-        values = np.asarray(readers[kind](path), np.float64)
-    except (OSError, ValueError, SyntaxError) as error:  # the last two are what readers raise of a broken file
-        raise InputError(f"{path}: cannot be read as {kind[1:].upper()}: {error}") from None
-    return map_text(values, str(path))
+        values = readers[kind](path)
+    except Exception as error:  # a broken file makes readers raise nearly anything
+        raise InputError(f"{path}: cannot be read as {kind[1:].upper()}: {error}; expected a table of numbers") from None
+    if values.dtype.kind not in "biuf":
+        raise InputError(f"{path}: holds values of type {values.dtype}: expected real numbers")
+    return map_text(values.astype(np.float64), str(path))
 
 
 def _read_csv(path: Path) -> Array:
-    return np.loadtxt(path, delimiter=",", ndmin=2)
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # an empty file is refused for its shape
+        return np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")  # spreadsheets write a byte-order mark
 
 
-def _read_npy(path: Path) -> Array:
-    return np.load(path, allow_pickle=False)
+def _read_npy(path: Path) -> NDArray[Any]:
+    with path.open("rb") as file:  # np.load would open archives, too
+        return np.lib.format.read_array(file)
 
 
 def _read_png(path: Path) -> Array:
@@ -85,10 +91,12 @@ def map_values(text: str) -> Array:
     size, _, packed = text.partition("_")
     try:
         rows, columns = map(int, size.split("x"))
-        whole = np.frombuffer(zlib.decompress(base64.b64decode(packed)), "<i4").reshape(rows, columns)
+        whole = np.frombuffer(zlib.decompress(base64.b64decode(packed)), "<i4")
+        if min(rows, columns) < 1 or rows * columns != whole.size:
+            raise ValueError
     except (ValueError, binascii.Error, zlib.error):
         raise InputError(f"data = {text[:20]!r}...: is no map; expected 'file', or what a floor's content says") from None
-    return RESOLUTION * np.cumsum(whole, axis=1, dtype=np.int64)[::-1].astype(np.float64)
+    return RESOLUTION * np.cumsum(whole.reshape(rows, columns), axis=1, dtype=np.int64)[::-1].astype(np.float64)
 
 
 @cache
