@@ -17,6 +17,8 @@ static bool selected, has_pointer;
 static double reset_over, next_sample;
 static int clocks;
 
+uint8_t imu_register(int at) { return reg[at & 127]; }
+
 bool imu_holds_bus(void) { return imu.hold || imu.hang_clocks; }
 
 static void power_on(void) {
@@ -107,6 +109,7 @@ static void on_bus(avr_irq_t *irq, uint32_t value, void *param) {
 static void on_direction(avr_irq_t *irq, uint32_t value, void *param) {
     (void)param;
     bool rises = irq->value & 0x20 && !(value & 0x20);
+    if (irq->value & 0x10 && !(value & 0x10) && !(value & 0x20)) imu.stops++; /* data rises while the clock is high */
     if (imu.hang_clocks && rises && ++clocks >= imu.hang_clocks) imu.hang_clocks = clocks = 0;
     avr_ioport_external_t pulls = {.name = 'C', .mask = 0x30, .value = imu.hang_clocks ? 0x20 : 0x30};
     avr_ioctl(chip_of, AVR_IOCTL_IOPORT_SET_EXTERNAL('C'), &pulls);

@@ -11,14 +11,18 @@
 #define T_SRAD 35e-6
 #define T_SWX 45e-6 /* from a write to the next transfer */
 #define T_SRX 20e-6 /* from a read */
+#define T_SCLK_NCS 35e-6 /* from a write's last clock to NCS */
 
-pmw3901_t flow = {.present = true, .floating = 0xFF};
+pmw3901_t flow = {.present = true, .floating = 0xFF, .inverse = 0xB6};
 
 static avr_t *chip_of;
 static avr_irq_t *line_in;
 static uint8_t bank[32][128], current, address, burst[12];
 static int position; /* byte of a transfer; -1 = NCS is high */
 static bool was_reset;
+static uint8_t writes[512];
+static size_t written;
+static double last_write;
 static double next_frame, sum_x, sum_y, address_end, last_end, due;
 
 static void power_on(void) {
@@ -64,7 +68,7 @@ static uint8_t read_register(void) {
     if (current) return bank[current & 31][address];
     switch (address) {
         case 0x00: return 0x49;
-        case 0x5F: return 0xB6;
+        case 0x5F: return (uint8_t)flow.inverse;
         case 0x02: latch(); return burst[0];
         case 0x03: return burst[2];
         case 0x04: return burst[3];
@@ -76,8 +80,11 @@ static uint8_t read_register(void) {
 }
 
 static void write_register(uint8_t value) {
+    if (written + 2 <= sizeof writes) writes[written++] = address, writes[written++] = value;
+    if (written > 2 && now() - last_write > flow.pause) flow.pause = now() - last_write;
+    last_write = now();
     if (address == 0x7F) current = value;
-    else if (address == 0x3A && current == 0 && value == 0x5A) power_on(), was_reset = true;
+    else if (address == 0x3A && current == 0 && value == 0x5A) power_on(), was_reset = true, written = 0, flow.pause = 0;
     else bank[current & 31][address] = value;
 }
 
@@ -118,8 +125,14 @@ static void on_byte(avr_irq_t *irq, uint32_t sent, void *param) {
 
 static void on_select(avr_irq_t *irq, uint32_t level, void *param) {
     (void)irq, (void)param;
+    if (level && position > 1 && address & 0x80) flow.violations += now() - last_end < T_SCLK_NCS;
     if (level && position > 0) due = last_end + (address & 0x80 ? T_SWX - 8e-6 : address == 0x16 ? 0.5e-6 : T_SRX - 4e-6);
     position = level ? -1 : 0;
+}
+
+void flow_print_writes(void) {
+    for (size_t k = 0; k < written; k++) printf("%02x", writes[k]);
+    printf("\n");
 }
 
 void flow_power(bool on) {

@@ -14,8 +14,10 @@
 #define TICK 2000 /* counts of timer 1: 1 ms */
 #define DIVISOR ((F_CPU / 4 / BAUD_RATE + 1) / 2)
 
-#if 1000 % IMU_RATE || IMU_RATE > 500
-#error "IMU_RATE: expected 1000 over a whole number, 500 at most"
+#define SPEED (F_CPU / 8 / DIVISOR)
+
+#if SPEED * 1000 > BAUD_RATE * 1025 || SPEED * 1000 < BAUD_RATE * 975
+#error "BAUD_RATE: the board's clock makes it only with more than 2.5 % error; expected 57600, 115200, 250000, 500000, 1000000"
 #endif
 #if IMU_RATE * 24L + 122 * 20L > BAUD_RATE / 10 * 95L / 100
 #error "IMU_RATE: its frames and those of the optical flow do not fit into BAUD_RATE; raise BAUD_RATE (500000)"

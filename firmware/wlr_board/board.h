@@ -23,12 +23,12 @@ extern status_frame_t board;
 
 /* MPU-6050 */
 void imu_begin(void);
-void imu_tick(void);                                   /* every millisecond: look after the chip */
+void imu_tick(void);                                   /* every millisecond: find the chip, set it up */
 void imu_sample(uint16_t sequence, uint32_t moment);   /* the chip has new values since `moment`: read and send them */
 
 /* PMW3901 */
 void flow_begin(void);
-void flow_tick(void); /* every millisecond: look after the chip, read and send */
+void flow_tick(void); /* every millisecond: find the chip, set it up, read and send */
 
 #ifdef __cplusplus
 }

@@ -122,8 +122,10 @@ void imu_begin(void) {
 void imu_tick(void) {
     uint32_t elapsed = clock_now() - since;
     if (state == ABSENT && elapsed >= RETRY) {
+        uint16_t errors = board.bus_errors;
         board.imu_identity = 0;
         bool found = read_registers(WHO_AM_I, &board.imu_identity, 1) && board.imu_identity == IDENTITY;
+        if (!board.imu_identity) board.bus_errors = errors; /* nobody is there: no fault of the bus */
         become(found && write_register(POWER_1, 0x80) ? RESETTING : ABSENT);
     } else if (state == RESETTING && elapsed >= RESET_TIME) {
         become(set_up() ? RUNNING : ABSENT);

@@ -22,4 +22,20 @@
 #define IMU_ADDRESS 0x68 /* 0x69 where AD0 is high */
 #endif
 
+#if GYRO_RANGE != 250 && GYRO_RANGE != 500 && GYRO_RANGE != 1000 && GYRO_RANGE != 2000
+#error "GYRO_RANGE: expected 250, 500, 1000 or 2000 deg/s"
+#endif
+#if ACCEL_RANGE != 2 && ACCEL_RANGE != 4 && ACCEL_RANGE != 8 && ACCEL_RANGE != 16
+#error "ACCEL_RANGE: expected 2, 4, 8 or 16 g"
+#endif
+#if BANDWIDTH != 184 && BANDWIDTH != 94 && BANDWIDTH != 44 && BANDWIDTH != 21 && BANDWIDTH != 10 && BANDWIDTH != 5
+#error "BANDWIDTH: expected 184, 94, 44, 21, 10 or 5 Hz"
+#endif
+#if IMU_ADDRESS != 0x68 && IMU_ADDRESS != 0x69
+#error "IMU_ADDRESS: expected 0x68 or 0x69"
+#endif
+#if 1000 % IMU_RATE || IMU_RATE > 500 || IMU_RATE < 4
+#error "IMU_RATE: expected 1000 over a whole number, 4 to 500 Hz"
+#endif
+
 #endif

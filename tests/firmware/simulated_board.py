@@ -22,6 +22,7 @@ def missing_packages() -> str:
         "gcc-avr": shutil.which("avr-gcc"),
         "avr-libc": any(Path(path).exists() for path in ("/usr/lib/avr/include/avr/io.h", "/usr/avr/include/avr/io.h")),
         "make": shutil.which("make"),
+        "gcc": shutil.which("cc"),
         "libsimavr-dev": Path("/usr/include/simavr/sim_avr.h").exists(),
         "libelf-dev": Path("/usr/include/libelf.h").exists(),
     }

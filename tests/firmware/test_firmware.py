@@ -22,6 +22,18 @@ FORCE, TURN = (1.0, -2.0, 9.0), (10.0, -20.0, 30.0)  # m/s2, deg/s
 START = 0.3
 
 
+#: The MPU-6050's registers at 200 Hz, 500 deg/s, 4 g, 44 Hz, on the gyroscope's clock, with a pulse for new values.
+IMU_REGISTERS = {0x19: 4, 0x1A: 3, 0x1B: 8, 0x1C: 8, 0x37: 0, 0x38: 1, 0x6B: 1}
+TWBR = 0xB8  # of the ATmega328P
+#: The PMW3901's list "performance optimization registers": register, value.
+TUNING = bytes.fromhex(
+    "7f00 61ad 7f03 4000 7f05 41b3 43f1 4514 5b32 5f34 7b08 7f06 441b 40bf 4e3f 7f08 6520 6a18 7f09 4faf 5f40 4880 4980 5777"
+    "6078 6178 6208 6350 7f0a 4560 7f00 4d11 5580 741f 751f 4a78 4b78 4408 4550 64ff 651f 7f14 6567 6608 6370 7f15 4848 7f07"
+    "410d 4314 4b0e 450f 4442 4c80 7f10 5b02 7f07 4041 7000 3244 7f07 4040 7f06 62f0 6300 7f0d 48c0 6fd5 7f00 5ba0 4ea8 5a50"
+    "4080"
+)
+
+
 def collect(board: SimulatedBoard, stream: ImuStream, seconds: float, step: float = 0.02) -> list[TimedFrame]:
     """Let time pass, reading every ``step`` s, and return all frames."""
     frames = []
@@ -60,7 +72,10 @@ def check_everything(folder: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(reading.accelerometer, FORCE, atol=0.003)
         np.testing.assert_allclose(np.rad2deg(reading.gyro), TURN, atol=0.02)
         stamps = np.array([frame.numbers[1] for frame in frames]) * 1e-6
-        assert np.ptp(stamps - sample_moments(board, frames)) < 1e-4
+        off = stamps - sample_moments(board, frames) + board.get("clock_start")
+        assert abs(off).max() < 2e-5
+        assert {at: int(board.command(f"register {at}")) for at in IMU_REGISTERS} == IMU_REGISTERS
+        assert int(board.command(f"peek {TWBR}")) == 12  # 400 kHz
         found = status(board, stream)
         assert (found["version_major"], found["version_minor"]) == FIRMWARE_VERSION
         assert (found["imu_rate"], found["gyro_range"], found["accel_range"], found["bandwidth"]) == (200, 500, 4, 44)
@@ -87,6 +102,32 @@ def check_everything(folder: Path, tmp_path: Path) -> None:
         assert np.ptp(late) < 1.7e-3  # asked every millisecond, after what the IMU takes
         assert flow.parser.lost == flow.parser.crc_errors == 0
         assert board.get("violations") == 0  # times and clock of the data sheet
+        assert bytes.fromhex(board.command("writes")) == TUNING
+        assert board.get("pause") >= 0.01
+        board.set(flow_x=0, flow_y=0)
+        still = []
+        for _ in range(50):
+            board.run(0.02)
+            still += [frame.numbers[2] for frame in flow.frames()]
+        assert np.mean(still[10:]) == pytest.approx(1e6 / 121, rel=0.005)
+
+
+def check_troubles(folder: Path, tmp_path: Path) -> None:
+    """A bus that hangs, a line that is full, a chip with only half of the identity."""
+    with SimulatedBoard(folder, tmp_path) as board:
+        stream = board.imu()
+        collect(board, stream, START)
+        board.set(hang_clocks=7)
+        collect(board, stream, 0.1)
+        assert status(board, stream)["bus_locks"] == board.get("stops") == 1
+        for _ in range(16):
+            stream.request_status()
+        collect(board, stream, 0.3)
+        assert status(board, stream)["line_full"] > 0
+        assert stream.parser.crc_errors == 0
+        board.set(inverse=0)
+        collect(board, stream, 0.3)
+        assert status(board, stream)["sensors"] == 1
 
 
 def test_header_is_that_of_readers_and_emulator():
@@ -113,12 +154,33 @@ MUTATIONS = {
     "one of the tuning registers": ("pmw3901.c", "0x48, 0xC0, 0x6F", "0x48, 0xC1, 0x6F"),
     "time from address to data": ("pmw3901.c", "_delay_us(35); /* t_SRAD */", "_delay_us(5);"),
     "speed of SPI": ("pmw3901.c", " | _BV(SPR0)", ""),
+    "bandwidth": ("mpu6050.c", "BANDWIDTH == 44 ? 3", "BANDWIDTH == 44 ? 4"),
+    "clock of the IMU": ("mpu6050.c", "{POWER_1, 0x01}", "{POWER_1, 0x00}"),
+    "speed of the two-wire bus": ("mpu6050.c", "400000L - 16", "800000L - 16"),
+    "speed of the line": ("board.c", "UBRR0 = DIVISOR - 1", "UBRR0 = DIVISOR"),
+    "edge of the stamp": ("board.c", "_BV(ICNC1) | _BV(ICES1)", "_BV(ICNC1)"),
+    "time from clock to NCS": ("pmw3901.c", "_delay_us(35); /* t_SCLK-NCS */", "_delay_us(1);"),
+    "another of the tuning registers": ("pmw3901.c", "0x65, 0x67", "0x65, 0x66"),
+    "pause in the tuning": ("pmw3901.c", "PAUSE, 10,", "PAUSE, 0,"),
+    "period of the flow": ("pmw3901.c", "PERIOD 8264", "PERIOD 8000"),
+}
+#: As above, for what only trouble shows.
+TROUBLES = {
+    "no stop on a freed bus": ("mpu6050.c", "DDRC |= _BV(4); /* stop", "/* stop"),
+    "dropped frames are not counted": ("board.c", "board.line_full++;", ""),
+    "a full line is overwritten": ("board.c", "(uint8_t)(tail - head - 1) < size", "size == 0"),
+    "inverse identity": ("pmw3901.c", " && read_register(INVERSE) == (uint8_t)~IDENTITY", ""),
 }
 
 
-@pytest.mark.parametrize("what", MUTATIONS)
+def test_troubles(default_build, tmp_path):
+    check_troubles(default_build, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", [*MUTATIONS, *TROUBLES])
 def test_broken_firmware_is_caught(what, default_build, tmp_path):
-    name, text, replacement = MUTATIONS[what]
+    name, text, replacement = (MUTATIONS | TROUBLES)[what]
     source = tmp_path / "source"
     shutil.copytree(FIRMWARE, source, ignore=shutil.ignore_patterns("build", "*.md", "__pycache__"))
     file = source / "wlr_board" / name
@@ -126,7 +188,15 @@ def test_broken_firmware_is_caught(what, default_build, tmp_path):
     file.write_text(file.read_text().replace(text, replacement))
     folder = build(tmp_path / "built", source)
     with pytest.raises(AssertionError):
-        check_everything(folder, tmp_path)
+        (check_everything if what in MUTATIONS else check_troubles)(folder, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "setting", [{"GYRO_RANGE": 400}, {"ACCEL_RANGE": 3}, {"BANDWIDTH": 42}, {"BAUD_RATE": 230400}, {"IMU_RATE": 300}]
+)
+def test_settings_the_chips_do_not_have_are_refused(setting, default_build, tmp_path):
+    with pytest.raises(AssertionError, match=f"{next(iter(setting))}: expected|{next(iter(setting))}: the board"):
+        build(tmp_path, **setting)
 
 
 def test_500_hz(fast_build, tmp_path):
@@ -270,7 +340,8 @@ def test_a_sensor_that_was_never_there(board, absent, bits, rate):
     stream = board.imu()
     collect(board, stream, START)
     assert len(collect(board, stream, 1.0)) == pytest.approx(rate, abs=2)
-    assert status(board, stream)["sensors"] == bits
+    found = status(board, stream)
+    assert (found["sensors"], found["bus_errors"]) == (bits, 0)
 
 
 def test_a_brownout_is_a_restart(board):
