@@ -21,6 +21,7 @@ from wlr_gym.data.watch import truth_of
 from wlr_gym.physics.floor import load_floor
 from wlr_gym.physics.plants import make_plant
 from wlr_gym.physics.plants.base import PlantOptions, PlantState, standing_state
+from wlr_gym.physics.plants.body import SPOTS, spots_at
 from wlr_gym.physics.plants.contacts import CONTACTS, contacts_at
 from wlr_gym.robot import FIRST_WHEEL, Robot, load_robot
 from wlr_gym.robot.parameters import Parameters
@@ -98,8 +99,8 @@ def fuzz(
         laid.write(parameters, seeds)
         parameters["ground.mu_x"] = parameters["ground.mu_y"] = rng.uniform(0.0, 1.5, (ROBOTS, 1))
         state = throw(robot, parameters, rng)
-        deepest = contacts_at(robot, parameters, truth_of(state), np.zeros((ROBOTS, len(CONTACTS), 3))).depth.max(axis=1)
-        state.position[:, 2] += np.maximum(deepest, 0.0) - rng.uniform(-0.05, 0.003, ROBOTS)
+        lift(robot, parameters, state)
+        state.position[:, 2] -= rng.uniform(-0.05, 0.003, ROBOTS)
         plant.reset(seeds, parameters, state=state)
         fastest = found.fastest
         for _ in range(TICKS):
@@ -110,6 +111,17 @@ def fuzz(
         found = Fuzzed(found.substeps + ROBOTS * TICKS * options.substeps, found.lost + lost, first, fastest)
         note(found)
     return found
+
+
+def lift(robot: Robot, parameters: Parameters, state: PlantState) -> None:
+    """Raise robots until neither wheels nor bodies nor legs are in the floor. A kerb's face may show the way aside, not up."""
+    for _ in range(20):
+        wheels = contacts_at(robot, parameters, truth_of(state), np.zeros((ROBOTS, len(CONTACTS), 3))).depth.max(axis=1)
+        others = spots_at(robot, parameters, truth_of(state), np.zeros((ROBOTS, len(SPOTS), 3))).depth.max(axis=1)
+        deepest = np.maximum(wheels, others)
+        state.position[:, 2] += np.maximum(deepest, 0.0)
+        if (deepest <= 0.0).all():
+            return
 
 
 @dataclass(frozen=True)

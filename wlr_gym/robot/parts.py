@@ -51,7 +51,7 @@ class Hole(NamedTuple):
     diameter: float
 
 
-class Servo(NamedTuple):
+class ServoCase(NamedTuple):
     """Case and horn of a servo, mm; ``u`` is along the case from the axle to the near end, ``v`` across."""
 
     size: Place  #: along the case, along the axle, across
@@ -72,8 +72,8 @@ class Servo(NamedTuple):
 
 
 #: Threads of the case: of each flat side (u, mm behind the front; M2.5, 4 deep at most), of the back (u, v; M2.5 case screws).
-XM540 = Servo((58.5, 44.0, 33.5), 0.165, 13.75, 2.6, 22.0, 8, M25, 10.2, ((-6, 14), (-6, 30), (-38, 14), (-38, 30)))
-XL430 = Servo((46.5, 34.0, 28.5), 0.0572, 11.25, 2.0, 16.0, 4, 2.2, 11.0, ((8, 11), (8, -11), (-32, 11), (-32, -11)))
+XM540 = ServoCase((58.5, 44.0, 33.5), 0.165, 13.75, 2.6, 22.0, 8, M25, 10.2, ((-6, 14), (-6, 30), (-38, 14), (-38, 30)))
+XL430 = ServoCase((46.5, 34.0, 28.5), 0.0572, 11.25, 2.0, 16.0, 4, 2.2, 11.0, ((8, 11), (8, -11), (-32, 11), (-32, -11)))
 #: mm: diameter and height of the hub at the XL430's back; height of the ring on its horn's face.
 HUB, RING = (7.9, 3.9), 1.0
 
