@@ -51,7 +51,7 @@ ROLLING, SWINGING = {"wheel", "tyre"}, {"leg_arm", "wheel_servo"}
 
 
 def test_nothing_is_in_the_way_of_anything(kit):
-    """Over the legs' whole range, what moves keeps its distance, and no two other pieces share room."""
+    """Over the legs' whole range, what moves keeps its distance, and no two other pieces overlap."""
     robot = load_robot("kit")
     for angle in np.linspace(*robot.leg_limits, 7):
         pieces = [piece for piece in posed(kit, robot, [angle] * 4) if piece[0] not in ("cables", "leg_screws")]
@@ -61,7 +61,7 @@ def test_nothing_is_in_the_way_of_anything(kit):
             if group(one) != group(other):
                 assert a.min_gap(b, 2 * CLEARANCE) >= CLEARANCE, f"{one} and {other} at {angle:.2f} rad"
             elif angle == robot.leg_limits[0]:
-                assert (a ^ b).volume() < 1.0, f"{one} and {other} share room"
+                assert (a ^ b).volume() < 1.0, f"{one} and {other} overlap"
 
 
 def group(name):
