@@ -383,8 +383,9 @@ def test_the_same_folder_as_an_arduino_sketch(default_build, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_hour(default_build, tmp_path):
-    hours = float(os.environ.get("FIRMWARE_HOURS", "1"))  # 24 take as long as an evening
+def test_hours(default_build, tmp_path):
+    """Six minutes of emulated time, or FIRMWARE_HOURS; 24 take as long as an evening."""
+    hours = float(os.environ.get("FIRMWARE_HOURS", "0.1"))
     with SimulatedBoard(default_build, tmp_path) as board:
         board.set(board_ppm=1200.0, imu_ppm=3000.0, flow_x=1.3, flow_y=-0.4)
         stream = board.imu()
