@@ -365,7 +365,7 @@ class SlipGains(PidGains):
             Not where legs sweep.
         warp_rise: of the warp's level (0 to 1) per s and rad/s of yaw rate error beyond ``warp_threshold`` (rad/s).
         warp_forget: s in which the level falls to 1/e.
-        warp_reach: at the whole level the legs that the warp unloads reach under the body 1 + so many times as fast.
+        warp_reach: legs that the warp unloads reach under the body 1 + level * warp_reach times as fast.
     """
 
     slip_limit: float = Field(1.0, gt=0)

@@ -273,6 +273,11 @@ STRAPS = tuple((x, s * y) for s in (1, -1) for x, y in ((36.0, 40.0), (-36.0, 40
 INSERTS, INSERT = ((21.0, 12.0), (21.0, -12.0), (-10.0, 12.0), (-10.0, -12.0)), 4.0
 
 
+def _both_sides(y: float, z: float) -> tuple[Place, Place]:
+    """Two places on the body's middle, left and right, mm."""
+    return (0.0, y, z), (0.0, -y, z)
+
+
 def _body(robot: Robot, lacking: float) -> list[Part]:
     x, y, height = 1e3 * robot.hip_position.x, 1e3 * robot.hip_position.y, 1e3 * robot.body.size[2]
     long, deep, _ = XM540.size
@@ -290,7 +295,6 @@ def _body(robot: Robot, lacking: float) -> list[Part]:
     stand = _box((60.0, 22.0, gap / 2 - 1.5)) - _box((44.0, 23.0, gap / 2)).translate((0.0, 0.0, -6.0))
     for at in STAND:
         stand -= _hole(INSERT, 16.0, *at, -gap / 4)
-    sides = lambda py, pz: ((0.0, py, pz), (0.0, -py, pz))  # noqa: E731
     block = _hip_block(gap)
     parts = [
         Part("body_plate_lower", "cut: glass fibre (G10) 2 mm", lower.solid(PLATE), GLASS_FIBRE,
@@ -302,8 +306,8 @@ def _body(robot: Robot, lacking: float) -> list[Part]:
              _mirrored(60.0, edge - 10.0)),
         Part("marker_plate", "cut: PVC foam board 2 mm", marker.solid(2.0), FOAM_BOARD, ((0.0, 0.0, height / 2 + 4.0),),
              sheet=marker),
-        Part("power_hub", "bought: U2D2 power hub board", _box((64.0, 48.0, 18.0)), None, sides(40.0, -23.0), mass=0.035),
-        Part("adapter", "bought: U2D2", _box((48.0, 18.0, 14.6)), None, sides(80.0, -25.0), mass=0.009),
+        Part("power_hub", "bought: U2D2 power hub board", _box((64.0, 48.0, 18.0)), None, _both_sides(40.0, -23.0), mass=0.035),
+        Part("adapter", "bought: U2D2", _box((48.0, 18.0, 14.6)), None, _both_sides(80.0, -25.0), mass=0.009),
         Part("sensor_board", "bought: Arduino Nano and level shifters on strip board", _box((50.0, 40.0, 15.0)), None,
              ((95.0, 0.0, -20.5),), mass=0.025),
         Part("imu_stand", "print: PETG, 2 walls, 15 % infill", stand, 0.3 * PETG, ((0.0, 0.0, -gap / 4 - 0.75),)),
