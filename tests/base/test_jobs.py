@@ -24,6 +24,9 @@ def work(task, send):
     if task["do"] == "die":
         print("the last words", file=sys.stderr)
         os._exit(7)
+    if task["do"] == "tear":
+        os.write(ANSWERS, b'{"text": "half a li')
+        os._exit(0)
     if task["do"] == "raise":
         raise OSError(28, "No space left on device", "a_file")
     send({"threads": os.environ["OMP_NUM_THREADS"]})
@@ -35,6 +38,7 @@ def work(task, send):
         (here / "began").write_text("")
         time.sleep(600)
 
+ANSWERS = os.dup(1)
 serve(work)
 """
 
@@ -58,6 +62,12 @@ def test_one_hears_what_it_says_and_it_has_one_thread(job):
     heard = []
     assert follow(job("speak"), heard.append) == ""
     assert heard == [{"threads": "1"}]
+
+
+def test_a_line_that_its_writer_did_not_end_is_not_heard(job):
+    heard = []
+    assert "process ended with 0" in follow(job("tear"), heard.append)
+    assert heard == []
 
 
 def test_a_log_that_cannot_be_written_is_an_error_of_its_job(job, tmp_path):

@@ -93,8 +93,8 @@ def follow(job: Job, hear: Callable[[dict[str, Any]], object]) -> str:
         last = []
         for line in process.stdout:
             last = [line]
-            if "error" not in json.loads(line):
-                hear(json.loads(line))
+            if (said := read_message(line)) and "error" not in said:
+                hear(said)
         process.wait()
         return outcome(job, process, last)
     finally:
@@ -119,10 +119,15 @@ def start(job: Job) -> Any:
     return process
 
 
+def read_message(line: str) -> dict[str, Any]:
+    """Return what a line says; nothing, where its writer was killed before the end of the line."""
+    return json.loads(line) if line.endswith("\n") else {}
+
+
 def outcome(job: Job, process: Any, last: list[str]) -> str:
     """Return the error of a job that ended; ``last`` is the last line it said."""
-    if last and "error" in (message := json.loads(last[0])):
-        return message["error"]
+    if last and "error" in (said := read_message(last[0])):
+        return said["error"]
     with open(job.log, "rb") as file:
         file.seek(max(0, os.path.getsize(job.log) - 2000))
         said = file.read(2000).decode("utf-8", errors="replace").strip().splitlines()[-1:]

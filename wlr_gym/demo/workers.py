@@ -6,7 +6,6 @@ A worker is a job (:mod:`wlr_gym.base.jobs`): it sends progress and finished sec
 from __future__ import annotations
 
 import contextlib
-import json
 import queue
 import threading
 import traceback
@@ -15,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from wlr_gym.base.errors import InputError, MissingPackageError, require_package
-from wlr_gym.base.jobs import Job, Send, serve, start, stop
+from wlr_gym.base.jobs import Job, Send, read_message, serve, start, stop
 from wlr_gym.demo import diagnosis, policies, retraining
 from wlr_gym.demo.page import FAILED, SKIPPED, Demo, DemoStage, Section, paragraph
 
@@ -69,13 +68,13 @@ def run_workers(demo: Demo, tell: TellWorker) -> tuple[list[Section], bool]:
         while running:
             try:
                 worker, line = inbox.get()
-                message = json.loads(line or "{}")
+                said = read_message(line)
                 if not line:
                     running.pop(worker).wait()
-                elif "section" in message:
-                    found[worker].append(Section(**message["section"]))
-                elif "text" in message:
-                    tell(worker, message["text"], message["share"])
+                elif "section" in said:
+                    found[worker].append(Section(**said["section"]))
+                elif "text" in said:
+                    tell(worker, said["text"], said["share"])
             except KeyboardInterrupt:
                 interrupted = True
                 with contextlib.suppress(KeyboardInterrupt):  # a second one kills them
