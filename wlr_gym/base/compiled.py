@@ -7,53 +7,228 @@ lowered to LLVM; what numba lacks.
 from __future__ import annotations
 
 import ast
+import atexit
+import errno
+import hashlib
 import math
-from collections.abc import Callable, Sequence
-from functools import cache
+import os
+import pickle
+import platform
+import shutil
+import stat
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache, partial
+from pathlib import Path
+from types import CodeType
 from typing import Any
 
+import llvmlite
+import numba
+import numpy as np
 from llvmlite import binding as llvm
 from llvmlite import ir
 from numba import njit, types
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
+from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-#: Decorator of a kernel that only other kernels call: without what Python would call it by, which takes time to compile.
-inner_kernel: Any = njit(  # numba's stubs lack two of the options
-    cache=True,
-    nogil=True,
-    no_cpython_wrapper=True,
-    no_cfunc_wrapper=True,  # pyright: ignore[reportCallIssue]
-)
+from wlr_gym.base.files import try_lock, unlock
+
+#: s that a process waits for another one that compiles the same.
+PATIENCE = 120.0
+
+# ---- machine code that is kept ---------------------------------------------------------------------------------------
+
+
+def cache_directory() -> Path:
+    """Return the folder for all that is compiled: ``$WLR_GYM_CACHE``, else ``wlr_gym`` in the user's cache.
+
+    Where it cannot be written, one for temporary files that nobody else writes to; stderr says so once.
+    """
+    users = os.path.join(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "wlr_gym")
+    wanted = os.path.expanduser(os.environ.get("WLR_GYM_CACHE") or users)
+    return _writable(wanted if wanted.startswith("~") else os.path.abspath(wanted))
+
+
+@cache
+def _writable(wanted: str) -> Path:
+    try:
+        if wanted.startswith("~"):
+            raise OSError(errno.ENOENT, "this user has no home")
+        os.makedirs(wanted, exist_ok=True)
+        with tempfile.TemporaryFile(dir=wanted):
+            return Path(wanted)
+    except OSError as error:
+        folder = _private_folder()
+        text = f"wlr_gym: {wanted} cannot be written ({error.strerror}): compiled kernels are kept in {folder}"
+        print(f"{text}; set WLR_GYM_CACHE to a folder of yours", file=sys.stderr, flush=True)
+        return folder
+
+
+def _private_folder() -> Path:
+    """Return this user's folder among those for temporary files; a new one where others can write to it: it holds code."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(tempfile.gettempdir()) / f"wlr_gym-{user}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    found = folder.lstat()
+    if stat.S_ISDIR(found.st_mode) and (os.name == "nt" or (found.st_uid == user and not found.st_mode & 0o022)):
+        return folder
+    folder = Path(tempfile.mkdtemp(prefix="wlr_gym-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def versions() -> list[str]:
+    """Return what machine code and its files depend on besides the source."""
+    return [sys.version, platform.machine(), numba.__version__, llvmlite.__version__, np.__version__]
+
+
+@contextmanager
+def compiling(name: str) -> Iterator[None]:
+    """Compile what has this name while no other process does, as long as :data:`PATIENCE` lasts: then both do."""
+    part = 1, int.from_bytes(hashlib.sha256(name.encode()).digest()[:7])  # of a file that holds nothing: one byte a name
+    file = _lock_file(cache_directory())
+    deadline = time.monotonic() + PATIENCE
+    while not (held := try_lock(file, *part)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    try:
+        yield
+    finally:
+        if held:
+            unlock(file, *part)
+
+
+@cache
+def _lock_file(folder: Path) -> int:
+    return os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o666)  # stays open: closing it would free all of its locks
+
+
+@cache
+def _file_hash(path: str, changed: int) -> bytes:
+    return hashlib.sha256(Path(path).read_bytes()).digest()
+
+
+class _Place(InTreeCacheLocator):
+    """Where a function's machine code lies: a folder of the cache for its module's folder and the versions in use."""
+
+    def __init__(self, py_func: Any, py_file: str) -> None:
+        super().__init__(py_func, py_file)
+        self._cache_path = _folder_of(os.path.dirname(os.path.abspath(py_file)), cache_directory())
+
+    def get_source_stamp(self) -> bytes:
+        return _file_hash(self._py_file, os.stat(self._py_file).st_mtime_ns)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        return cls(py_func, py_file)
+
+
+@cache
+def _folder_of(sources: str, within: Path) -> str:
+    name = hashlib.sha256("\0".join([sources, *versions()]).encode()).hexdigest()[:16]
+    return str(within / f"{os.path.basename(sources)}_{name}")
+
+
+class _Content(CompileResultCacheImpl):
+    """Machine code as it is filed, with a checksum: what a power failure left of a file is not run."""
+
+    _locator_classes = [_Place]  # noqa: RUF012
+
+    def reduce(self, cres: Any) -> Any:
+        kept = dumps(super().reduce(cres))
+        return zlib.crc32(kept), kept
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        checksum, kept = payload
+        if zlib.crc32(kept) != checksum:
+            raise ValueError("not what was written")
+        return super().rebuild(target_context, pickle.loads(kept))
 
 
 class _Kept(FunctionCache):
-    """Machine code beside the source; what another version left there and cannot be read any more counts as none.
+    """Machine code of one function, from one process to the next; a file that cannot be used counts as none.
 
-    numba reads the whole index, classes of its arguments included, before it asks whether the index is of this source: where
-    such a class has been moved or renamed since, its own cache fails.
+    It is used as long as the function's file is the same, and so are the functions that it calls and the numbers that it names.
     """
+
+    _impl_class = _Content
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        self._own = f"{self._impl.locator.get_source_stamp().hex()} {function.__qualname__}"  # now: of the code that is loaded
+        self._compiling = ExitStack()
+
+    def stamp(self, seen: set[str]) -> set[str]:
+        """Add to ``seen``, and return, what the machine code depends on."""
+        if self._own not in seen:
+            seen.add(self._own)
+            known = self._py_func.__globals__
+            for name in _names(self._py_func.__code__):
+                value = known.get(name)
+                if isinstance(kept := getattr(value, "_cache", None), _Kept):
+                    kept.stamp(seen)
+                elif isinstance(value, int | float | str | tuple | np.generic) and " at 0x" not in (text := repr(value)):
+                    seen.add(f"{name} = {text}")
+        return seen
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        self._cache_file._source_stamp = " ".join(sorted(self.stamp(set())))
+        found = self._load(sig, target_context)
+        if found is None:
+            self._compiling.enter_context(compiling(f"{self.cache_path} {self._impl.filename_base}"))
+            found = self._load(sig, target_context)  # who held it may have kept it
+        if found is not None:
+            self._compiling.close()
+        return found
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
-        except Exception:  # whatever a file of another version makes its reader raise
-            self.flush()
+        except Exception:  # whatever a torn file, or one of another version, makes its reader raise
+            with suppress(OSError):
+                self.flush()
             return None
 
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with self._compiling, suppress(OSError):  # a full disk: the next process compiles it again
+            super().save_overload(sig, data)
 
-def compiled(function: Callable[..., Any], *signatures: Any) -> Any:
-    """Compile a function at its first call, or at once for given signatures only, and keep it (``numba.njit`` with a cache).
 
-    For functions whose arguments are named tuples of this package; those of arrays and numbers need no more than numba's own.
+def _names(code: CodeType) -> Iterator[str]:
+    """Names that a function's code looks up, those of functions inside it included."""
+    yield from code.co_names
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            yield from _names(inner)
+
+
+def compiled(function: Callable[..., Any] | None = None, *, signatures: Sequence[Any] = (), **options: Any) -> Any:
+    """Decorate a function that is compiled at its first call and kept: ``numba.njit`` with the cache of this package.
+
+    Args:
+        function: to compile.
+        signatures: compile it at once, for these only.
+        options: of ``numba.njit``.
     """
-    dispatcher = njit(nogil=True)(function)
+    if function is None:
+        return partial(compiled, signatures=signatures, **options)
+    dispatcher = njit(nogil=True, **options)(function)
     dispatcher._cache = _Kept(function)  # pyright: ignore[reportAttributeAccessIssue]
     for signature in signatures:
         dispatcher.compile(signature)
     if signatures:
         dispatcher.disable_compile()
     return dispatcher
+
+
+#: Decorator of a kernel that only other kernels call: without what Python would call it by, which takes time to compile.
+inner_kernel = partial(compiled, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 # ---- straight-line source as LLVM instructions -----------------------------------------------------------------------

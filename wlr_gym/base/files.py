@@ -182,21 +182,29 @@ def locked(path: Path, patience: float) -> Iterator[None]:
     for_so_long = f" for {patience:g} s" if patience else ""
     with file:
         deadline = time.monotonic() + patience
-        while not _lock(file.fileno()):
+        while not try_lock(file.fileno()):
             if time.monotonic() > deadline:
                 raise InputError(f"{path}: held by another process{for_so_long}: something else works on the same")
             time.sleep(0.1)
         yield
 
 
-def _lock(descriptor: int) -> bool:
-    """Lock an open file, until it is closed; return whether that is so."""
+def try_lock(descriptor: int, *part: int) -> bool:
+    """Lock an open file until it is closed, or only a part (length, start) of it; return whether no other process holds it."""
     try:
         import fcntl
 
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, *part)
     except (BlockingIOError, PermissionError):
         return False
     except (ImportError, OSError):
         return True
     return True
+
+
+def unlock(descriptor: int, *part: int) -> None:
+    """Let go what :func:`try_lock` locked."""
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.lockf(descriptor, fcntl.LOCK_UN, *part)

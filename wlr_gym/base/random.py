@@ -13,10 +13,9 @@ import hashlib
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.base.compiled import bits_of, number_of_bits
+from wlr_gym.base.compiled import bits_of, compiled, number_of_bits
 
 _LOW = np.uint64(0xFFFFFFFF)
 _HALF_WORD = np.uint64(32)
@@ -33,7 +32,7 @@ _WORD = 2.0**-32
 _QUARTER_TURN = 1.5707963267948966 * 2.0**-30
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
     """Philox4x32-10: four 32-bit random words from four counter words and two key words, each held in a uint64."""
     for _ in range(10):
@@ -45,14 +44,14 @@ def philox(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
     return c0, c1, c2, c3
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def words4(seed: Any, stream: Any, counter: Any, block: Any) -> Any:
     """Four random 32-bit words: key = seed, counter words = (block, stream, counter low, counter high)."""
     count = np.uint64(counter)
     return philox(np.uint64(block), stream & _LOW, count & _LOW, count >> _HALF_WORD, seed & _LOW, seed >> _HALF_WORD)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def _minus_log(u: float) -> float:
     """-ln(u) for a normal float in (0, 1], error below 2e-16 relative to max(1, -ln u)."""
     bits = bits_of(u)  # pyright: ignore[reportCallIssue]
@@ -71,7 +70,7 @@ def _minus_log(u: float) -> float:
     return -(exponent * _LN_2 + 2.0 * (s + s * x * p))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def _normal_pair(radius_word: Any, angle_word: Any) -> Any:
     """Two independent standard normals (Box-Muller) from two 32-bit words; at most 6.7 standard deviations.
 
@@ -93,7 +92,7 @@ def _normal_pair(radius_word: Any, angle_word: Any) -> Any:
     return first * (c - s), second * (c + s)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def normals4(seed: Any, stream: Any, counter: Any, block: Any) -> Any:
     """Four independent standard normals, a function of these numbers alone; ``seed`` and ``stream`` are uint64."""
     a, b, c, d = words4(seed, stream, counter, block)
@@ -141,21 +140,21 @@ def spawn_seeds(seed: int | None, count: int, *names: str | int) -> NDArray[np.u
 _EPISODE = stream_number("episode")
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def uniform(seed: Any, stream: Any, counter: Any) -> Any:
     """One uniform number in [0, 1) of 53 bits: a function of (seed, stream, counter) alone."""
     high, low, _, _ = words4(seed, stream, counter, 0)
     return float(np.int64(((high >> np.uint64(5)) << np.uint64(26)) | (low >> np.uint64(6)))) * 2.0**-53
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _fill_uniforms(seeds: Any, streams: Any, counters: Any, out: Any) -> None:
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             out[row, column] = uniform(seeds[row, column], streams[column], counters[row, column])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _fill_seeds(seeds: Any, stream: Any, counters: Any, out: Any) -> None:
     for row in range(out.shape[0]):
         high, low, _, _ = words4(seeds[row], stream, counters[row], 0)

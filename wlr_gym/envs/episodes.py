@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium.error import ResetNeeded
-from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.random import episode_seeds, stream_number, stream_numbers, uniform, uniforms
 from wlr_gym.base.snapshot import RowStore
@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _count_step(mask: Any, limit: int, over: Any, steps: Any, sooner: Any, terminated: Any, truncated: Any) -> bool:
     """Count a step and set the end flags. Returns whether any episode ended."""
     any_done = False
@@ -152,7 +152,7 @@ TIMING = np.dtype([(name, np.float64) for name in ("hold_low", "hold_high", "zer
 # step (N,), how often they were drawn (N,). A plain tuple: numba takes twice as long to receive a named one.
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _draw(i: int, now: int, seed: Any, ranges: Any, timing: Any, buffers: Any) -> None:
     """Draw where robot i's commands go to and how long they stay there."""
     _, target, given, until, draws = buffers
@@ -170,7 +170,7 @@ def _draw(i: int, now: int, seed: Any, ranges: Any, timing: Any, buffers: Any) -
             target[i, c] = 0.0 if stop else ranges[c].low + (ranges[c].high - ranges[c].low) * u
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _follow(i: int, ranges: Any, buffers: Any) -> None:
     """Move robot i's commands towards their targets, no further than they may change in a step."""
     command, target, _, _, _ = buffers
@@ -182,7 +182,7 @@ def _follow(i: int, ranges: Any, buffers: Any) -> None:
             command[i, c] += math.copysign(ranges[c].change, change)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _begin(mask: Any, seeds: Any, ranges: Any, timing: Any, buffers: Any) -> None:
     """Draw the first commands of an episode. Those that ramp begin at zero."""
     command, _, given, _, draws = buffers
@@ -196,7 +196,7 @@ def _begin(mask: Any, seeds: Any, ranges: Any, timing: Any, buffers: Any) -> Non
             _follow(i, ranges, buffers)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _advance(mask: Any, seeds: Any, steps: Any, ranges: Any, timing: Any, buffers: Any) -> None:
     """Draw new commands where their time is up, and let commands ramp."""
     _, _, _, until, _ = buffers

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import normals4, stream_numbers, uniforms
 from wlr_gym.base.snapshot import RowStore
@@ -66,7 +66,7 @@ PICKED = np.dtype([("matrix", np.int64), ("column", np.int64), ("limit", np.floa
 # readings, and the policy observation (N, D). Plain tuples: numba takes twice as long to receive named ones.
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _observe(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, tables: Any, buffers: Any) -> None:
     """Take all readings, and show those of the right age. ``first``: the episode starts, older readings are as this one."""
     readings, shown = tables
@@ -74,7 +74,7 @@ def _observe(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, table
     _show(mask, steps, shown, buffers)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _read(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, readings: Any, buffers: Any) -> None:
     """Take the readings into the ring."""
     sensors, estimate, truth, command, action, _, _, _, _, computed = signals
@@ -108,7 +108,7 @@ def _read(mask: Any, first: bool, signals: Any, seeds: Any, steps: Any, readings
                     ring[i, k, w] = value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _show(mask: Any, steps: Any, shown: Any, buffers: Any) -> None:
     """Assemble the observation from readings of the right age."""
     _, delays, ring, policy = buffers
@@ -130,7 +130,7 @@ def _show(mask: Any, steps: Any, shown: Any, buffers: Any) -> None:
             policy[i, d] = column.scale * min(max(value, -column.limit), column.limit)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _pick(mask: Any, signals: Any, picked: Any, out: Any) -> None:
     """Copy columns of the truth and of what is computed, clipped to a limit and scaled."""
     _, _, truth, _, _, _, _, _, _, computed = signals
@@ -242,7 +242,7 @@ _FLOAT32 = np.dtype(np.float32)
 SCALING = np.dtype([(name, np.float64) for name in ("centre", "scale", "low", "high")])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _take(mask: Any, given: Any, limit: float, scaling: Any, buffers: Any) -> int:
     """Check actions (N, 8) and turn them into setpoints; nothing is written when one is bad.
 

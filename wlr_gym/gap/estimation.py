@@ -27,12 +27,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 from scipy.special import stdtrit
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.base.jobs import in_threads
 from wlr_gym.gap.analysis import ParameterEstimate
 from wlr_gym.gap.problem import Array, Candidate, Problem, Quantity, Setting, Unknown
@@ -133,7 +133,7 @@ def autocorrelation_times(series: Sequence[Array]) -> Array:
     return _integrated(np.concatenate(series, axis=1, dtype=np.float64), edges, LONGEST)
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
+@compiled(fastmath={"reassoc"})
 def _lagged(values: Any, first: Any, last: Any, lag: Any) -> Any:
     """Sum of products of values a lag apart, side by side in vector registers."""
     late, early = values[first:last], values[first - lag : last - lag]
@@ -143,7 +143,7 @@ def _lagged(values: Any, first: Any, last: Any, lag: Any) -> Any:
     return total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _integrated(series: Any, edges: Any, longest: Any) -> Any:
     """Integrated autocorrelation (channels) of series (channels, rows) of several runs that begin at ``edges``."""
     channels = len(series)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.perception.markers.camera import Camera
 from wlr_gym.perception.markers.targets import CODES, Target
 from wlr_gym.robot import CORNER_SIGNS, Robot
@@ -276,7 +276,7 @@ def develop(light: NDArray[np.float32], look: Look, seed: int) -> Image:
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _uneven(x: float, y: float) -> float:
     """Smooth noise in [-1, 1] with a grain of 6 cm."""
     x, y = x / 0.06, y / 0.06
@@ -292,7 +292,7 @@ def _uneven(x: float, y: float) -> float:
     return total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _shade(packed: Any, facet: int, x: float, y: float) -> float:
     _, kinds, _, circles, tags, cells = packed
     kind = kinds[facet]
@@ -312,7 +312,7 @@ def _shade(packed: Any, facet: int, x: float, y: float) -> float:
     return shade
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _cast(rays: Any, packed: Any, box: Any, samples: int, first: int, image: Any) -> None:
     """Render the pixels of ``box`` that may show facet ``first`` or a later one.
 
@@ -338,7 +338,7 @@ def _cast(rays: Any, packed: Any, box: Any, samples: int, first: int, image: Any
             image[v, u] = mean
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _pixel(corners: Any, packed: Any, near: Any, samples: int, turn: int) -> tuple[float, float]:
     """Mean and range of the brightness over a pixel; its rays take turns through the instants of the exposure."""
     geometry, kinds = packed[0], packed[1]

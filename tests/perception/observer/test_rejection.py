@@ -7,6 +7,7 @@ import pytest
 
 from studies.observer.runs import PERIOD, Runs, changed, estimated, observe, simulate, without_flow
 from wlr_gym.perception.observer import SlipObserver, trust
+from wlr_gym.perception.observer.observer import load_trust
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import load_robot
 from wlr_gym.robot.description import FlowSensor
@@ -106,7 +107,7 @@ def test_the_compiled_network_is_the_one_that_was_trained():
     runs = simulate("gibbs_appell", "split", "commands", 1, 0.5, seed=2)
     observer, everyone = SlipObserver(runs.robot, PERIOD, 1, False), np.ones(1, bool)
     observer.reset(everyone, runs.sensors[0])
-    net = trust.load_trust()
+    net = load_trust()
 
     def squash(x):
         x = np.clip(x, -3, 3)
@@ -135,9 +136,9 @@ def test_the_filter_that_was_trained_is_the_compiled_one():
     runs = simulate("gibbs_appell", "slippery", "commands", 4, 2.0, seed=4)
     d = {name: torch.from_numpy(values) for name, values in training._prepared(runs).items()}
     net = training.Trust()
-    net.start_from(trust.load_trust())
+    net.start_from(load_trust())
     for name, values in net.arrays().items():
-        np.testing.assert_allclose(values, trust.load_trust()[name], rtol=1e-5)
+        np.testing.assert_allclose(values, load_trust()[name], rtol=1e-5)
     never = {f"{name}_{end}": torch.full((4,), 1000) for name in ("camera", "flow") for end in ("on", "off")}
     zero = torch.zeros(101, 4, 2)
     sensors = never | {"camera_noise": zero, "flow_noise": zero, "flow_scale": torch.zeros(4)}

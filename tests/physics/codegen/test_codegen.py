@@ -1,7 +1,5 @@
 """The tracer gives what numpy gives, and compiled kernels give it bit for bit at any width."""
 
-import os
-import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -9,14 +7,12 @@ import numpy as np
 import pytest
 from llvmlite import binding
 
-from wlr_gym.base.errors import InputError
 from wlr_gym.physics.codegen import Graph, emit, hoist, load_module, ops, straight_line_source
-from wlr_gym.physics.codegen.compilation import cache_directory
 
 
 @pytest.mark.skipif(not binding.get_host_cpu_features().get("avx512f"), reason="no vector registers of 512 bits")
 def test_whole_registers_are_used_where_they_are_asked_for():
-    lines = ["@njit", "def run(x):", "    whole_registers()", "    w = numbers_of(x)"]
+    lines = ["@compiled", "def run(x):", "    whole_registers()", "    w = numbers_of(x)"]
     lines += ["    for k in range(256):", "        w[k] = fma(w[k + 256], w[k + 256], w[k])", ""]
     run = load_module("test_registers", "\n".join(lines)).run
     run(np.ones(512, np.float32))
@@ -64,19 +60,6 @@ def test_threads_that_load_a_module_at_once_are_given_it_whole(monkeypatch, tmp_
     assert found == [tmp_path.name] * 4
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="users of other systems have no number")
-def test_code_is_not_taken_from_another_users_folder(monkeypatch, tmp_path):
-    (tmp_path / "no_folder").touch()
-    monkeypatch.setenv("WLR_GYM_CACHE", str(tmp_path / "no_folder"))
-    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
-    assert cache_directory().parent == tmp_path
-    owner = os.getuid()
-    (tmp_path / f"wlr_gym-{owner + 1}").mkdir()
-    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-    with pytest.raises(InputError, match="is another user's"):
-        cache_directory()
-
-
 def test_a_compact_block_overwrites_what_it_reads_without_losing_it():
     """Outputs are stored early, yet never before the input of their name is read: a swap, a chain, and a plain number."""
     owner = Graph()
@@ -94,7 +77,7 @@ def test_a_compact_block_overwrites_what_it_reads_without_losing_it():
 
 
 INPUTS, WIDTH = 6, 8
-PLAIN = "@njit(nogil=True, error_model='numpy')"
+PLAIN = "@compiled(error_model='numpy')"
 
 
 def expressions(a, b, c, d, e, f) -> dict[str, Any]:

@@ -251,7 +251,7 @@ def _compile(
     return TermKernel(module.run, np.array([number(task, name) for name in numbers], dtype=np.float64))
 
 
-_DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
+_DECORATOR = "@compiled(error_model='numpy')"
 _UNPACK = f"    {', '.join(MATRICES)} = signals"
 _SCORES_HEAD = (
     "def run(active, signals, numbers, scores):",

@@ -293,7 +293,7 @@ def _strength_and_load_friction(lanes: Lanes, voltage: Value, motor_rate: Value)
 # ---- its law compiled: many models over one run, restarted where a window begins -------------------------------------
 
 _DRIVER = '''
-@njit(cache=True, nogil=True, error_model="numpy")
+@compiled(error_model="numpy")
 def simulate(P, lag, setpoints, inputs, starts, begun, step, out):
     """See the function of this name below. P: parameters; inputs: supply, switch, warmth."""
     count = setpoints.shape[0]

@@ -20,7 +20,7 @@ from functools import cache
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit, typeof, types
+from numba import typeof, types
 from numpy.typing import NDArray
 
 from wlr_gym.base.compiled import compiled
@@ -539,7 +539,7 @@ def take(tick: Any, readings: Any, truth: Any, tape: Any) -> None:
             tape.next_row[r] += 1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _store(readings: Any, shift: Any, out: Any) -> None:
     """Copy the readings of a tick (robots, SENSOR_LAYOUT.width) as channels but the camera's (robots, len(CHANNELS)).
 
@@ -586,7 +586,7 @@ def _read_row(tick: Any, place: Any, first: Any, settings: Any, out: Any, apart:
                 row[c] = last[c] + share * (now[c] - last[c])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _show(stored: Any, offset: Any, places: Any, mount: Any, scale: Any, out: Any) -> None:
     """Fill what the camera shows of the marker: x, y, heading, z and pitch (settings, rows, 5).
 
@@ -615,7 +615,7 @@ def _show(stored: Any, offset: Any, places: Any, mount: Any, scale: Any, out: An
             out[i, row, 0], out[i, row, 1] = cosine * x + sine * y, cosine * y - sine * x
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _pose(stored: Any, offset: Any, out: Any) -> None:
     """x, y, heading, z and pitch (5) of the marker of one body."""
     w, x, y, z = stored[3], stored[4], stored[5], stored[6]
@@ -673,12 +673,9 @@ def _loop(function: Any, batch: CompiledTick, schedule: Schedule, tape: Tape) ->
 
 @cache
 def _compiled(signature: Any, batch: Any, schedule: Any, tape: Any) -> Any:
-    """The loop for arguments of these types: one for all engine functions, which are called by their address.
-
-    numba keeps it with the sensor model compiled in (``measure_rows``), and looks at this file only to tell whether it is old.
-    """
+    """The loop for arguments of these types: one for all engine functions, which are called by their address."""
     arguments = (types.FunctionType(signature), batch, schedule, tape, types.int64, types.int64)
-    return compiled(_ticks, types.void(*arguments))
+    return compiled(_ticks, signatures=[types.void(*arguments)])
 
 
 def _ticks(function: Any, batch: Any, schedule: Any, tape: Any, first: int, last: int) -> None:

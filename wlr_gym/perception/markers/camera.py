@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
@@ -102,7 +102,7 @@ def save_camera(path: str | Path, camera: Camera) -> None:
 # --- kernels ----------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def distort(camera: Any, x: float, y: float) -> tuple[float, float]:
     """Pixel of a direction (x, y, 1) in the camera frame."""
     r2 = x * x + y * y
@@ -113,7 +113,7 @@ def distort(camera: Any, x: float, y: float) -> tuple[float, float]:
     return camera[0] * dx + camera[2], camera[1] * dy + camera[3]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def undistort(camera: Any, u: float, v: float) -> tuple[float, float]:
     """Direction (x, y, 1) of a pixel: Newton's method on :func:`distort`, to 1e-12."""
     tx, ty = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1]

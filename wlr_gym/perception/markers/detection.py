@@ -21,10 +21,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from wlr_gym.base.compiled import inner_kernel
+from wlr_gym.base.compiled import compiled, inner_kernel
 from wlr_gym.perception.markers.camera import Camera, undistort
 from wlr_gym.perception.markers.targets import CODE_NAMES, ring_radii
 
@@ -49,7 +48,7 @@ _EDGE_FLOOR = 0.02  # px; 1 sigma no edge point is trusted below
 _CENTRE_FLOOR = 0.008  # px; likewise for a centre
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def brightness(image: Any, x: float, y: float) -> float:
     """Bilinear brightness; NaN outside the image."""
     height, width = image.shape
@@ -248,7 +247,7 @@ def _change(ellipse: Any, answer: Any) -> None:
         ellipse[k], ellipse[k + 1] = a * xx + b * xy, a * xy + b * yy
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def fit_marker(
     image: Any, camera: Any, ellipse: Any, radii: Any, centres: Any, covariances: Any, shape: Any, quality: Any
 ) -> bool:
@@ -492,7 +491,7 @@ def _identify(image: Image, camera: Array, ellipse: Array) -> Detection | None:
     return None
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _match(image: Any, ellipse: Any, radii: Any, profiles: Any, grid: Any, scores: Any) -> None:
     """Correlate the mean profile around an ellipse with every code, taking the ellipse for each of its edges."""
     profile = np.empty(grid.shape[0])

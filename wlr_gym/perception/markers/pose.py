@@ -19,10 +19,9 @@ from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from wlr_gym.base.compiled import inner_kernel
+from wlr_gym.base.compiled import compiled, inner_kernel
 from wlr_gym.perception.markers.camera import Camera, distort
 from wlr_gym.perception.markers.detection import Detection, solve_normal
 from wlr_gym.perception.markers.targets import CODE_NAMES, Target, ring_radii
@@ -231,7 +230,7 @@ _IDENTITY = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 # --- kernels ----------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def circle_centres(places: Any, radii: Any, rotation: Any, position: Any, centres: Any) -> None:
     """Fill ``centres`` (K, 2) with the centres of the ellipses that circles at ``places`` (K, 3) with ``radii`` (K,) show."""
     nx, ny, nz = rotation[0, 2], rotation[1, 2], rotation[2, 2]
@@ -245,7 +244,7 @@ def circle_centres(places: Any, radii: Any, rotation: Any, position: Any, centre
         centres[k, 0], centres[k, 1] = (x * z + square * nx * nz) / below, (y * z + square * ny * nz) / below
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def move(rotation: Any, position: Any, step: Any, new_rotation: Any, new_position: Any) -> None:
     """Move a pose by ``step`` (6,), a rotation vector, then a shift; the new pose may be in the same arrays as the old one."""
     x, y, z = step[0], step[1], step[2]
@@ -275,7 +274,7 @@ def _residuals(measured: Any, roots: Any, places: Any, radii: Any, rotation: Any
     return total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _least_squares(
     measured: Any, roots: Any, places: Any, radii: Any, rotation: Any, position: Any, covariance: Any, residual: Any
 ) -> bool:
@@ -331,7 +330,7 @@ def _least_squares(
     return math.isfinite(cost) and position[2] > 0.0 and solve_normal(covariance, gradient)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _expected(centre: Any, rotation: Any, radius: float, camera: Any) -> Any:
     """Image (6,) of a circle with that centre in the camera frame; NaN too near or behind the camera."""
     ellipse = np.full(6, math.nan)

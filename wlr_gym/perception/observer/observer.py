@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore
 from wlr_gym.perception.observer import slip_filter
 from wlr_gym.perception.observer.slip_filter import DIRECTION_SIZE, ESTIMATE_LAYOUT
-from wlr_gym.perception.observer.trust import MEMORY, WORK, load_trust
+from wlr_gym.perception.observer.trust import MEMORY, WORK
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT
 from wlr_gym.robot import CORNER_SIGNS, Robot
 from wlr_gym.robot.parameter_table import SPECS
@@ -22,6 +23,12 @@ Mask = NDArray[np.bool_]
 
 _ROUNDING = 12.0**-0.5  # 1 sigma of rounding to whole counts
 _LEAST = 1e-4  # rad/s and m/s2; what an ideal encoder and accelerometer count as: errors are divided by
+
+
+def load_trust() -> dict[str, Array]:
+    """Return the shipped network of ``trust.py``: weights (outputs, inputs), and what else was learned with it."""
+    with (files("wlr_gym.perception.observer") / "trust.npz").open("rb") as file, np.load(file) as data:
+        return {name: data[name].astype(np.float64) for name in data.files}
 
 
 def constants(robot: Robot, period: float, camera: bool) -> NDArray[np.void]:

@@ -18,8 +18,7 @@ import math
 from collections import namedtuple
 from typing import Any
 
-from numba import njit
-
+from wlr_gym.base.compiled import compiled
 from wlr_gym.perception.observer.trust import LEAST_LOAD, gather, judge
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Channel, Layout
 from wlr_gym.robot import FIRST_WHEEL, WHEELS
@@ -70,7 +69,7 @@ VELOCITY, LEAK, LENS = 1, 2, 3
 DIRECTION_SIZE = 4
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def predict_direction(p: Any, step: float, velocity_noise: float, leak_noise: float) -> None:
     """P = F P F' + diag(0, velocity_noise, leak_noise, 0) over ``step`` s; ``p`` (4, 4) is changed."""
     half = 0.5 * step * step
@@ -84,7 +83,7 @@ def predict_direction(p: Any, step: float, velocity_noise: float, leak_noise: fl
     p[LEAK, LEAK] += leak_noise
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def see_velocity(p: Any, age: float, flow: float, column: Any) -> float:
     """Put P h' of the measurement of the velocity ``age`` s ago less e ``flow`` into ``column`` (4,); return h P h'.
 
@@ -95,7 +94,7 @@ def see_velocity(p: Any, age: float, flow: float, column: Any) -> float:
     return column[VELOCITY] + age * column[LEAK] - flow * column[LENS]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def see_position(p: Any, age: float, column: Any) -> float:
     """Put P h' of the measurement of the position ``age`` s ago into ``column`` (4,); return h P h'."""
     half = 0.5 * age * age
@@ -104,7 +103,7 @@ def see_position(p: Any, age: float, column: Any) -> float:
     return column[0] - age * column[VELOCITY] - half * column[LEAK]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def correct_direction(p: Any, column: Any, innovation: float, total: float, change: Any) -> None:
     """Take in a measurement that came out ``innovation`` above its prediction, with the variance ``total`` of that.
 
@@ -118,7 +117,7 @@ def correct_direction(p: Any, column: Any, innovation: float, total: float, chan
             p[j, k] = p[k, j] = p[j, k] - gain * column[k]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def correct(r: Any, k: int, innovation: float, total: float) -> None:
     """Correct direction ``k`` by the measurement whose P h' is in ``r.column``."""
     correct_direction(r.covariance[k], r.column, innovation, total, r.change)
@@ -130,7 +129,7 @@ def correct(r: Any, k: int, innovation: float, total: float) -> None:
     r.lens[k] += r.change[LENS]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def correct_yaw(r: Any, of_yaw: float, of_bias: float, innovation: float, total: float) -> None:
     """Correct yaw and gyroscope bias by a measurement of of_yaw yaw + of_bias bias; ``total``: the innovation's variance."""
     p = r.yaw_covariance
@@ -145,7 +144,7 @@ def correct_yaw(r: Any, of_yaw: float, of_bias: float, innovation: float, total:
 # --- wheels and floor -------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def look(robot: Any, sensors: Any, r: Any) -> None:
     """Find heading, left and contact points for floor normal and rate of turn of the body, and how each wheel rolls.
 
@@ -175,14 +174,14 @@ def look(robot: Any, sensors: Any, r: Any) -> None:
         r.rolling[i, 0], r.rolling[i, 1], r.lift[i] = -ahead, -aside, -up
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _along_floor(r: Any, x: float, y: float, z: float) -> Any:
     """Return a vector of the body frame along heading, left and normal."""
     h, left, n = r.heading, r.left, r.normal
     return h[0] * x + h[2] * z, left[0] * x + left[1] * y + left[2] * z, n[0] * x + n[1] * y + n[2] * z
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _centre_of_mass(robot: Any, r: Any) -> Any:
     """Centre of mass of the whole robot along heading, left and normal, m."""
     x, y, z = robot.body_mass * robot.body_com[0], robot.body_mass * robot.body_com[1], robot.body_mass * robot.body_com[2]
@@ -195,7 +194,7 @@ def _centre_of_mass(robot: Any, r: Any) -> Any:
     return _along_floor(r, x / robot.mass, y / robot.mass, z / robot.mass)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def carry(robot: Any, r: Any) -> Any:
     """Find the normal forces that hold the robot: ``r.load`` (4,) N; return the tilt of the floor they imply.
 
@@ -255,7 +254,7 @@ def carry(robot: Any, r: Any) -> Any:
     return b, c
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def pull(robot: Any, sensors: Any, r: Any) -> None:
     """Find the traction of every wheel, ``r.traction`` (4,) N: effort less gear friction and spin inertia, over the radius.
 
@@ -281,14 +280,14 @@ _SETTLE = 1.5  # s: how fast the tilt follows the legs
 _SMOOTH = 0.06  # s: low-pass of the friction demand
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rate_noise(robot: Any, changed: Any) -> Any:
     """Variance (rad2/s2) of a gyroscope's reading that has changed by so much, rad/s."""
     missed = _ALIAS * changed
     return robot.gyro_noise**2 + missed * missed
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def shaking(robot: Any, changed: Any, square: Any) -> Any:
     """Variance (m2/s4) of what one reading of the specific force per step misses, that has ``changed`` by so much, m/s2.
 
@@ -297,13 +296,13 @@ def shaking(robot: Any, changed: Any, square: Any) -> Any:
     return (robot.alias * changed) ** 2 + robot.velocity_legs**2 * square
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def leak_noise(robot: Any, square: Any) -> Any:
     """Variance per s (m2/s5) of the walk of the accelerometer's leak; ``square``: mean square of the legs' rates."""
     return robot.leak_wander**2 + robot.leak_legs**2 * square
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def turn(robot: Any, r: Any) -> None:
     """Turn floor normal and heading with the gyroscope."""
     before, dt = r.yaw_rate, robot.period
@@ -323,27 +322,27 @@ def turn(robot: Any, r: Any) -> None:
     c[2] += _GYRO_WANDER**2 * dt
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _mean_rate(r: Any, factor: float) -> Any:
     """Return the mean angular velocity over the step, body frame, times a factor."""
     w, last = r.rate, r.last_rate
     return 0.5 * factor * (w[0] + last[0]), 0.5 * factor * (w[1] + last[1]), 0.5 * factor * (w[2] + last[2])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def set_normal(r: Any, x: float, y: float, z: float) -> None:
     scale = 1.0 / math.sqrt(x * x + y * y + z * z)
     r.normal[0], r.normal[1], r.normal[2] = x * scale, y * scale, z * scale
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def measure_force(r: Any) -> None:
     """Turn the accelerometer's reading into the heading frame: ``r.last_force``."""
     x, y, z = r.seen[SENSOR.accelerometer], r.seen[SENSOR.accelerometer + 1], r.seen[SENSOR.accelerometer + 2]
     r.last_force[0], r.last_force[1], r.last_force[2] = _along_floor(r, x, y, z)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def sense_force(robot: Any, r: Any) -> None:
     """Mean specific force over the step, how much it changed along the floor, and friction demand."""
     last = (r.last_force[0], r.last_force[1], r.last_force[2])
@@ -356,7 +355,7 @@ def sense_force(robot: Any, r: Any) -> None:
     r.shaken = math.sqrt((r.last_force[0] - last[0]) ** 2 + (r.last_force[1] - last[1]) ** 2)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def move(robot: Any, r: Any) -> None:
     """Carry pose and velocity over the step."""
     dt, turned = robot.period, r.turned
@@ -388,7 +387,7 @@ def move(robot: Any, r: Any) -> None:
     r.raw_velocity[1] += kick_y
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def spread(robot: Any, r: Any) -> None:
     """Carry the uncertainty over the step."""
     dt = robot.period
@@ -405,7 +404,7 @@ def spread(robot: Any, r: Any) -> None:
         predict_direction(r.covariance[k], dt, velocity_noise, r.wander[1] * wander)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def settle(robot: Any, r: Any) -> None:
     """Loads of the wheels; let the tilt follow the legs."""
     b, c = carry(robot, r)
@@ -430,7 +429,7 @@ RADIUS = 0.005  # relative error of one wheel's radius
 _GRIPPING_SLIP = 0.003  # m/s: slip below which a wheel counts as gripping
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def guess_velocity(r: Any) -> None:
     """Begin with the geometric median of the wheels' rolling velocities: some spin while a robot is put down."""
     for _ in range(4):
@@ -444,7 +443,7 @@ def guess_velocity(r: Any) -> None:
         r.velocity[0], r.velocity[1] = x / total, y / total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def see_rolling(robot: Any, r: Any) -> None:
     """Take in how the wheels roll, each as far as it is trusted: their weighted mean is a measurement of the velocity."""
     speed, share = 0.0, 1.0 - robot.period / _DOUBT
@@ -464,7 +463,7 @@ def see_rolling(robot: Any, r: Any) -> None:
         correct(r, k, innovation, max(total, innovation * innovation / _ROLLING_GATE))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def see_rest(robot: Any, r: Any) -> None:
     """While every joint rests, the gyroscope reads its bias."""
     for k in range(8):
@@ -485,7 +484,7 @@ _SAME, _SAME_YAW = 0.006, 0.03  # m, rad: what counts as the same
 _CAMERA_SILENCE = 0.5  # s without a frame after which nothing is said about the last one
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def see_camera(robot: Any, sensors: Any, r: Any) -> None:
     """Take in a camera pose where there is a new one; it shows where the robot was ``camera_age`` ago.
 
@@ -527,7 +526,7 @@ def see_camera(robot: Any, sensors: Any, r: Any) -> None:
     r.frame_time = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _pose_before(robot: Any, age: float, r: Any) -> Any:
     """Return where the robot was ``age`` s ago, start frame: its estimate less the IMU's way since."""
     length = r.raw.shape[0]
@@ -545,20 +544,20 @@ def _pose_before(robot: Any, age: float, r: Any) -> Any:
     return x, y, r.yaw - (r.raw[now, 2] - r.raw[a, 2] - part * (r.raw[b, 2] - r.raw[a, 2]))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _yaw_variance(robot: Any, age: float, r: Any) -> float:
     p = r.yaw_covariance
     return p[0] + 2.0 * age * p[1] + age * age * p[2] + robot.camera_yaw_noise**2
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _along(k: int, error: Any, r: Any) -> float:
     """Return what of an error (x, y, yaw) in the start frame lies along heading (0) or left (1)."""
     c, s = r.pointing[0], r.pointing[1]
     return c * error[0] + s * error[1] if k == 0 else c * error[1] - s * error[0]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _off(robot: Any, age: float, error: Any, r: Any) -> float:
     """Return the largest squared normalised innovation of a frame that is off by so much in the start frame."""
     off = error[2] * error[2] / _yaw_variance(robot, age, r)
@@ -568,7 +567,7 @@ def _off(robot: Any, age: float, error: Any, r: Any) -> float:
     return off
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _refuse(frame: Any, then: Any, error: Any, r: Any) -> None:
     """Follow how refused frames are off: by the same, then the camera has been moved; or steadily moving away.
 
@@ -615,7 +614,7 @@ _FLOW_SILENCE = 0.5  # s without a reading after which nothing is said about the
 _LEAST_HEIGHT = 0.02  # m: shortest distance from lens to floor that is taken for one
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     """Take in a flow reading where there is a new one: flow_x = v_x/h - w_y, flow_y = v_y/h + w_x of the lens, body frame."""
     r.flow_time += robot.period
@@ -656,7 +655,7 @@ def see_flow(robot: Any, sensors: Any, r: Any) -> None:
     r.flow_time = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _seen_velocity(robot: Any, x: float, y: float, r: Any) -> Any:
     """Return the body origin's velocity along heading and left by a reading, and the lens's distance to the floor."""
     n, lens = r.normal, robot.lens
@@ -671,7 +670,7 @@ def _seen_velocity(robot: Any, x: float, y: float, r: Any) -> Any:
     return (along, (by - along * r.heading[1]) / r.left[1]), height
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _carried(r: Any) -> Any:
     """Return height (m) and rise (m/s) of the wheels over the floor along its normal, by their loads."""
     floor, carried, rise = 0.0, 1e-12, 0.0
@@ -688,7 +687,7 @@ def _carried(r: Any) -> Any:
 _START_PLACE = 1e-4  # m, 1 sigma at the start
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def reset(robot: Any, states: Any, mask: Any, sensors: Any, values: Any) -> None:
     """Start masked robots anew, whose states are 0; see :class:`wlr_gym.perception.observer.observer.SlipObserver`."""
     for i in range(mask.shape[0]):
@@ -697,7 +696,7 @@ def reset(robot: Any, states: Any, mask: Any, sensors: Any, values: Any) -> None
             _report(robot[0], states[i], values[i])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def update(robot: Any, states: Any, mask: Any, sensors: Any, values: Any, work: Any) -> None:
     """Advance masked robots by one control step."""
     for i in range(mask.shape[0]):
@@ -706,7 +705,7 @@ def update(robot: Any, states: Any, mask: Any, sensors: Any, values: Any, work: 
             _report(robot[0], states[i], values[i])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _start(robot: Any, sensors: Any, r: Any) -> None:
     """Begin level and at rest; what the accelerometer reads along the floor is bias or, where it is much, a slope."""
     r.seen[SENSOR.accelerometer + 2] = robot.gravity
@@ -737,7 +736,7 @@ def _start(robot: Any, sensors: Any, r: Any) -> None:
         r.covariance[k, LENS, LENS] = (SCALE if k == 0 else ROTATION) ** 2
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _take(sensors: Any, r: Any) -> None:
     """Keep what is a number: ``r.seen``."""
     for k in range(sensors.shape[0]):
@@ -745,7 +744,7 @@ def _take(sensors: Any, r: Any) -> None:
             r.seen[k] = sensors[k]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _advance(robot: Any, sensors: Any, r: Any, work: Any) -> None:
     """Predict with the IMU, then take in wheels, camera and flow."""
     _take(sensors, r)
@@ -768,7 +767,7 @@ def _advance(robot: Any, sensors: Any, r: Any, work: Any) -> None:
     see_rest(robot, r)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _report(robot: Any, r: Any, out: Any) -> None:
     """Write the estimates."""
     h, n, left, rise = r.heading, r.normal, r.left, _carried(r)[1]

@@ -11,12 +11,12 @@ wheel that pulls rolls ahead. Trained on simulated runs of the nominal robot wit
 from __future__ import annotations
 
 import math
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from wlr_gym.base.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -41,25 +41,19 @@ WORK = np.dtype(
 )
 
 
-def load_trust() -> dict[str, Array]:
-    """Return the shipped network: weights (outputs, inputs), and what else was learned with it."""
-    with (files("wlr_gym.perception.observer") / "trust.npz").open("rb") as file, np.load(file) as data:
-        return {name: data[name].astype(np.float64) for name in data.files}
-
-
-@njit(cache=True, nogil=True)
+@compiled
 def _squash(x: float) -> float:
     """A rational tanh."""
     x = min(max(x, -3.0), 3.0)
     return x * (27.0 + x * x) / (27.0 + 9.0 * x * x)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _log(x: float, least: float) -> float:
     return math.log(abs(x) + least)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def gather(robot: Any, r: Any, work: Any) -> None:
     """Put what each wheel's network sees into ``work.seen_by`` (4, OWN), and what all see alike into ``work.alike``."""
     fz = max(r.force[2], 2.0)
@@ -93,7 +87,7 @@ def gather(robot: Any, r: Any, work: Any) -> None:
         c[9] = 0.5 * (_log(dx - mean_x, 1e-3) + 5.0)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def judge(robot: Any, r: Any, work: Any) -> None:
     """Advance the wheels' memories by what they see.
 
@@ -125,7 +119,7 @@ def judge(robot: Any, r: Any, work: Any) -> None:
     _say(robot, r, work)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _share(robot: Any, r: Any, work: Any) -> None:
     """Lay out what each wheel's network sees, and add up what all four see alike."""
     for i in range(4):
@@ -142,7 +136,7 @@ def _share(robot: Any, r: Any, work: Any) -> None:
         common[k] = total
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _say(robot: Any, r: Any, work: Any) -> None:
     """Read precision, lead and wander from the memories."""
     weights, alike_weights, bias = robot.output, robot.output_alike, robot.output_bias

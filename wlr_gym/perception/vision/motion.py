@@ -25,10 +25,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from wlr_gym.base.compiled import inner_kernel
+from wlr_gym.base.compiled import compiled, inner_kernel
 from wlr_gym.base.errors import InputError
 from wlr_gym.data.run_states import rest_pose
 from wlr_gym.data.runs import Run
@@ -118,7 +117,7 @@ def _predict(step: float, density: float, spread: Any) -> None:
             spread[i, j] += density * _SHARES[i, j] * step ** _POWERS[i, j]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _filter(
     time: Any, values: Any, variances: Any, density: float, jump: float, rejected: Any, states: Any, spreads: Any
 ) -> float:
@@ -170,7 +169,7 @@ def _smooth_back(time: Array, density: float, states: Array, spreads: Array) -> 
     _add_later(gain, states)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _add_later(gain: Any, states: Any) -> None:
     for n in range(gain.shape[0] - 1, -1, -1):
         for i in range(3):

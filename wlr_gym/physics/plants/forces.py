@@ -348,5 +348,5 @@ def force_source(forces: Sequence[Force], precision: str) -> str:
             f"        {wound} += way - abs(way) * {wound}",
         ]
     body.append(f"        {row['time']} += step")
-    head = ["@njit(cache=True, nogil=True, error_model='numpy')", "def evaluate(inputs, values, memory, generalised, step):"]
+    head = ["@compiled(error_model='numpy')", "def evaluate(inputs, values, memory, generalised, step):"]
     return "\n".join([f"F = np.{precision}", "", *head, "    for k in range(inputs.shape[1]):", *body, ""])

@@ -15,9 +15,9 @@ from itertools import accumulate
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.random import normals4, stream_number, words4
 from wlr_gym.base.snapshot import RowStore
@@ -93,13 +93,13 @@ def check_flow(robot: Robot, parameters: Parameters) -> None:
         )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def _uniform(seed: Any, stream: Any, counter: Any, block: Any) -> float:
     """A number from 0 to 1."""
     return float(np.int64(words4(seed, stream, counter, block)[0])) * 2.0**-32
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _place(height: float, floor: float, quaternion: Any, pose: Any, settings: Any, out: Any) -> None:
     """Write the lens's place (x, y, and height over the floor), the attitude, and the floor's height into ``out`` (8)."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
@@ -111,7 +111,7 @@ def _place(height: float, floor: float, quaternion: Any, pose: Any, settings: An
     out[7] = floor
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _shift(before: Any, after: Any) -> Any:
     """Image shift (x, y; rad) between two places of the lens (8), and the distance to the floor along its axis (m).
 
@@ -138,7 +138,7 @@ def _shift(before: Any, after: Any) -> Any:
     return along / distance - stretch * half_y, across / distance + stretch * half_x, distance
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _texture(seed: Any, x: float, y: float, poor_floor: float) -> float:
     """Share of the quality that the floor's texture leaves at a place: 1, and 0 to 1 on its poor share."""
     if poor_floor <= 0.0:
@@ -148,7 +148,7 @@ def _texture(seed: Any, x: float, y: float, poor_floor: float) -> float:
     return drawn / poor_floor if drawn < poor_floor else 1.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def measure_flow(
     seed: Any, tick: int, period: float, height: float, floor: float, turn: Any, pose: Any, settings: Any, state: Any, out: Any
 ) -> None:
@@ -180,7 +180,7 @@ def measure_flow(
     out[4] = is_new
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state: Any) -> float:
     """Count the shift since the last tick; read what the frames up to now give. Returns 1 when that is a new valid reading."""
     shift_x, shift_y, distance = _shift(state[_PLACE:_CARRIED], place)
@@ -214,7 +214,7 @@ def _read(seed: Any, tick: int, period: float, place: Any, settings: Any, state:
     return 1.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _counted(flow: float, interval: float, frames: int, normal: float, settings: Any) -> float:
     """Return ``flow`` (rad/s) with the noise of its frames, in whole counts; without a count it stays as it is."""
     count = settings[_COUNT]
@@ -277,13 +277,13 @@ _PHASE_STREAM = stream_number("camera phase")
 _DROPOUT_STREAM = stream_number("camera dropout")
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def _rounded(value: float, count: float) -> float:
     """``value`` in whole counts (no negative zero); a count of 0 leaves it as it is."""
     return np.rint(value / count) * count + 0.0 if count > 0.0 else value
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _camera(seed: Any, tick: int, pose: Any, settings: Any, state: Any, out: Any) -> None:
     """Store this tick's pose; show the newest frame that has arrived: exposed at (j + phase) / rate, ``delay`` earlier."""
     period, rate = settings[_PERIOD], settings[_CAMERA_RATE]
@@ -312,13 +312,13 @@ def _camera(seed: Any, tick: int, pose: Any, settings: Any, state: Any, out: Any
     out[_OUT_AGE + 3] = 1.0 if is_new else 0.0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def _is_lost(seed: Any, frame: int, dropout: float) -> bool:
     """Whether the camera's frame of this number never arrives."""
     return dropout > 0.0 and _uniform(seed, _DROPOUT_STREAM, frame, 0) < dropout
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _expose(seed: Any, frame: int, ticks: float, length: int, settings: Any, state: Any) -> None:
     """Compute the pose a frame shows: at ``ticks`` (linear between tick poses), from the start pose, in the camera's frame."""
     ticks = max(ticks, 0.0)
@@ -341,7 +341,7 @@ def _expose(seed: Any, frame: int, ticks: float, length: int, settings: Any, sta
         state[_SHOWN_POSE + 2] += settings[_YAW_NOISE] * n2
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _add_noise(seed: Any, tick: int, settings: Any, out: Any) -> None:
     """Add Gaussian noise to efforts, IMU and voltage."""
     for block in range(2):
@@ -359,14 +359,14 @@ def _add_noise(seed: Any, tick: int, settings: Any, out: Any) -> None:
     out[_OUT_ACCEL + 2] += settings[_ACCEL_NOISE] * n2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@compiled(inline="always")
 def _in_imu_frame(state: Any, row: Any, first: int, axis: int) -> float:
     """Component ``axis`` in the IMU's frame of the body-frame vector in ``row[first:first + 3]`` (transposed rotation)."""
     r = _IMU_TO_BODY + axis
     return state[r] * row[first] + state[r + 3] * row[first + 1] + state[r + 6] * row[first + 2]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def measure_rows(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, outs: Any, start: Any, stop: Any) -> None:
     """Read the sensors of robots ``start`` to ``stop``: what :meth:`SensorModel.measure` does, for compiled loops."""
     for i in range(start, stop):
@@ -404,7 +404,7 @@ def measure_rows(raw: Any, seeds: Any, ticks: Any, settings: Any, states: Any, o
         ticks[i] += 1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _phase(seed: Any, stream: Any) -> float:
     """Phase of a robot's frames of camera or flow, 0 to 1."""
     return _uniform(seed, stream, 0, 0)

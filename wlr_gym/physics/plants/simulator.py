@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.snapshot import RowStore, Snapshot, check_fit, read_rows, take_snapshot, write_snapshot
 from wlr_gym.physics.plants import relief
@@ -356,7 +356,7 @@ class Setpoints(Protocol):
     def stores(self) -> dict[str, RowStore]: ...
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _read(ring: Any, head: int, ticks: Any, newer: Any, older: Any) -> None:
     """Read the setpoints written so many ``ticks`` (N, 8) ago, and those of a tick before, from a ring (depth, N, 8)."""
     depth, count, width = ring.shape

@@ -149,7 +149,7 @@ def _source(features: frozenset[str]) -> str:
     lines = [
         *straight_line_source("step_of_robot", ["w"], body),
         "",
-        "@njit(cache=True, nogil=True, error_model='numpy')",
+        "@compiled(error_model='numpy')",
         "def settle(values, steps):",
         "    for i in range(len(values)):",
         "        w = numbers_of(values[i])",

@@ -281,7 +281,7 @@ def _driver(start: Mapping[str, int], width: int, precision: str, has_pairs: boo
 
 
 #: Arrays are copied by loops: numba's slice assignment takes four times as long.
-_DECORATOR = "@njit(cache=True, nogil=True, error_model='numpy')"
+_DECORATOR = "@compiled(error_model='numpy')"
 _APPLY_FORMULAS = """
             sense(W)
             seen = W[{sensed} : {sensed} + {sensed_count} * {width}].reshape({sensed_count}, {width})

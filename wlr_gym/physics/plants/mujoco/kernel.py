@@ -230,7 +230,7 @@ def kernel_source(features: frozenset[str]) -> str:
         signature = "" if block == "features" else _signature(len(own), len(scalars))
         pointers = [f"numbers_of({name})" if block == "features" else f"numbers_of({name}[i])" for name in own]
         lines += [
-            f"@njit({signature}cache=True, nogil=True, error_model='numpy')",
+            f"@compiled({signature}error_model='numpy')",
             f"def {block}({', '.join(['table', 'rows', *own, *scalars])}):",
             "    count = len(table)",
             "    for i in rows:",
@@ -250,7 +250,7 @@ def kernel_source(features: frozenset[str]) -> str:
 
 #: Body and legs on the floor, where they are near it.
 _TOUCH_FLOOR = """
-@njit({signature}cache=True, nogil=True, error_model='numpy')
+@compiled({signature}error_model='numpy')
 def touch_floor(table, rows, step):
     count, room = len(table), np.zeros({room})
     touching = numbers_of(room)
@@ -270,7 +270,7 @@ def touch_floor(table, rows, step):
 def _signature(own: int, scalars: int) -> str:
     """Types of a block's arguments, so that one compilation at import serves every batch size."""
     kinds = ["types.intp[:, ::1]", "types.intp[::1]"] + ["types.float64[:, ::1]"] * own + ["types.float64"] * scalars
-    return f"types.void({', '.join(kinds)}), "
+    return f"signatures=[types.void({', '.join(kinds)})], "
 
 
 def load_kernel(features: frozenset[str]) -> ModuleType:
