@@ -18,7 +18,7 @@ from rich.console import Console
 
 from studies.paper import claims, experiments, report, slip_search
 from wlr_gym.base.errors import InputError, Interval, check_name
-from wlr_gym.base.files import output_folder
+from wlr_gym.base.files import alone_in
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK, run_program
@@ -79,7 +79,7 @@ def run(options: PaperOptions) -> int:
     robot = load_robot(options.robot or "nominal")
     options.refuse_results(options.out, "report.md")
     console, records = Console(), {}
-    with output_folder(options.out), progress(console, shown=options.progress) as tell:
+    with alone_in(options.out), progress(console, shown=options.progress) as tell:
         try:
             for done, model in enumerate(options.plant):
                 tell("", f"both tests: {model}", _SHARES["tests"] * done / len(options.plant))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import output_folder, replace_file
+from wlr_gym.base.files import alone_in, replace_file
 
 
 def write(path: Path) -> None:
@@ -45,7 +45,7 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
 
 
 def _fail(folder, error, written=""):
-    with output_folder(folder):
+    with alone_in(folder):
         if written:
             (folder / written).touch()
         raise error

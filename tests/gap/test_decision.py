@@ -265,7 +265,7 @@ def test_two_processes_do_not_drive_one_robot_for_one_folder(data, tmp_path, ans
     code = f"import pathlib, time\nfrom wlr_gym.base.files import alone_in\nwith alone_in(pathlib.Path({str(out)!r})):\n"
     holder = subprocess.Popen([sys.executable, "-c", f"{code}    pathlib.Path({str(begun)!r}).touch(); time.sleep(600)"])
     wait_until(begun.exists, holder)
-    with pytest.raises(InputError, match=r"out/\.lock: held by another process"):
+    with pytest.raises(InputError, match=rf"out/\.lock: held by process {holder.pid} "):
         decide(data, out, record)
     holder.kill()
     holder.wait()

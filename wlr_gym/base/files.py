@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import platform
+import shlex
+import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,8 @@ from wlr_gym.base.errors import InputError
 
 #: File of a folder for results by which one process holds it.
 LOCK = ".lock"
+#: Folders that this process holds, and the threads that do.
+_HELD: dict[Path, int] = {}
 
 
 def make_output_folder(path: Path, option: str = "--out") -> None:
@@ -41,20 +47,39 @@ def require_output_place(path: Path) -> None:
 
 
 @contextmanager
-def output_folder(path: Path | None) -> Iterator[None]:
-    """Make the folder of ``--out``, None = there is none; work that fails or is interrupted in here leaves no empty one."""
-    if path is None:
+def alone_in(folder: Path | None, patience: float = 0.0) -> Iterator[None]:
+    """Make a folder for results, if it is not there, and hold it; None = there is none. See :func:`locked`.
+
+    Work that fails or is interrupted in here leaves no empty folder. What holds it already may hold it again.
+
+    Raises:
+        InputError: it cannot be made or written to, or another process, or another thread, works in it.
+    """
+    if folder is None or _HELD.get(folder.resolve()) == threading.get_ident():
         yield
         return
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    make_output_folder(path)
+    path = folder.resolve()
+    if path in _HELD:
+        raise InputError(f"--out {folder}: another thread of this program works in it; choose another folder")
+    made = [one for one in (folder, *folder.parents) if not one.exists()]
+    make_output_folder(folder)
     try:
-        yield
+        with locked(folder / LOCK, patience, stays=False):
+            _HELD[path] = threading.get_ident()
+            try:
+                yield
+            finally:
+                del _HELD[path]
     except BaseException:
-        for folder in made:
+        for one in made:
             with suppress(OSError):  # not empty
-                folder.rmdir()
+                one.rmdir()
         raise
+
+
+def contents(folder: Path) -> list[Path]:
+    """Return what is in a folder, in order, without the file by which a process holds it; nothing where there is none."""
+    return sorted(path for path in folder.iterdir() if path.name != LOCK) if folder.is_dir() else []
 
 
 def refuse_existing(path: Path, force: bool, option: str = "--out") -> None:
@@ -67,7 +92,7 @@ def require_empty(folder: Path, resume: str) -> None:
     """Refuse a folder that something is in; ``resume`` is the command that goes on with it, empty = none does."""
     if folder.is_file():
         raise InputError(f"{folder}: cannot be a folder: it is a file")
-    if folder.is_dir() and any(folder.iterdir()):
+    if contents(folder):
         hint = f", or resume what is there: {resume} --resume {folder}" if resume else ""
         raise InputError(f"{folder}: not empty; give another folder{hint}")
 
@@ -99,15 +124,10 @@ def resumes(folder: Path, file: str) -> bool:
     """Whether work in a folder for results resumes from its ``file``; otherwise the folder is new or empty, and is made."""
     if (folder / file).is_file():
         return True
-    if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
+    if folder.is_file() or contents(folder):
         raise InputError(f"--out {folder}: expected a new folder, or one with a {file} of the same command")
     make_output_folder(folder)
     return False
-
-
-def alone_in(folder: Path) -> AbstractContextManager[None]:
-    """Work in a folder that no other process works in meanwhile; see :func:`locked`."""
-    return locked(folder / LOCK, 0.0)
 
 
 def keep_request(path: Path, requested: Mapping[str, Any]) -> None:
@@ -163,30 +183,52 @@ def write_text(path: Path, text: str) -> None:
 
 
 @contextmanager
-def locked(path: Path, patience: float) -> Iterator[None]:
+def locked(path: Path, patience: float, *, stays: bool = True) -> Iterator[None]:
     """Hold a file as a lock, among all processes and machines that see it; the system frees that of a process that died.
 
     Where there are no such locks (Windows, some shared file systems) nothing is held.
 
     Args:
-        path: of the file, which is made and stays.
+        path: of the file, which is made, and says who holds it.
         patience: how long to wait for another process to let go, s.
+        stays: the file is left there.
 
     Raises:
         InputError: another process still holds it, or it cannot be written.
     """
-    try:
-        file = path.open("ab")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    for_so_long = f" for {patience:g} s" if patience else ""
+    deadline = time.monotonic() + patience
+    while True:
+        try:
+            file = path.open("a+", encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        if (is_free := try_lock(file.fileno())) and _is_at(file.fileno(), path):
+            break
+        file.seek(0)
+        holder = file.read().strip() or "another process"
+        file.close()
+        if not is_free and time.monotonic() > deadline:
+            for_so_long = f" for {patience:g} s" if patience else ""
+            raise InputError(f"{path}: held{for_so_long} by {holder}; wait until it ends, or choose another folder")
+        time.sleep(0.1 * (not is_free))
     with file:
-        deadline = time.monotonic() + patience
-        while not try_lock(file.fileno()):
-            if time.monotonic() > deadline:
-                raise InputError(f"{path}: held by another process{for_so_long}: something else works on the same")
-            time.sleep(0.1)
-        yield
+        with suppress(OSError):  # a full disk
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {platform.node()}: {shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}\n")
+            file.flush()
+        try:
+            yield
+        finally:
+            if not stays:
+                path.unlink(missing_ok=True)
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether an open file is the one at a path: who held it may have removed it meanwhile."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def try_lock(descriptor: int, *part: int) -> bool:

@@ -18,6 +18,7 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -59,6 +60,10 @@ COMMANDS = {
     "deploy": "drive the robot with a policy, through the command limiter",
     "emulate": "emulate the robot's servos and IMU on pseudo-terminals, with faults",
 }
+
+
+#: Commands whose ``--out`` is a folder that nobody else may write to meanwhile; train, sweep and adapt see to it themselves.
+WRITE_A_FOLDER = {"demo", "evaluate", "record", "replay", "compare", "gap", "vision", "commission", "deploy"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -144,7 +149,16 @@ def run_command(name: str, arguments: Sequence[str]) -> int:
     """Parse the arguments of one command and run it."""
     options, module = parse_command(name, arguments), _module(name)
     own = (run for kind, run in getattr(module, "COMMANDS", {}).values() if type(options) is kind)
-    return run_options(options, next(own, None) or module.run)
+    run = next(own, None) or module.run
+    return run_options(options, partial(_alone, run) if name in WRITE_A_FOLDER and run is module.run else run)
+
+
+def _alone(run: Callable[[Any], int], options: Any) -> int:
+    """Run a command that holds the folder for its results."""
+    from wlr_gym.base.files import alone_in
+
+    with alone_in(options.out):
+        return run(options)
 
 
 def run_options(options: Any, run: Callable[[Any], int]) -> int:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, Interval
-from wlr_gym.base.files import output_folder, write_json, write_text
+from wlr_gym.base.files import write_json, write_text
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
@@ -82,7 +82,7 @@ def run(options: CompareOptions) -> int:
     patches = _patches(options, robot)
     options.refuse_results(options.out, "compare.json")
     console, comparisons = Console(), []
-    with output_folder(options.out), progress(console) as tell:
+    with progress(console) as tell:
         for done, patch in enumerate(patches):
             of_them = f", effects: {patch.summary()}" if len(patches) > 1 else ""
 

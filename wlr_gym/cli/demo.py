@@ -18,7 +18,7 @@ from pathlib import Path
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, refuse_existing
+from wlr_gym.base.files import contents, refuse_existing
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import CONFIG_FILE, record_provenance
 from wlr_gym.base.settings import read_yaml
@@ -83,8 +83,7 @@ def run(options: DemoOptions) -> int:
 
 def _clear(folder: Path) -> None:
     """Make the folder anew; one that holds anything but a demo is refused."""
-    make_output_folder(folder)
-    inside, config = list(folder.iterdir()), folder / CONFIG_FILE
+    inside, config = contents(folder), folder / CONFIG_FILE
     if inside and not (config.is_file() and "quick" in read_yaml(config)):
         raise InputError(
             f"{folder}: '{inside[0].name}' is in the way, and this is not the folder of a demo; give another --out"

@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError, Interval, check_name
-from wlr_gym.base.files import output_folder, refuse_existing
+from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.progress import progress, tracked
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
@@ -117,16 +117,15 @@ def run(options: EvaluateOptions) -> int:
     patch = options.patch()
     if options.out is not None:
         options.refuse_results(options.out, "card.json")
-    with output_folder(options.out):
-        first: list[Rollout] = []  # the first block of the first subject
+    first: list[Rollout] = []  # the first block of the first subject
 
-        def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
-            if not first:
-                first.append(rollout)
+    def watch(condition: Condition, subject: Subject, block: int, rollout: Rollout) -> None:
+        if not first:
+            first.append(rollout)
 
-        with _progress(options.progress) as tell:
-            own = {"env_id": options.env, "sweeps": options.sweep, "sensors": options.present(), "effects": patch}
-            card = evaluate(**handed(options, evaluate, **own, tell=tell, watch=watch))
+    with _progress(options.progress) as tell:
+        own = {"env_id": options.env, "sweeps": options.sweep, "sensors": options.present(), "effects": patch}
+        card = evaluate(**handed(options, evaluate, **own, tell=tell, watch=watch))
     if options.json:
         print_json(cards.content(card))
     else:
@@ -168,7 +167,7 @@ def _accept(options: EvaluateOptions) -> int:
     _subjects(options)
     if options.out is not None:
         refuse_existing(options.out / scoring.ACCEPTANCE_FILE, options.force)
-    with output_folder(options.out), _progress(options.progress) as tell:
+    with _progress(options.progress) as tell:
         own = {
             "policy": options.policy[0], "env_id": options.env, "references": options.baselines,
             "floors": None if options.randomization is None else (options.randomization,),

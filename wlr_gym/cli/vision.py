@@ -20,7 +20,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from wlr_gym.base.errors import InputError, Interval, require_package
-from wlr_gym.base.files import make_output_folder
+from wlr_gym.base.files import contents
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.cli import FAILED, OK
@@ -95,8 +95,7 @@ def run(options: VisionOptions) -> int:
     if options.out.resolve() == options.run.resolve().parent:
         raise InputError(f"--out {options.out}: is the run's own folder; the run would be overwritten")
     options.refuse_results(options.out, "summary.json")
-    fresh = not options.out.exists()
-    make_output_folder(options.out)
+    fresh = not contents(options.out)
     console = Console(highlight=False, soft_wrap=True)
     try:
         if live:
@@ -110,7 +109,8 @@ def run(options: VisionOptions) -> int:
         analysis = _analyse(options, measured or read_run(options.run), camera, body, floor, console)
     except BaseException:
         if fresh and not (options.out / "film.avi").exists():  # a refusal leaves no folder behind; a film stays
-            shutil.rmtree(options.out, ignore_errors=True)
+            for path in contents(options.out):
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
         raise
     paths = save_video_analysis(analysis, options.out)
     record_provenance(options.out, settings_of(options) | {"robot": analysis.robot.name})

@@ -188,8 +188,8 @@ def decide(
     """
     known, data, out = load_patch(known), Path(data), Path(out)
     session = _Session(data, out, budget or Budget(), known, robot, backend, threads, tell)
-    history, last = session.resumed()
     with alone_in(out):
+        history, last = session.resumed()
         while True:
             now, result, left = session.analysed(history, last)
             ended, following = session.choice(history, now, result, left)

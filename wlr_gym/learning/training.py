@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, check_number, nearest
-from wlr_gym.base.files import require_empty
+from wlr_gym.base.files import alone_in, require_empty
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
@@ -149,16 +149,17 @@ def resume_training(
     path = Path(folder) / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"{folder}: not a run folder: {CONFIG_FILE} is missing")
-    saved = read_yaml(path)
-    for key in ("environment", "agent", "settings"):
-        if not isinstance(saved, dict) or key not in saved:
-            raise InputError(f"{path}: '{key}' is missing")
-    if total_steps is not None:
-        _extend(saved["settings"], total_steps)
-        write_yaml(path, saved)
-    follow: dict[str, Any] = {"max_seconds": max_seconds, "progress": progress, "on_update": on_update}
-    request = Training(saved["environment"], Path(folder), saved["settings"], resume=True, init=saved.get("init"), **follow)
-    return run_training(saved["agent"], request)
+    with alone_in(Path(folder)):
+        saved = read_yaml(path)
+        for key in ("environment", "agent", "settings"):
+            if not isinstance(saved, dict) or key not in saved:
+                raise InputError(f"{path}: '{key}' is missing")
+        if total_steps is not None:
+            _extend(saved["settings"], total_steps)
+            write_yaml(path, saved)
+        follow: dict[str, Any] = {"max_seconds": max_seconds, "progress": progress, "on_update": on_update}
+        request = Training(saved["environment"], Path(folder), saved["settings"], resume=True, init=saved.get("init"), **follow)
+        return run_training(saved["agent"], request)
 
 
 def _extend(settings: dict[str, Any], total_steps: int) -> None:
@@ -174,10 +175,11 @@ def run_training(agent: str, training: Training) -> Path:
     """Train, and return the folder of the policy."""
     if training.max_seconds is not None:
         check_number("max_seconds", training.max_seconds, "s", above=0)
-    if not training.resume:
-        require_empty(training.folder, "wlr train" if can_resume(training.folder) else "")
-    check_environment_settings(training.config)
-    return agent_function(agent, "train")(replace(training, config=with_robot(training.config)))
+    with alone_in(training.folder):
+        if not training.resume:
+            require_empty(training.folder, "wlr train" if can_resume(training.folder) else "")
+        check_environment_settings(training.config)
+        return agent_function(agent, "train")(replace(training, config=with_robot(training.config)))
 
 
 def check_environment_settings(settings: Mapping[str, Any]) -> None:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wlr_gym.base.errors import InputError, unknown_name
-from wlr_gym.base.files import output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.envs.interfaces import Infos
@@ -65,7 +64,7 @@ def tune(training: Training, agent: str, make_policy: MakePolicy, model: type[Pi
         if not has_limits(measures_of(core)):
             raise InputError(f"agent '{agent}' is tuned by the limits of a task's success, and '{contract['task']}' has none")
         start = task_settings(model, contract, config, agent)
-        with output_folder(training.folder), progress(Console(), shown=training.progress) as tell:
+        with progress(Console(), shown=training.progress) as tell:
             best, score = search(core, make_policy, start, partial(tell, ""))
     settings = {"environment": training.environment, "agent": agent, "settings": config}
     record_provenance(training.folder, settings, start.seed)

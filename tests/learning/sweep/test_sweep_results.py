@@ -146,15 +146,14 @@ def test_a_table_that_cannot_be_written_says_what_to_do(book, monkeypatch):
 def test_two_cannot_run_one_sweep(tmp_path, monkeypatch):
     monkeypatch.setattr(running, "_HANDOVER", 0.1)
     write_yaml(tmp_path / "sweep.yaml", PLAN.model_dump(mode="json"))
-    (tmp_path / ".locks").mkdir()
-    held, lock = tmp_path / "held", tmp_path / ".locks" / "sweep"
-    code = f"import pathlib\nfrom wlr_gym.base.files import locked\nwith locked(pathlib.Path({str(lock)!r}), 1):\n"
+    held = tmp_path / "held"
+    code = f"import pathlib\nfrom wlr_gym.base.files import alone_in\nwith alone_in(pathlib.Path({str(tmp_path)!r})):\n"
     code += f"    pathlib.Path({str(held)!r}).touch(); input()"
     other = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, env=os.environ | {"PYTHONPATH": ":".join(sys.path)}
     )
     wait_until(held.exists, other)
-    with pytest.raises(InputError, match="held by another process"):
+    with pytest.raises(InputError, match=f"held for 0.1 s by process {other.pid}"):
         wlr_gym.resume_sweep(tmp_path)
     other.communicate(b"\n")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from wlr_gym import __version__
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder, replace_file, require_output_place, write_text
+from wlr_gym.base.files import contents, make_output_folder, replace_file, require_output_place, write_text
 from wlr_gym.base.html import commands, document, folded, heading, pictures_of, section, table
 from wlr_gym.base.provenance import CONFIG_FILE, PROVENANCE_FILE
 from wlr_gym.base.text import counted, duration, number
@@ -483,7 +483,7 @@ def check_folder(folder: Path) -> None:
     Raises:
         InputError: a file, a folder without rights, or one with contents that no earlier analysis wrote.
     """
-    there = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    there = [path.name for path in contents(folder)]
     strange = [name for name in there if name not in _OWN] or ([] if _is_analysis(folder) else there)
     if strange:
         raise InputError(f"--out {folder}: '{strange[0]}' in it is not of an analysis; expected a new folder or an earlier one")

@@ -125,8 +125,8 @@ def adapt(
         check_runs(Path(robot_runs), own)  # before anything is written
     elif driven is None:
         driven = EmulatedRobot(own, patch, request.backend, floor=on)
-    progress = open_folder(Path(out), request, tell, threads)
-    with alone_in(progress.out):
+    with alone_in(Path(out)):
+        progress = open_folder(Path(out), request, tell, threads)
         if not progress.steps:
             record_provenance(progress.out, request.model_dump(mode="json"), request.seed)
             save_patch(patch, progress.out / "hidden.yaml")

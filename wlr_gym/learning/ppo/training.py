@@ -29,7 +29,6 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
 from wlr_gym.envs.core import Core
@@ -78,7 +77,6 @@ def run_training(training: Training) -> Path:
         if training.resume:
             write_yaml(training.folder / "provenance_resumed.yaml", provenance(config.seed))
         else:
-            make_output_folder(training.folder)  # only now: bad settings leave nothing behind
             settings = {"environment": training.environment, "agent": "ppo", "settings": config.model_dump(mode="json")}
             settings |= {} if training.init is None else {"init": str(training.init)}
             record_provenance(training.folder, settings, config.seed)

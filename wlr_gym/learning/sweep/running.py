@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from wlr_gym.base.errors import InputError, check_number, require_package
-from wlr_gym.base.files import locked, make_output_folder, require_empty
+from wlr_gym.base.files import alone_in, make_output_folder, require_empty
 from wlr_gym.base.jobs import spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
@@ -68,13 +68,13 @@ def start_sweep(
 ) -> SweepResult:
     """Run a plan in a new folder; arguments, result and errors as of :func:`sweep`."""
     folder = Path(out)
-    require_empty(folder, "wlr sweep" if (folder / PLAN_FILE).is_file() else "")
-    whole = resolve(plan)
-    _check_machines(whole, ray, workers)
-    make_output_folder(folder)
-    write_yaml(folder / PROVENANCE_FILE, provenance(whole.seed_list[0]))
-    write_yaml(folder / PLAN_FILE, whole.model_dump(mode="json"))
-    return _run(whole, folder, ray, workers, say)
+    with alone_in(folder):
+        require_empty(folder, "wlr sweep" if (folder / PLAN_FILE).is_file() else "")
+        whole = resolve(plan)
+        _check_machines(whole, ray, workers)
+        write_yaml(folder / PROVENANCE_FILE, provenance(whole.seed_list[0]))
+        write_yaml(folder / PLAN_FILE, whole.model_dump(mode="json"))
+        return _run(whole, folder, ray, workers, say)
 
 
 def resume_sweep(folder: str | Path, *, ray: str | None = None, workers: int | None = None, say: Say = print) -> SweepResult:
@@ -109,7 +109,7 @@ def _run(plan: SweepPlan, folder: Path, ray: str | None, workers: int | None, sa
     """Train what is left of a plan, on this machine's processes or on Ray."""
     for name in (TRIALS, LOGS, LOCKS):
         make_output_folder(folder / name)
-    with locked(folder / LOCKS / "sweep", _HANDOVER):
+    with alone_in(folder, _HANDOVER):
         book = Book(plan, folder, say)
         if ray is None and not plan.needs_ray:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
