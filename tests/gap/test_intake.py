@@ -72,6 +72,11 @@ def clipped(channel):
     return spoil
 
 
+def mixed(table):
+    """Every second row is of a recording in which the left front leg stands elsewhere."""
+    return table.assign(pos_leg_lf=table["pos_leg_lf"] + 0.6 * (table.index % 2))
+
+
 def silent(channel):
     return lambda table: table.assign(**{channel: 0.0})
 
@@ -80,6 +85,7 @@ def silent(channel):
 FAULTS = {
     "gyroscope in degrees per second": (degrees, "gyro_z", "units", None),
     "robot that stands still": (still, "pos", "still", None),
+    "two recordings in one": (mixed, "pos", "jump", (0.01, 0.03)),
     "dead leg": (frozen("leg_rf", 0), "pos_leg_rf", "dead", None),
     "dead wheel": (frozen("wheel_lr", 0), "pos_wheel_lr", "dead", None),
     "wheel that dies": (frozen("wheel_rf", 120), "pos_wheel_rf", "dead", (2.4, 4.5)),

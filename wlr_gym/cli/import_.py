@@ -43,6 +43,8 @@ class ImportOptions(JsonOption):
     """Length of a run, about: recordings are cut where the robot is quietest; default: only those over 600 s are cut."""
     robot: str | None = None
     """Robot file, or name in configs/robot/; default: the one that the map's meta names, else the nominal one."""
+    keep_going: bool = False
+    """Import what comes before the first row that cannot be true; default: such a recording is refused."""
     format: Literal["parquet", "csv"] = "parquet"
     """Format of the runs."""
 
@@ -79,7 +81,8 @@ def run(options: ImportOptions) -> int:
     runs: list[ImportedRun] = []
     for log in options.log:
         with _reading(console, log) as tell:
-            imported = import_log(log, options.out, given, options.robot, options.split, f".{options.format}", tell)
+            kept = options.robot, options.split, f".{options.format}"
+            imported = import_log(log, options.out, given, *kept, tell, options.keep_going)
         _report(imported, console)
         runs += imported
     if options.json:

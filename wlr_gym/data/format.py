@@ -16,7 +16,7 @@ from pydantic import Field
 from wlr_gym.base.errors import InputError, nearest
 from wlr_gym.base.settings import SettingsModel
 from wlr_gym.base.text import row_words
-from wlr_gym.robot import JOINTS, LEGS, WHEELS, Vector3
+from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot, Vector3
 from wlr_gym.robot.parameter_table import XYZ
 
 #: File suffixes a run may have.
@@ -164,6 +164,11 @@ NOMINAL_PERIOD = 0.02
 _GAP = 1.5  # a step of the clock longer than this many usual ones is a gap
 _STUCK_ROWS = 25  # half a second of bit-equal readings from a noisy sensor
 _CLIPPED_ROWS = 4
+_SECTION, _LEAST = 100, 20  # rows that are judged by themselves, for units that change in mid-run, and values in them
+_SAME_MOTION = 0.8  # correlation of an angle's turns and its rate's
+_SHOWN = 0.05  # rad, rms over windows: a section in which one of the two turns this far shows their ratio
+_APART = 3.0  # ratio from which on one of the two has another unit; sound sections have 0.87 to 1.05
+_QUICK, _SPREAD = 2.0, 0.05  # of the no-load speed, and rad: steps above are none of the motor's; sound runs reach 0.95
 _MOVED = 0.1  # rad or rad/s: a joint that was asked to move this far must show it
 _WINDOW = 0.5  # s: long enough for a turn to stand out of the camera's noise
 _DEGREES = 180 / math.pi
@@ -215,6 +220,14 @@ _UNIT_LIMITS = (
     _UnitLimit("eff_wheel", 0.95, 50.0, "mA or mN m"),
     _UnitLimit("volt", 0.5, 100.0, "millivolts"),
 )
+
+
+class ImpossibleError(InputError):
+    """A recording that cannot be true; what comes before ``row`` may be."""
+
+    def __init__(self, text: str, row: int) -> None:
+        super().__init__(text)
+        self.row = row
 
 
 def check_names(names: Sequence[str], where: str) -> None:
@@ -270,7 +283,8 @@ def _check_values(table: Table, where: str) -> None:
         infinite, nan = np.isinf(values), np.isnan(values)
         if infinite.any():
             row = int(np.argmax(infinite))
-            raise InputError(f"{where}: {row_words(where, row)}, column '{name}': {values[row]:g}; expected a finite number")
+            text = f"{where}: {row_words(where, row)}, column '{name}': {values[row]:g}; expected a finite number"
+            raise ImpossibleError(text, row)
         if nan.any() and COLUMNS[name].required and not COLUMNS[name].may_be_nan:
             place = f"{where}: {row_words(where, int(np.argmax(nan)))}, column '{name}'"
             raise InputError(f"{place}: no value, but this column must have one")
@@ -292,6 +306,19 @@ def _check_clock(t: Array, where: str) -> None:
         )
 
 
+def _parts(rows: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
+    """Return what of a channel's values, which are in ``rows``, is judged together: all of them, and each section's places.
+
+    With each comes the row up to which the run may be true if they are not: in a section fewer wrong values do not show.
+    """
+    if not len(rows):
+        return []
+    edges = np.arange(_SECTION, rows[-1] + 1 - _SECTION // 2, _SECTION)
+    parts = np.split(np.arange(len(rows)), np.searchsorted(rows, edges))
+    kept = [(int(start), part) for start, part in zip([0, *edges], parts, strict=True) if len(part) >= _LEAST]
+    return [(0, np.arange(len(rows))), *((max(start - _SECTION, 0), part) for start, part in kept)]
+
+
 def _check_magnitudes(table: Table, where: str) -> None:
     for limit in _UNIT_LIMITS:
         for name in (name for name in table if COLUMNS[name].group == limit.group):
@@ -299,19 +326,23 @@ def _check_magnitudes(table: Table, where: str) -> None:
             values = table[name][rows]
             if limit.rate:
                 values, rows = np.diff(values) / np.diff(table["t"][rows]), rows[1:]
-            if len(values) and np.quantile(np.abs(values), limit.quantile) > limit.limit:
-                row = int(rows[np.argmax(np.abs(values) > limit.limit)])
-                raise _unit_mistake(where, row, name, table[name][row], limit.looks_like)
+            for first, part in _parts(rows):
+                if np.quantile(np.abs(values[part]), limit.quantile) > limit.limit:
+                    row = int(rows[part[np.argmax(np.abs(values[part]) > limit.limit)]])
+                    raise _unit_mistake(where, row, name, table[name][row], limit.looks_like, first)
     if {"acc_x", "acc_y", "acc_z"} <= set(table):
         norm = np.sqrt(table["acc_x"] ** 2 + table["acc_y"] ** 2 + table["acc_z"] ** 2)
-        typical = np.median(norm[np.isfinite(norm)]) if np.isfinite(norm).any() else 9.81
-        if 0 < typical < 2.0 or typical > 50.0:
-            raise _unit_mistake(where, 0, "acc_z", table["acc_z"][0], "multiples of g" if typical < 2.0 else "mm/s2 or cm/s2")
+        rows = np.flatnonzero(np.isfinite(norm))
+        for first, part in _parts(rows):
+            typical, row = float(np.median(norm[rows[part]])), int(rows[part[0]])
+            if 0 < typical < 2.0 or typical > 50.0:
+                looks_like = "multiples of g" if typical < 2.0 else "mm/s2 or cm/s2"
+                raise _unit_mistake(where, row, "acc_z", table["acc_z"][row], looks_like, first)
 
 
-def _unit_mistake(where: str, row: int, name: str, value: float, looks_like: str) -> InputError:
+def _unit_mistake(where: str, row: int, name: str, value: float, looks_like: str, first: int = 0) -> ImpossibleError:
     place = f"{where}: {row_words(where, row)}, column '{name}'"
-    return InputError(f"{place}: {value:g}; expected {COLUMNS[name].unit}, looks like {looks_like}")
+    return ImpossibleError(f"{place}: {value:g}; expected {COLUMNS[name].unit}, looks like {looks_like}", first)
 
 
 def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
@@ -320,20 +351,70 @@ def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
     if len(rows) < 20:
         return
     turned, measured = increments(table["t"][rows], table[angle][rows], table[rate][rows])
-    energies = float(turned @ turned), float(measured @ measured)
-    if min(energies) == 0.0:
-        return
-    product = float(turned @ measured)
-    ratio, correlation = product / energies[0], product / math.sqrt(energies[0] * energies[1])
-    if correlation < 0.8:
-        return
-    if _DEGREES / 2 < ratio < 2 * _DEGREES:
-        row = int(rows[np.argmax(np.abs(table[rate][rows]))])
-        raise _unit_mistake(where, row, rate, table[rate][row], f"degrees per second ({ratio:.0f} times the rate of '{angle}')")
-    if _DEGREES / 2 < 1 / ratio < 2 * _DEGREES:
-        row = int(rows[np.argmax(np.abs(table[angle][rows]))])
-        looks_like = f"degrees (it turns {1 / ratio:.0f} times faster than '{rate}')"
-        raise _unit_mistake(where, row, angle, table[angle][row], looks_like)
+    wrong = _wrong_section(turned, measured, rows[: len(turned)]) if not rate.startswith("cmd") else None
+    ratio, correlation, _ = _compare(turned, measured)
+    if correlation >= _SAME_MOTION and not (wrong and wrong[1]):
+        if _DEGREES / 2 < ratio < 2 * _DEGREES:
+            row = int(rows[np.argmax(np.abs(table[rate][rows]))])
+            looks_like = f"degrees per second ({ratio:.0f} times the rate of '{angle}')"
+            raise _unit_mistake(where, row, rate, table[rate][row], looks_like)
+        if _DEGREES / 2 < 1 / ratio < 2 * _DEGREES:
+            row = int(rows[np.argmax(np.abs(table[angle][rows]))])
+            looks_like = f"degrees (it turns {1 / ratio:.0f} times faster than '{rate}')"
+            raise _unit_mistake(where, row, angle, table[angle][row], looks_like)
+    if wrong:
+        row, first, ratio = wrong
+        text = f"column '{rate}': from here on {ratio:.3g} times the rate of '{angle}': the unit of one is wrong, or changes"
+        raise ImpossibleError(f"{where}: {row_words(where, row)}, {text}", first)
+
+
+def _wrong_section(turned: Array, measured: Array, rows: NDArray[np.intp]) -> tuple[int, int, float] | None:
+    """Return the first row of a section in which an angle and its rate do not go together, and their ratio.
+
+    Between them stands the row up to which they may: 0 where no section before shows that they did.
+    """
+    agreed = False
+    for first, part in _parts(rows)[1:]:
+        ratio, correlation, size = _compare(turned[part], measured[part])
+        if correlation < _SAME_MOTION or size < _SHOWN:
+            continue
+        if not 1 / _APART < ratio < _APART:
+            return int(rows[part[0]]), first if agreed else 0, ratio
+        agreed = True
+    return None
+
+
+def _compare(turned: Array, measured: Array) -> tuple[float, float, float]:
+    """Return the ratio of two series of turns, their correlation (0 where one shows none), and the larger rms, rad."""
+    energies, product = (float(turned @ turned), float(measured @ measured)), float(turned @ measured)
+    if min(energies) == 0.0 or product == 0.0:
+        return 1.0, 0.0, 0.0
+    return product / energies[0], product / math.sqrt(energies[0] * energies[1]), math.sqrt(max(energies) / len(turned))
+
+
+def check_speeds(table: Table, robot: Robot, where: str) -> None:
+    """Refuse a run with a step that :func:`find_leap` finds: :class:`ImpossibleError` with its row."""
+    if leap := find_leap(table, robot):
+        raise ImpossibleError(f"{where}: {row_words(where, leap[0])}, {leap[1]}", leap[0])
+
+
+def find_leap(table: Table, robot: Robot) -> tuple[int, str] | None:
+    """Return the first row to which a joint moves as no motor of the robot can, with column and speed in words.
+
+    Two recordings in one, units that change and angles that start anew after a turn show as such steps.
+    """
+    steps = np.diff(table["t"])
+    steps, found = np.maximum(steps, np.median(steps)), []  # times of single rows may be late
+    for joint in JOINTS:
+        top = (robot.servo.leg if joint in LEGS else robot.servo.wheel).no_load_speed
+        moved = np.abs(np.diff(table[f"pos_{joint}"]))
+        rows = np.flatnonzero(moved > _QUICK * top * steps + _SPREAD)
+        if len(rows):
+            speed, times = moved[rows[0]] / steps[rows[0]], f" ({len(rows)} times in the run)" if len(rows) > 1 else ""
+            seen = f"column 'pos_{joint}': jumps by {moved[rows[0]]:.3g} rad, at {speed:.3g} rad/s{times}"
+            text = f"{seen}; the motor of robot '{robot.name}' reaches {top:.3g} rad/s"
+            found.append((int(rows[0]) + 1, f"{text}: two recordings in one, units that change, or another robot (--robot)?"))
+    return min(found, default=None)
 
 
 def increments(t: Array, angle: Array, rate: Array) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ def test_suggest_answer_import(mcap, answered, tmp_path, monkeypatch, capsys):
     assert main(["import", str(mcap), "--map", "map.yaml", "--out", "runs"]) == OK
     said = capsys.readouterr().out
     assert "as recorded" in said
-    assert "interpolated" in said
+    assert "held at mid-step" in said
     assert "does not state the servo profile (meta.profile): none is assumed" in " ".join(said.split())
     (run,) = read_dataset("runs").runs
     assert run.meta.robot == "wlr-nominal"

@@ -99,7 +99,7 @@ def test_setpoints_that_end_early_are_held_and_said(messages, known, tmp_path):
     late = run["t"] > 5.1
     assert (run["cmd_wheel_lf"][late] == run["cmd_wheel_lf"][-1]).all()
     (note,) = [one for one in imported.notes if "silent" in one]
-    assert note.startswith("topic '/chassis/target': silent for up to 6.9 s: its last message is held over 34")
+    assert note.startswith("topic '/chassis/target': silent for up to 7.0 s: its last message is held over 34")
 
 
 def split_joints(messages):

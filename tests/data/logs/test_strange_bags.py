@@ -22,6 +22,7 @@ from foreign_logs import (
 from wlr_gym.base.errors import InputError
 from wlr_gym.data import read_run, write_run
 from wlr_gym.data.logs import export_run, import_log, suggest_map
+from wlr_gym.data.logs.map import TopicClock
 from wlr_gym.data.logs.messages import definition, make, typestore
 from wlr_gym.robot import JOINTS, LEGS
 
@@ -92,8 +93,12 @@ def test_headers_that_go_back_are_said(messages, known, tmp_path):
     for message in of_topic(changed, "/chassis/joints")[200:203]:
         stamp = message.header.stamp
         message.header.stamp = make("builtin_interfaces/msg/Time", sec=stamp.sec - 1, nanosec=stamp.nanosec + 1)
-    (imported,) = import_log(write_mcap(tmp_path / "a.mcap", changed), tmp_path / "runs", known)
-    assert "topic '/chassis/joints': its times go back 1 times, by up to 0.98 s: sorted by time" in imported.notes
+    path = write_mcap(tmp_path / "a.mcap", changed)
+    with pytest.raises(InputError, match=r"jumps by .* its times go back 1 times, by up to 0.98 s") as error:
+        import_log(path, tmp_path / "runs", known)
+    assert "column 'pos_" in str(error.value)
+    by_log = known.model_copy(update={"clocks": {**known.clocks, "/chassis/joints": TopicClock(use="log")}})
+    assert import_log(path, tmp_path / "runs", by_log)
 
 
 def test_a_clock_that_began_anew_is_not_used(messages, known, tmp_path):

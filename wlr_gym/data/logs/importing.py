@@ -18,7 +18,7 @@ import yaml
 from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.files import make_output_folder, write_text
 from wlr_gym.base.settings import parse_config, read_yaml
-from wlr_gym.data.format import COLUMNS, REQUIRED, Finding, RunMeta, check_table
+from wlr_gym.data.format import COLUMNS, REQUIRED, Finding, ImpossibleError, RunMeta, check_speeds, check_table
 from wlr_gym.data.logs.map import (
     CURRENTS,
     NO_PROFILE,
@@ -35,7 +35,7 @@ from wlr_gym.data.logs.map import (
 )
 from wlr_gym.data.logs.messages import RUN, read_exported
 from wlr_gym.data.logs.readers import TABLE, first_messages, quiet, read_logs
-from wlr_gym.data.logs.rows import ChannelFact, MadeRun, runs_of, wanted_fields
+from wlr_gym.data.logs.rows import ChannelFact, MadeRun, make_run, part_of, split_run, wanted_fields
 from wlr_gym.data.logs.suggest import MOST, Proposal, propose
 from wlr_gym.data.logs.topics import Share
 from wlr_gym.data.runs import check_meta, next_run, note_robot, noted, own_robot, robot_of_meta, write_meta, write_run
@@ -81,6 +81,7 @@ def import_log(
     split: float | None = None,
     suffix: str = ".parquet",
     tell: Share = quiet,
+    keep_going: bool = False,
 ) -> list[ImportedRun]:
     """Import a log into a folder of runs, after those that are in it; the map is written beside them.
 
@@ -95,6 +96,7 @@ def import_log(
             recordings several (:data:`wlr_gym.data.logs.rows.LONGEST`).
         suffix: format of the runs.
         tell: called with the share that was read.
+        keep_going: import what comes before the first row that cannot be true; else such a recording is refused.
 
     Raises:
         InputError: an unreadable log, a map that is not complete, does not fit or names another robot, a run that a reader
@@ -122,7 +124,8 @@ def import_log(
     with _beside(out) as folder:
         for recording in read_logs(log, wanted_fields(resolved), tell=tell):
             _check_new(recording.name, record, out)
-            for one in runs_of(recording, found, resolved, split):
+            whole = _possible_part(make_run(recording, found, resolved), recording.name, resolved, chosen, keep_going)
+            for one in split_run(whole, split):
                 findings = _check(one, recording.name, resolved, chosen)
                 path = write_run(folder / f"{len(made)}{suffix}", one.table)
                 notes = (*recording.notes, *one.notes, *general)
@@ -240,10 +243,32 @@ def _beside(out: Path) -> Iterator[Path]:
         raise
 
 
+#: s; a shorter part is no run.
+_LEAST_PART = 3.0
+
+
+def _possible_part(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Robot, keep_going: bool) -> MadeRun:
+    """Return a recording that can be true; of another what comes before its first impossible row, or it is refused."""
+    try:
+        _check(made, name, resolved, robot)
+    except ImpossibleError as error:
+        t, back = made.table["t"], [note for note in made.notes if "times go back" in note]
+        text = "; ".join([str(error), *(note for note in back if note.partition(":")[0] in str(error))])
+        if t[error.row] < _LEAST_PART:
+            raise InputError(text) from None
+        if not keep_going:
+            raise InputError(f"{text}; --keep-going imports the first {t[error.row]:.1f} s") from None
+        note = f"rows from {error.row} on ({t[-1] - t[error.row]:.1f} of {t[-1]:.1f} s) are cut: {error}"
+        part = part_of(replace(made, notes=(*made.notes, note)), 0, error.row)
+        return _possible_part(part, name, resolved, robot, keep_going)
+    return made
+
+
 def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Robot) -> tuple[Finding, ...]:
     """Return what is odd about a run; a refusal says from which topic and field the column came."""
     try:
         findings = tuple(check_table(made.table, name))
+        check_speeds(made.table, robot, name)
         for column in filter(is_effort, made.table):
             check_effort(column, made.table, resolved[column].unit, robot, name)
         return findings
@@ -253,7 +278,8 @@ def _check(made: MadeRun, name: str, resolved: Mapping[str, Resolved], robot: Ro
         if source is None:
             raise
         where = f"from topic '{source.topic}', field '{source.field}', read as {source.unit}: check its unit in the map"
-        raise InputError(f"{error} ({where})") from None
+        text = f"{error} ({where})"
+        raise (ImpossibleError(text, error.row) if isinstance(error, ImpossibleError) else InputError(text)) from None
 
 
 # ---- the record of what was imported ---------------------------------------------------------------------------------

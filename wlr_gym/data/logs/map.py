@@ -138,8 +138,8 @@ class ChannelSource(SettingsModel):
         zero: what the log says where the channel is 0, in SI units.
         take: how a row gets its value: ``interpolate`` between the samples before and after it, ``hold`` the last one
             (of setpoints: the one that holds in the middle of the row's step), ``nearest``, or ``frames``: only rows next to a
-            sample get one. None = ``hold`` for setpoints, ``frames`` for the camera, else ``interpolate``. What has a
-            sample at the row's own time is taken as it is.
+            sample get one. None = ``hold`` for setpoints and voltage, ``frames`` for the camera, else ``interpolate``. What has
+            a sample at the row's own time is taken as it is.
     """
 
     topic: str
@@ -361,7 +361,7 @@ def _resolve(found: LogMap, column: str, source: ChannelSource, robot: Robot, wh
         field = field.replace("{axis}", axis[-1])
     elif "{axis}" in field:  # heading and pitch come from the quaternion beside the position
         field = field.replace("position.{axis}", f"orientation.{label}").replace("{axis}", label)
-    take = source.take or ("hold" if kind == "cmd" else "frames" if kind == "cam" else "interpolate")
+    take = source.take or ("hold" if kind in ("cmd", "volt") else "frames" if kind == "cam" else "interpolate")
     angle_of_pose = column in ("cam_yaw", "cam_pitch") and source.unit in ("mm", "cm", "m")
     unit = None if angle_of_pose else source.unit
     size = factor(column, unit, robot, where)

@@ -477,7 +477,7 @@ def numeric_topic(frame: pandas.DataFrame, times: NDArray[np.int64], wanted: Col
     names = [str(name) for name in frame.columns if pandas.api.types.is_numeric_dtype(frame[name])]
     for name in names if wanted is None else [name for name in names if name in wanted]:
         values = frame[name].to_numpy(np.float64, na_value=np.nan)
-        known = np.isfinite(values)
+        known = ~np.isnan(values)
         fields[name] = (rows, values) if known.all() else (rows[known], values[known])
     return Topic(TABLE, TABLE, np.asarray(times, np.int64), None, fields, known=frozenset(names))
 

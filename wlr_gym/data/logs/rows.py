@@ -276,7 +276,8 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
         raise InputError(f"{log.name}: no source for {', '.join(missing)}: {_MISSING[missing[0].partition('_')[0]]}")
     notes: list[str] = []
     _note_odd_times(log, found, resolved, notes)
-    series = _read_series(log, found, resolved, notes)
+    infinite: dict[str, Times] = {}
+    series = _read_series(log, found, resolved, notes, infinite)
     times = _row_times(log, found, resolved, series, notes)
     times = _complete(log, resolved, series, times, notes)
     times = _without_holes(log, resolved, series, times, notes)
@@ -287,6 +288,7 @@ def make_run(log: Log, found: LogMap, resolved: Mapping[str, Resolved]) -> MadeR
         at, values = series[column]
         values = np.unwrap(values) if column == "cam_yaw" else values
         table[column], how, moved = at_rows(times, at, values, source.take, period)
+        table[column][np.searchsorted(times[:-1], infinite[column])] = np.inf  # refused, in its row or the next
         rate, known = 1e9 / float(np.median(np.diff(at))), float(np.isfinite(table[column]).mean())
         facts.append(ChannelFact(column, source.topic, source.field, source.unit, rate, how, moved, known))
     _note_silent(resolved, series, times, notes)
@@ -322,8 +324,13 @@ def _note_odd_times(log: Log, found: LogMap, resolved: Mapping[str, Resolved], n
             notes.append(f"topic '{name}': its times go back {much}: sorted by time{anew}")
 
 
-def _read_series(log: Log, found: LogMap, resolved: Mapping[str, Resolved], notes: list[str]) -> dict[str, Series]:
-    """Return each channel's samples in SI units on the common clock, in the order of time; times once only."""
+def _read_series(
+    log: Log, found: LogMap, resolved: Mapping[str, Resolved], notes: list[str], infinite: dict[str, Times]
+) -> dict[str, Series]:
+    """Return each channel's samples in SI units on the common clock, in the order of time; times once only.
+
+    Times (ns) of infinite values go to ``infinite``.
+    """
     lost: Times = np.zeros(0, np.int64)
     yaw = resolved.get("cam_yaw")
     if yaw is not None and has_angle(topic := log.topic(yaw.topic), yaw.field):
@@ -340,12 +347,13 @@ def _read_series(log: Log, found: LogMap, resolved: Mapping[str, Resolved], note
             at, raw, _ = pose_angle(topic, source.field, clock.use, found.frames.get("cam"), where)
         else:
             at, raw = topic.series(source.field, clock.use, where)
+        offset = round(clock.offset * 1e9)
+        infinite[column] = at[np.isinf(raw)] + offset
         keep = np.concatenate([np.diff(at) > 0, [True]])  # of two at one time, the later message
-        if column not in COMMANDS:
-            keep &= np.isfinite(raw)
+        keep &= np.isfinite(raw) if column not in COMMANDS else ~np.isinf(raw)
         if yaw is not None and column in CAMERA and source.topic == yaw.topic:
             keep &= ~np.isin(at, lost)
-        at, raw = at[keep] + round(clock.offset * 1e9), raw[keep]
+        at, raw = at[keep] + offset, raw[keep]
         if len(at) < 2:
             text = f"topic '{source.topic}', field '{source.field}': {len(at)} samples, expected at least 2"
             raise InputError(f"{where}: {text}")
@@ -455,12 +463,11 @@ _PLAY = 0.25
 _HOLE, _LEAST_HOLE, _LEAST_PIECE = 5.0, 0.5, 1.0
 
 
-def runs_of(log: Log, found: LogMap, resolved: Mapping[str, Resolved], split: float | None) -> Iterator[MadeRun]:
-    """Yield the runs that a map makes of a recording, cut where the robot is quietest.
+def split_run(made: MadeRun, split: float | None) -> Iterator[MadeRun]:
+    """Yield a run, or several of about :data:`LONGEST` or ``split`` seconds, cut where the robot is quietest.
 
-    One run, or several of about :data:`LONGEST` or ``split`` seconds. Runs of a cut recording go across no hole.
+    Runs of a cut recording go across no hole.
     """
-    made = make_run(log, found, resolved)
     t = made.table["t"]
     if split is None and t[-1] <= LONGEST:
         yield made
@@ -473,12 +480,12 @@ def runs_of(log: Log, found: LogMap, resolved: Mapping[str, Resolved], split: fl
         text = f"{len(pieces) - len(kept)} pieces between holes are shorter than {_LEAST_PIECE:g} s and are left out"
         made = replace(made, notes=(*made.notes, text))
     for first, last in kept:
-        piece = made if len(pieces) == 1 else _part(made, first, last)
+        piece = made if len(pieces) == 1 else part_of(made, first, last)
         whole = float(piece.table["t"][-1])
         count = max(round(whole / split), 1)
         cuts = [_quiet_row(piece, k * whole / count, whole / count) for k in range(1, count)]
         for begin, end in itertools.pairwise([0, *cuts, len(piece.table["t"])]):
-            yield _part(piece, begin, end) if cuts else piece
+            yield part_of(piece, begin, end) if cuts else piece
 
 
 def _quiet_row(made: MadeRun, middle: float, length: float) -> int:
@@ -494,7 +501,8 @@ def _quiet_row(made: MadeRun, middle: float, length: float) -> int:
     return int(rows[np.argmin(cost)])
 
 
-def _part(made: MadeRun, first: int, last: int) -> MadeRun:
+def part_of(made: MadeRun, first: int, last: int) -> MadeRun:
+    """Return rows of a run as a run."""
     table = _from_start({name: values[first:last] for name, values in made.table.items()})
     begin = float(table["t"][0])
     table["t"] = table["t"] - begin

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.data.format import COMMANDS, increments
+from wlr_gym.data.format import COMMANDS, find_leap, increments
 from wlr_gym.data.runs import Run
 from wlr_gym.gap.analysis import IntakeFinding
 from wlr_gym.gap.problem import Array
@@ -276,6 +276,12 @@ def wrapped(run: Run, channel: str, robot: Robot) -> Outcome:
     row = int(jumps[0]) + 1
     text = f"jumps {len(jumps)} times, first by {run[channel][row] - run[channel][row - 1]:.3g} rad in row {row}"
     return ChannelFault(row, text)
+
+
+def leaps(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether a joint gets further between two rows than any motor of the robot can move it."""
+    leap = find_leap({name: run[name] for name in ("t", *_POS)}, robot)
+    return Sound.YES if leap is None else ChannelFault(*leap)
 
 
 def dead(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -644,6 +650,7 @@ CHECKS: tuple[IntakeCheck, ...] = (
     ),
     IntakeCheck("still", ("pos",), stands_still, "a robot that drives or moves its legs", _MOVE),
     IntakeCheck("wrap", _POS, wrapped, "angles that go on past a turn", "numpy.unwrap mends it"),
+    IntakeCheck("jump", ("pos",), leaps, "one recording, in one unit", "leave the run out, or split it there into two files"),
     IntakeCheck("clock", ("t",), clock_rate, "seconds", "write the time at which each row was read, in s"),
     IntakeCheck("clock", ("t",), clock_jumps, "a monotonic clock, rows 20 ms apart; single lost rows do no harm", _CLOCK),
     IntakeCheck("dead", _POS, dead, *_DEAD),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError, check_name
 from wlr_gym.base.files import replace_file, write_json
 from wlr_gym.base.plots import BLUE, COLOURS, GREY, legend_below, new_figure, save, tidy
+from wlr_gym.data.format import check_speeds
 from wlr_gym.data.run_states import rest_pose
 from wlr_gym.data.runs import Run, floor_of, own_robot, robot_of, write_run
 from wlr_gym.perception.markers.camera import Camera
@@ -147,6 +148,7 @@ def analyse(
     """
     check_name("origin", origin, ORIGINS)
     found = robot_of(run, robot)
+    check_speeds(run.table, found, str(run.path))
     _require_level(run, found)
     parameters = Parameters.nominal(found)
     for_tracking, for_watching = tee(frames)  # they are apart no longer than until the floor is located
