@@ -181,6 +181,32 @@ def test_import_as_json(big, tmp_path, capsys):
     assert report["numbers"]["leg"]["length"] == 0.3
 
 
+def test_what_comes_from_the_base_is_listed_and_checked(big, tmp_path, capsys):
+    file, back = tmp_path / "big.xml", tmp_path / "back.yaml"
+    assert main(["robot", "export", str(big), "--out", str(file)]) == OK
+    assert main(["robot", "import", str(file), "--out", str(back)]) == OK
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Taken from 'nominal': " in said
+    assert "servo.wheel.no_load_speed = 6.388, " in said
+    assert "servo.wheel.no_load_speed = 6.388" in back.read_text()
+    assert main(["robot", "check", str(back)]) == OK
+    said = capsys.readouterr().out
+    assert "servo.wheel.no_load_speed = 6.388 rad/s: taken from 'nominal'; it decides the top speed" in said
+    assert "servo.wheel.stall_torque = " not in said  # the file has it
+    for robot in (str(big), "nominal", "emanual"):
+        assert main(["robot", "check", robot]) == OK
+        assert "taken from" not in capsys.readouterr().out
+
+
+def test_a_number_is_given_in_place_of_the_files(big, tmp_path, capsys):
+    file, back = tmp_path / "big.urdf", tmp_path / "back.yaml"
+    assert main(["robot", "export", str(big), "--out", str(file)]) == OK
+    assert main(["robot", "import", str(file), "--out", str(back), "--set", "wheel.radius=90 mm"]) == OK
+    assert load_robot(back).wheel.radius == 0.09
+    assert main(["robot", "import", str(file), "--out", str(tmp_path / "b.yaml"), "--set", "wheel.radios=1"]) == BAD_INPUT
+    assert "(did you mean 'wheel.radius'?)" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [

@@ -220,6 +220,14 @@ def test_numbers_of_a_foreign_robot(tmp_path):
     assert any("body origin: put at (0.1, 0, 0.05) m of link 'trunk'" in note for note in found.notes)
 
 
+def test_gains_of_actuators_are_named(tmp_path):
+    path = tmp_path / "foreign.xml"
+    hold = '<position name="hold" joint="hr_hip" kp="40" kv="2"/></actuator>'
+    path.write_text(foreign_text().replace("</actuator>", hold))
+    found, _ = imported(path)
+    assert "actuator 'hold': kp = 40, kv = 2: not used; servo gains are those of the base" in found.notes
+
+
 # ---- round trips -------------------------------------------------------------------------------------------------------
 
 #: What each format cannot hold: keys of a robot file.

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.robot import load_robot
+from wlr_gym.robot import LEGS, load_robot
 from wlr_gym.robot.interchange.recognition import recognise, robot_over, robot_text
 from wlr_gym.robot.interchange.urdf import parse_urdf, urdf_text
+from wlr_gym.robot.parameters import Parameters
 
 LINK = """
 <link name="{name}">
@@ -129,13 +130,59 @@ def test_a_body_frame_that_is_not_in_the_middle_is_said():
     assert any(note.startswith("body origin: put at (0.1, 0, 0.4) m of link 'base_footprint'") for note in found.notes)
 
 
-def test_small_differences_are_said_and_large_ones_refused():
-    found = read(foreign(leg_FL={"mass": 0.51}))
-    assert found.numbers["leg"]["mass"] == pytest.approx(0.6025)
-    assert any("leg.mass = 0.61, 0.6, 0.6, 0.6 kg: a robot file has one" in note for note in found.notes)
-    with pytest.raises(InputError, match=r"robot.urdf: leg.mass = 0.8, 0.6, 0.6, 0.6 kg: .* 25 % is too much .*--idealise"):
-        read(foreign(leg_FL={"mass": 0.7}))
-    assert read(foreign(leg_FL={"mass": 0.7}), idealise=True).numbers["leg"]["mass"] == pytest.approx(0.65)
+def test_unlike_legs_are_stated_one_by_one(tmp_path):
+    """Whether little or much differs, and with --idealise too: a robot file has a place for each."""
+    short = {"axle_FL": {"place": "0 0 0"}, "leg_FL": {"mass": 0.7}}
+    for options in ({}, {"idealise": True}):
+        found = read(foreign(**short), **options)
+        assert found.numbers["leg"]["length"] == pytest.approx(0.275)
+        single = found.numbers["individual"]
+        assert [single[f"leg.length[{leg}]"] for leg in LEGS] == pytest.approx([0.2, 0.3, 0.3, 0.3])
+        assert [single[f"leg.mass[{leg}]"] for leg in LEGS] == pytest.approx([0.8, 0.6, 0.6, 0.6])
+        assert any("leg.length = 0.2, 0.3, 0.3, 0.3 m: one by one under 'individual'" in note for note in found.notes)
+    path = tmp_path / "mine.yaml"
+    path.write_text(robot_text("mine", "nominal", found.numbers))
+    robot = load_robot(path)
+    assert Parameters.nominal(robot)["leg.length"][0] == pytest.approx([0.2, 0.3, 0.3, 0.3])
+    again = read(urdf_text(robot)).numbers
+    assert again["individual"] == pytest.approx(single, rel=1e-12)
+
+
+def test_what_no_robot_file_has_one_by_one_is_averaged_or_refused():
+    wide = {"wheel_FL": {"shape": cylinder(0.08, 0.051)}}
+    assert any("wheel.width = 0.051, 0.05, 0.05, 0.05 m: a robot file has one" in note for note in read(foreign(**wide)).notes)
+    wider = {"wheel_FL": {"shape": cylinder(0.08, 0.07)}}
+    with pytest.raises(InputError, match=r"robot.urdf: wheel.width = 0.07, 0.05, .* 28.6 % is too much .*--idealise"):
+        read(foreign(**wider))
+    assert read(foreign(**wider), idealise=True).numbers["wheel"]["width"] == pytest.approx(0.055)
+
+
+MESH = '<collision><geometry><mesh filename="package://parts/wheel.stl"/></geometry></collision>'
+
+
+def test_wheels_that_are_meshes_need_a_radius():
+    meshes = {f"wheel_{name}": {"shape": MESH} for name, *_ in CORNERS}
+    with pytest.raises(InputError, match="no sphere: give its radius, such as --set wheel"):
+        read(foreign(**meshes))
+    assert read(foreign(**meshes), given={"wheel.radius": 0.09}).numbers["wheel"]["radius"] == 0.09
+    single = {"wheel_FL": {"shape": cylinder(0.07, 0.05)}}
+    given = read(foreign(**single), given={"wheel.radius": 0.09}).numbers
+    assert (given["wheel"]["radius"], given.get("individual")) == (0.09, None)
+
+
+def test_joints_that_move_freely_or_not_at_all_need_no_axis():
+    """As CAD exporters write them: axis 0 0 0 of fixed joints, a world above the body."""
+    text = foreign(
+        lambda text: text.replace('xyz="0.3 0 0.1" rpy="0 0 0"/><axis xyz="0 1 0"/>', 'xyz="0.3 0 0.1"/><axis xyz="0 0 0"/>')
+    )
+    assert text.count('axis xyz="0 0 0"') == 1
+    assert read(text).numbers == read(foreign()).numbers
+    world = with_part(
+        '<link name="world"/><joint name="free" type="floating"><parent link="world"/><child link="base_footprint"/></joint>'
+    )
+    assert read(foreign(world)).numbers == read(foreign()).numbers
+    with pytest.raises(InputError, match="joint 'hip_FL' is a free"):
+        read(foreign(hip_FL={"kind": "floating"}))
 
 
 def test_what_no_robot_file_holds_is_said_with_its_number():
@@ -183,7 +230,11 @@ TWIN = (link("second", 0.1), joint("axle_2", "leg_FL", "second", place="0 0 -0.1
         (foreign(axle_FL={"place": "0 0 0.2"}), r"leg 'hip_FL': its wheel 'axle_FL' turns about the hip: length = 0 m"),
         (foreign(wheel_FL={"mass": 0.0}), "link 'tyre_FL': mass = 0 kg: expected more than 0"),
         (foreign(wheel_FL={"mass": "heavy"}), "link 'tyre_FL': mass: value = 'heavy': expected 1 numbers"),
-        (foreign(wheel_FL={"shape": ""}), "wheel 'tyre_FL' has no cylinder about its axle and no sphere"),
+        (foreign(wheel_FL={"shape": ""}), "wheel 'tyre_FL' has no cylinder about its axle and no sphere: give its radius"),
+        (foreign(wheel_FL={"inertia": (0.002, 0.0, 0.002)}), "link 'tyre_FL': iyy = 0 kg m2: expected more than 0"),
+        (foreign(lambda t: t.replace('"hip_FL"', '"hip_FR"')), "two joints are called 'hip_FR'"),
+        (foreign(lambda t: t.replace('<link name="tyre_FL"', '<link name="tyre_FR"')), "two links are called 'tyre_FR'"),
+        (foreign(hip_FL={"more": '<limit lower="1" upper="-1"/>'}), "'hip_FL': limit: lower = 1 is above upper = -1 rad"),
         (foreign(axle_FL={"axis": "0 0 0"}), "joint 'axle_FL': axis = .* expected a direction"),
         (foreign(lambda t: t.replace('<parent link="leg_FL"/>', '<parent link="leg_F"/>')), "its parent 'leg_F' is no link"),
         (foreign(with_part(link("loose", 1.0))), "expected one link that is no joint's child, found 2: base_footprint, loose"),

@@ -5,7 +5,8 @@ Exit code 0: done, nothing stands against the robot; 1: it cannot stand, drive o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,16 +16,18 @@ from tyro.conf import Positional
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import check_new_file, make_output_folder, refuse_existing, write_text
+from wlr_gym.base.settings import overlay, read_layers
 from wlr_gym.base.text import counted, pairs
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import FloorOption, ForceOption, JsonOption, refuse_given
 from wlr_gym.cli.terminal import ask_terminal, print_json, print_table
 from wlr_gym.physics.feasibility import ENTRIES, RobotFinding, capability_of, examine_robot, unusual
-from wlr_gym.robot import Robot, load_robot, robot_hash
+from wlr_gym.robot import Robot, load_robot, robot_content, robot_hash
 from wlr_gym.robot.interchange.recognition import (
     ImportedRobot,
     LinkTree,
     base_beside,
+    missing_numbers,
     of_all,
     recognise,
     robot_over,
@@ -32,6 +35,7 @@ from wlr_gym.robot.interchange.recognition import (
 )
 from wlr_gym.robot.interchange.urdf import NOT_IN_URDF, parse_urdf, urdf_text
 from wlr_gym.robot.outline import QUESTIONS, Question, derived_numbers, question_of
+from wlr_gym.robot.parameter_table import spec_of
 from wlr_gym.robot.parameters import Parameters
 
 Format = Literal["mjcf", "urdf", "parts"]
@@ -91,6 +95,8 @@ class RobotImportOptions(JsonOption, ForceOption):
     """Name of the robot; default: that in the file."""
     base: str = "nominal"
     """Robot that has what the format cannot hold: name in configs/robot/ or path."""
+    set: tuple[str, ...] = ()
+    """Numbers in place of the file's, such as wheel.radius="80 mm" of wheels that are meshes; units may be left out (SI)."""
     idealise: bool = False
     """Accept that numbers are averaged or left out which change the robot by more than 5 %."""
 
@@ -189,13 +195,42 @@ def print_findings(robot: Robot, findings: Sequence[RobotFinding]) -> None:
 def check_robot(options: CheckOptions) -> int:
     """Print what is wrong or odd; 1 when something stands against the robot."""
     robot = load_robot(options.robot, check=False)
-    findings = examine_robot(robot)
+    findings = [*examine_robot(robot), *_borrowed(options.robot)]
     if options.json:
         print_json({"robot": robot.name, "findings": findings})
     else:
         print_findings(robot, findings)
     against = findings if options.strict else [finding for finding in findings if finding.level == "fault"]
     return FAILED if against else OK
+
+
+#: Number of a robot file -> what follows from it: another robot's is seldom right.
+MATTERS = {
+    **{f"servo.{part}.stall_torque": "what it carries and climbs" for part in ("leg", "wheel")},
+    "servo.leg.no_load_speed": "how fast legs move",
+    "servo.wheel.no_load_speed": "the top speed",
+    **{f"servo.{part}.armature": "how fast it speeds up" for part in ("leg", "wheel")},
+    "servo.supply_voltage": "the motors' resistance and gains",
+}
+
+
+def _borrowed(source: str) -> list[RobotFinding]:
+    """Warn of numbers that a robot with a body and wheels of its own has from the robot it is based on."""
+    own: Mapping[str, Any] = {}
+    (base, name), *above = read_layers("robot", source)
+    for content, _ in above:
+        own = overlay(own, content)
+    lacking, stated = missing_numbers(own, base), set(missing_numbers({}, own))
+    if not {"body.mass", "wheel.radius"} <= stated:
+        return []
+    said = [(key, why) for key, why in MATTERS.items() if key in lacking]
+    text = f"taken from '{Path(name).stem}'; it decides {{}}: state your robot's"
+    return [RobotFinding("warning", key, lacking[key], _unit(key), text.format(why)) for key, why in said]
+
+
+def _unit(key: str) -> str:
+    """Return the unit of a number of the servos."""
+    return spec_of(f"servo.{key.rpartition('.')[2]}").unit
 
 
 def show_robot(options: ShowOptions) -> int:
@@ -225,26 +260,39 @@ def show_robot(options: ShowOptions) -> int:
 def import_robot(options: RobotImportOptions) -> int:
     """Read, write, and say what was averaged or left out; 1 when the robot cannot stand, drive or turn."""
     check_new_file(options.out, options.force, endings=ENDINGS)
-    found = recognise(_read(options.file), idealise=options.idealise)
+    given = {key: question_of(key).read(text) for key, text in pairs("--set", options.set, "wheel.radius=0.08").items()}
+    found = recognise(_read(options.file), idealise=options.idealise, given=given)
     name = options.name or found.name or options.out.stem
     numbers = of_all(found.numbers, options.base)
     robot = robot_over(options.base, name, numbers, options.out)
-    title = [f"Imported from {options.file.name} by wlr robot import. SI units, radians.", *_explained(found, options.base)]
+    borrowed = missing_numbers(found.numbers, robot_content(options.base))
+    explained = _explained(found, options.base, borrowed)
+    title = [f"Imported from {options.file.name} by wlr robot import. SI units, radians.", *explained]
     write_text(options.out, robot_text(name, base_beside(options.base, options.out), numbers, title=title))
     findings = examine_robot(robot)
     if options.json:
-        print_json({"out": options.out, **asdict(found), "findings": findings})
+        print_json({"out": options.out, **asdict(found), "from_base": borrowed, "findings": findings})
     else:
-        print("\n".join([f"written: {options.out}", *_explained(found, options.base)]))
+        print("\n".join([f"written: {options.out}", *explained]))
         print_findings(robot, findings)
     return FAILED if any(finding.level == "fault" for finding in findings) else OK
 
 
-def _explained(found: ImportedRobot, base: str) -> list[str]:
+def _explained(found: ImportedRobot, base: str, borrowed: Mapping[str, Any]) -> list[str]:
     """What was read, what was not, and how joints correspond."""
-    lines = [f"What the file does not hold is as in '{base}'.", *(f"note: {note}" for note in found.notes)]
+    taken = [_shown(key, value) for key, value in borrowed.items() if key not in ("name", "joints")]
+    lines = textwrap.wrap(f"Taken from '{base}': {', '.join(dict.fromkeys(taken))}.", 120, subsequent_indent="  ")
+    lines += [f"note: {note}" for note in found.notes]
     lines.append("Joint here = sign x angle in the file + offset (rad):")
     return lines + [f"  {one.joint} = {one.sign:+.0f} x {one.name} {one.offset:+.6g}" for one in found.joints]
+
+
+def _shown(key: str, value: Any) -> str:
+    """Return a number of a robot file in words; of long groups the name."""
+    group = key.partition(".")[0]
+    if group in ("sensors", "tolerances", "dynamixel_ids"):
+        return group
+    return f"{key} = {value:.6g}" if isinstance(value, float) else f"{key} = {value}"
 
 
 def _read(path: Path) -> LinkTree:

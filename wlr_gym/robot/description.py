@@ -358,9 +358,10 @@ def physical_faults(robot: Robot) -> list[str]:
     box = [robot.body.mass / 12 * s for s in (y * y + z * z, x * x + z * z, x * x + y * y)]
     for axis, value, uniform in zip("xyz", robot.body.inertia, box, strict=True):
         if value is not None and value < 0.05 * uniform:
+            more = f", {uniform / value:.0f} times more" if value > 0.0 else ""
             faults.append(
                 f"body.inertia {axis} = {value:g} kg m2 is impossible for {robot.body.mass:g} kg in a body of {x:g} x {y:g} x "
-                f"{z:g} m: a uniform box has {uniform:.4g}, {uniform / value:.0f} times more"
+                f"{z:g} m: a uniform box has {uniform:.4g}{more}"
             )
     for name, inertia in (("body.inertia", robot.body.inertia), ("leg.inertia", robot.leg.inertia)):
         values = [float(value) for value in inertia if value is not None]

@@ -24,7 +24,7 @@ from wlr_gym.robot.description import Robot, load_robot
 from wlr_gym.robot.parameter_table import CORNER_NAMES, CORNER_SIGNS, CORNERS, LEGS, WHEELS, spec_of
 
 Array = NDArray[np.float64]
-JointKind = Literal["hinge", "slide", "ball", "fixed"]
+JointKind = Literal["hinge", "slide", "ball", "fixed", "free"]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class LinkJoint:
 
     Attributes:
         name: as in the file.
-        kind: ``fixed``, ``hinge``, ``slide`` or ``ball``.
+        kind: ``fixed``, ``hinge``, ``slide``, ``ball`` or ``free``.
         parent, child: names of links.
         placement: of the child's frame in the parent's at angle 0.
         axis: (3,) unit vector through the child's origin, in the child's frame.
@@ -123,6 +123,7 @@ class LinkTree:
         links: by name.
         joints: in the order of the file.
         numbers: what else of a robot file the format could hold: dotted key -> value.
+        notes: what of the file is not used.
     """
 
     name: str
@@ -130,17 +131,22 @@ class LinkTree:
     links: Mapping[str, RigidLink]
     joints: tuple[LinkJoint, ...]
     numbers: Mapping[str, float | list[float]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def fuse_fixed(tree: LinkTree) -> LinkTree:
-    """Return the tree with every link on a fixed joint made a part of its parent.
+    """Return the tree with every link on a fixed joint made a part of its parent, and so what moves freely in an empty world.
 
     Raises:
         InputError: a joint names a link that is not there, a link has two parents, or the joints go round in a circle.
     """
     _check_names(tree)
     links, joints = dict(tree.links), list(tree.joints)
-    while fixed := next((joint for joint in joints if joint.kind == "fixed"), None):
+
+    def is_fixed(joint: LinkJoint) -> bool:
+        return joint.kind == "fixed" or (joint.kind == "free" and links[joint.parent].mass == 0.0)
+
+    while fixed := next(filter(is_fixed, joints), None):
         joints.remove(fixed)
         links[fixed.parent] = _merged(links[fixed.parent], links.pop(fixed.child), fixed.placement)
         joints = [
@@ -325,40 +331,45 @@ class ImportedRobot:
 class _Reader:
     """Collects numbers and notes; refuses what differs by too much."""
 
-    def __init__(self, source: str, idealise: bool) -> None:
+    def __init__(self, source: str, idealise: bool, notes: Iterable[str]) -> None:
         self.source, self.idealise = source, idealise
         self.numbers: dict[str, Any] = {}
-        self.notes: list[str] = []
+        self.individual: dict[str, float] = {}
+        self.notes = list(notes)
 
     def put(self, key: str, value: Any) -> None:
         """Take a number, a list of them, or None, which is not stated; ``key`` is dotted."""
         if value is not None:
             self.numbers[key] = [rounded(one) for one in value] if isinstance(value, list | tuple) else rounded(value)
 
-    def one(self, what: str, values: Sequence[float | None], unit: str, scale: float | None = None) -> float | None:
-        """Return the number that four are; their mean where they differ a little.
+    def put_one(
+        self, key: str, values: Sequence[float | None], unit: str, scale: float | None = None, elements: Sequence[str] = ()
+    ) -> None:
+        """Take the number that four are, if they are stated; of different ones their mean, and each where a file has it.
 
         Args:
-            what: name for messages.
-            values: of the corners, or of the joints.
+            key: dotted.
+            values: of the corners.
             unit: of them.
             scale: what differences are compared with; None = the largest value.
+            elements: names under which a robot file states them one by one; without, those that differ much are refused.
         """
         stated = [value for value in values if value is not None]
+        if 0 < len(stated) < len(values):
+            count = f"stated for {len(stated)} of {len(values)} legs or wheels"
+            raise InputError(f"{self.source}: {key}: {count}: expected all or none")
         if not stated:
-            return None
-        if len(stated) < len(values):
-            raise InputError(
-                f"{self.source}: {what}: stated for {len(stated)} of {len(values)} legs or wheels: expected all or none"
-            )
-        spread = max(stated) - min(stated)
+            return
+        spread, mean = max(stated) - min(stated), sum(stated) / len(stated)
+        self.put(key, stated[0] if spread == 0.0 else mean)
         share = spread / (scale or max(map(abs, stated)) or 1.0)
-        if share <= SAME:
-            return stated[0] if spread == 0.0 else sum(stated) / len(stated)
-        mean = sum(stated) / len(stated)
-        text = f"{what} = {', '.join(f'{value:.6g}' for value in stated)} {unit}: a robot file has one for all four"
-        self._accept(share, f"{text}; their mean {mean:.6g} is used", text)
-        return mean
+        text = f"{key} = {', '.join(f'{value:.6g}' for value in stated)} {unit}"
+        if share > SAME and elements:
+            self.individual |= {name: rounded(value) for name, value in zip(elements, stated, strict=True)}
+            self.notes.append(f"{text}: one by one under 'individual'; controllers use their mean {mean:.6g}")
+        elif share > SAME:
+            text += ": a robot file has one for all four"
+            self._accept(share, f"{text}; their mean {mean:.6g} is used", text)
 
     def leave_out(self, what: str, value: float, unit: str, scale: float) -> None:
         """Note a number that a robot file has no place for; refuse a large one."""
@@ -386,7 +397,7 @@ def rounded(value: float) -> float:
     return float(f"{float(value):.{DIGITS}g}") + 0.0
 
 
-def recognise(tree: LinkTree, *, idealise: bool = False) -> ImportedRobot:
+def recognise(tree: LinkTree, *, idealise: bool = False, given: Mapping[str, Any] | None = None) -> ImportedRobot:
     """Return what a tree of links says of a robot with four legs of one hinge and four wheels.
 
     The body's origin is put in the middle of the hips along x and y, and at the centre of the body's box along z.
@@ -394,26 +405,33 @@ def recognise(tree: LinkTree, *, idealise: bool = False) -> ImportedRobot:
     Args:
         tree: of a file.
         idealise: accept that numbers are averaged or left out which change the robot by more than :data:`SMALL`.
+        given: dotted key -> number that counts in place of the file's.
 
     Raises:
         InputError: another kind of robot, or numbers that no robot file can hold; the message names them.
     """
     body, assemblies = find_assemblies(fuse_fixed(tree))
-    reader = _Reader(tree.source, idealise)
+    reader, given = _Reader(tree.source, idealise, tree.notes), dict(given or {})
     for key, value in tree.numbers.items():
         reader.put(key, value)
     for link in (body, *(link for one in assemblies for link in (one.leg, one.wheel))):
         if link.mass <= 0.0:
             raise InputError(f"{tree.source}: link '{link.name}': mass = {link.mass:g} kg: expected more than 0")
+        for axes, moment in zip(("ixx", "iyy", "izz"), np.diag(link.inertia), strict=True):
+            if moment <= 0.0:
+                raise InputError(f"{tree.source}: link '{link.name}': {axes} = {moment:g} kg m2: expected more than 0")
     _read_body(body, assemblies, reader)
     _read_legs(assemblies, reader)
-    _read_wheels(assemblies, reader)
+    _read_wheels(assemblies, reader, given.get("wheel.radius"))
     _read_drives(assemblies, reader)
     _read_limits(assemblies, reader)
     legs, wheels = zip(LEGS, assemblies, strict=True), zip(WHEELS, assemblies, strict=True)
     joints = [JointMapping(ours, one.leg_joint.name, one.leg_sign, rounded(one.angle)) for ours, one in legs]
     joints += [JointMapping(ours, one.wheel_joint.name, one.wheel_sign, 0.0) for ours, one in wheels]
-    return ImportedRobot(tree.name, nested(reader.numbers), joints, reader.notes)
+    numbers, single = nested(reader.numbers | given), {key.partition("[")[0] for key in reader.individual} - set(given)
+    if single:
+        numbers["individual"] = {key: value for key, value in reader.individual.items() if key.partition("[")[0] in single}
+    return ImportedRobot(tree.name, numbers, joints, reader.notes)
 
 
 # ---- body ------------------------------------------------------------------------------------------------------------
@@ -454,9 +472,9 @@ def _read_body(body: RigidLink, assemblies: Sequence[Assembly], reader: _Reader)
     reader.put("body.com_offset", list(body.com - origin))
     signs = np.array(CORNER_SIGNS)
     size = float(np.abs(hips[:, :2]).max())
-    reader.put("hip_position.x", reader.one("hip_position.x", list(hips[:, 0] * signs[:, 0]), "m"))
-    reader.put("hip_position.y", reader.one("hip_position.y", list(hips[:, 1] * signs[:, 1]), "m"))
-    reader.put("hip_position.z", reader.one("hip_position.z", list(hips[:, 2]), "m", scale=size))
+    reader.put_one("hip_position.x", list(hips[:, 0] * signs[:, 0]), "m")
+    reader.put_one("hip_position.y", list(hips[:, 1] * signs[:, 1]), "m")
+    reader.put_one("hip_position.z", list(hips[:, 2]), "m", scale=size)
 
 
 # ---- legs ------------------------------------------------------------------------------------------------------------
@@ -464,7 +482,7 @@ def _read_body(body: RigidLink, assemblies: Sequence[Assembly], reader: _Reader)
 
 def _read_legs(assemblies: Sequence[Assembly], reader: _Reader) -> None:
     lengths = [one.length for one in assemblies]
-    reader.put("leg.length", reader.one("leg.length", lengths, "m"))
+    reader.put_one("leg.length", lengths, "m", elements=spec_of("leg.length").elements)
     rows = []
     for one in assemblies:
         sine, cosine = (0.0 if abs(value) < 1e-15 else value for value in (math.sin(one.angle), math.cos(one.angle)))
@@ -480,25 +498,25 @@ def _read_legs(assemblies: Sequence[Assembly], reader: _Reader) -> None:
         reader.leave_out_products(f"{where}: product of inertia {{}} in the leg's frame", inertia)
         rows.append((one.leg.mass, float(com[0]), *(float(inertia[k, k]) for k in (2, 1, 0))))  # straight down: x, y, own axis
     mass, com, *moments = zip(*rows, strict=True)
-    reader.put("leg.mass", reader.one("leg.mass", mass, "kg"))
-    along = reader.one("leg.com_along_leg", com, "m", scale=max(lengths))
-    if along is not None and along < 0.0:
-        where = f"{reader.source}: leg.com_along_leg = {along:.6g} m"
+    reader.put_one("leg.mass", mass, "kg", elements=spec_of("leg.mass").elements)
+    if min(com) < 0.0:
+        where = f"{reader.source}: leg.com_along_leg = {min(com):.6g} m"
         raise InputError(f"{where}: the legs' mass is behind the hip: expected 0 or more")
-    reader.put("leg.com_along_leg", along)
-    scale = max(map(max, moments))
-    reader.put("leg.inertia", [reader.one(f"leg.inertia {axis}", values, "kg m2", scale=scale)
-                               for axis, values in zip("xyz", moments, strict=True)])  # fmt: skip
+    reader.put_one("leg.com_along_leg", com, "m", max(lengths), spec_of("leg.com_along_leg").elements)
+    scale, elements = max(map(max, moments)), spec_of("leg.inertia").elements
+    for k, (axis, values) in enumerate(zip("xyz", moments, strict=True)):
+        reader.put_one(f"leg.inertia {axis}", values, "kg m2", scale, elements[k::3])
+    reader.put("leg.inertia", [reader.numbers.pop(f"leg.inertia {axis}") for axis in "xyz"])
 
 
 # ---- wheels ----------------------------------------------------------------------------------------------------------
 
 
-def _read_wheels(assemblies: Sequence[Assembly], reader: _Reader) -> None:
-    sizes = [_wheel_size(one, reader) for one in assemblies]
-    reader.put("wheel.radius", reader.one("wheel.radius", [radius for radius, _ in sizes], "m"))
-    widths = [width for _, width in sizes]
-    reader.put("wheel.width", reader.one("wheel.width", widths, "m") if None not in widths else None)
+def _read_wheels(assemblies: Sequence[Assembly], reader: _Reader, given: float | None) -> None:
+    sizes = [_wheel_size(one, reader, given) for one in assemblies]
+    radii, widths = zip(*sizes, strict=True)
+    reader.put_one("wheel.radius", radii, "m", elements=spec_of("wheel.radius").elements)
+    reader.put_one("wheel.width", widths if None not in widths else (), "m")
     rows = []
     for one, (radius, _) in zip(assemblies, sizes, strict=True):
         where, frame = f"wheel '{one.wheel.name}'", one.wheel_frame
@@ -511,11 +529,11 @@ def _read_wheels(assemblies: Sequence[Assembly], reader: _Reader) -> None:
         rows.append((one.wheel.mass, float(inertia[1, 1]), across))
     units = {"mass": "kg", "spin_inertia": "kg m2", "transverse_inertia": "kg m2"}
     for (key, unit), values in zip(units.items(), zip(*rows, strict=True), strict=True):
-        reader.put(f"wheel.{key}", reader.one(f"wheel.{key}", values, unit))
+        reader.put_one(f"wheel.{key}", values, unit, elements=spec_of(f"wheel.{key}").elements)
 
 
-def _wheel_size(one: Assembly, reader: _Reader) -> tuple[float, float | None]:
-    """Radius and width (m) by the link's shapes; None: no width."""
+def _wheel_size(one: Assembly, reader: _Reader, given: float | None) -> tuple[float, float | None]:
+    """Radius and width (m) by the link's shapes, the radius as it is given; None: no width."""
     radius, width = 0.0, None
     for shape in one.wheel.shapes:
         axis = one.wheel_frame.rotation @ shape.placement.rotation[:, 2]
@@ -528,11 +546,10 @@ def _wheel_size(one: Assembly, reader: _Reader) -> tuple[float, float | None]:
     if radius == 0.0 and meshes:
         points = np.concatenate(meshes)
         return float(np.hypot(points[:, 0], points[:, 2]).max()), float(np.ptp(points[:, 1]))
-    if radius == 0.0:
-        raise InputError(
-            f"{reader.source}: wheel '{one.wheel.name}' has no cylinder about its axle and no sphere: expected one"
-        )
-    return radius, width
+    if radius == 0.0 and given is None:
+        seen = f"{reader.source}: wheel '{one.wheel.name}' has no cylinder about its axle and no sphere"
+        raise InputError(f"{seen}: give its radius, such as --set wheel.radius=0.05")
+    return given or radius, width
 
 
 # ---- drives ----------------------------------------------------------------------------------------------------------
@@ -549,14 +566,14 @@ _DRIVE: Mapping[str, tuple[str, str]] = {
 
 
 def _read_drives(assemblies: Sequence[Assembly], reader: _Reader) -> None:
-    for group in ("leg", "wheel"):
+    for group, half in (("leg", slice(4)), ("wheel", slice(4, 8))):
         joints = [getattr(one, f"{group}_joint") for one in assemblies]
         for name, (key, unit) in _DRIVE.items():
-            value = reader.one(f"{name} of the {group} joints", [getattr(joint, name) for joint in joints], unit)
-            if value == 0.0 and name != "damping":  # what files say where nobody knows; no servo has it
+            values = [getattr(joint, name) for joint in joints]
+            if name != "damping" and not any(values) and None not in values:  # what files say where nobody knows
                 reader.notes.append(f"servo.{group}.{key}: 0 in the file: taken from the base")
-                value = None
-            reader.put(f"servo.{group}.{key}", value)
+            else:
+                reader.put_one(f"servo.{group}.{key}", values, unit, elements=spec_of(f"servo.{key}").elements[half])
 
 
 def _read_limits(assemblies: Sequence[Assembly], reader: _Reader) -> None:
@@ -645,7 +662,20 @@ def of_all(numbers: Mapping[str, Any], base: str) -> dict[str, Any]:
             found = found.get(key) if isinstance(found, Mapping) else None
         if found is not None:
             removed[element] = None
-    return {**numbers, "individual": removed} if removed else dict(numbers)
+    single = removed | dict(numbers.get("individual", {}))
+    return {**numbers, "individual": single} if single else dict(numbers)
+
+
+def missing_numbers(numbers: Mapping[str, Any], of: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Return dotted key -> value of what ``of``, a robot file's content, states and ``numbers`` do not."""
+    found: dict[str, Any] = {}
+    for key, value in of.items():
+        inner = numbers.get(key)
+        if isinstance(value, Mapping):
+            found |= missing_numbers(inner if isinstance(inner, Mapping) else {}, value, f"{above}{key}.")
+        elif inner is None and value is not None:
+            found[above + key] = value
+    return found
 
 
 def robot_over(base: str, name: str, numbers: Mapping[str, Any], where: Path, *, check: bool = True) -> Robot:

@@ -7,6 +7,7 @@ What URDF has no place for is said by :data:`NOT_IN_URDF`. Rotor inertia stands 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from xml.etree import ElementTree
 
 import numpy as np
@@ -26,7 +27,9 @@ NOT_IN_URDF = (
     "gravity", "ground", "home", "sensors", "tolerances", "dynamixel_ids",
     "servo gains, currents, gear stiffness and supply voltage",
 )  # fmt: skip
-_KINDS: dict[str, JointKind] = {"fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
+_KINDS: dict[str, JointKind] = {
+    "fixed": "fixed", "revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free",
+}  # fmt: skip
 ElementTree.register_namespace("drake", DRAKE)
 
 
@@ -137,6 +140,9 @@ def parse_urdf(text: str, source: str) -> LinkTree:
         raise InputError(f"{source}: expected a URDF, with <robot> at its top, found <{root.tag}>")
     if "<xacro:" in text:
         raise InputError(f"{source}: holds xacro macros: expand them first, such as: xacro {source} > robot.urdf")
+    for tag in ("link", "joint"):
+        if repeated := [name for name, count in Counter(_name(one, source) for one in root.findall(tag)).items() if count > 1]:
+            raise InputError(f"{source}: two {tag}s are called '{repeated[0]}': expected names that occur once")
     links = {link.name: link for link in (_read_link(element, source) for element in root.findall("link"))}
     rotors = _rotor_inertias(root, source)
     joints = tuple(_read_joint(element, rotors, source) for element in root.findall("joint"))
@@ -186,7 +192,7 @@ def _read_joint(element: ElementTree.Element, rotors: dict[str, float], source: 
         raise InputError(f"{where}: mimics another joint: expected legs and wheels that are driven one by one")
     ends = [element.find(role) for role in ("parent", "child")]
     parent, child = (end.get("link", "") if end is not None else "" for end in ends)
-    direction = _numbers(element.find("axis"), "xyz", where, (1.0, 0.0, 0.0))
+    direction = _numbers(element.find("axis") if kind not in ("fixed", "floating") else None, "xyz", where, (1.0, 0.0, 0.0))
     if not any(direction):
         raise InputError(f"{where}: axis = {direction}: expected a direction")
     axis = np.array(direction) / float(np.linalg.norm(direction))
@@ -194,6 +200,8 @@ def _read_joint(element: ElementTree.Element, rotors: dict[str, float], source: 
     span = None
     if kind == "revolute":
         span = _number(limit, "lower", where, 0.0), _number(limit, "upper", where, 0.0)
+        if span[0] > span[1]:
+            raise InputError(f"{where}: limit: lower = {span[0]:g} is above upper = {span[1]:g} rad")
     return LinkJoint(
         name, _KINDS[kind], parent, child, _placement(element.find("origin"), where), axis, span,
         effort=_optional(limit, "effort", where), velocity=_optional(limit, "velocity", where),

@@ -415,7 +415,17 @@ def read_mjcf(path: str | Path) -> LinkTree:
     links = {_name(model, "body", body): _link(model, body) for body in members}
     joints = tuple(_joint(model, body, members[0], source) for body in members[1:])
     numbers = _scene_numbers(model, members[0], source)
-    return LinkTree(mujoco.MjSpec.from_file(source).modelname, source, links, joints, numbers)
+    notes = tuple(gain for actuator in range(model.nu) if (gain := _gain(model, actuator)))
+    return LinkTree(mujoco.MjSpec.from_file(source).modelname, source, links, joints, numbers, notes)
+
+
+def _gain(model: Any, actuator: int) -> str:
+    """Return what an actuator's gains are, in words; nothing of a plain motor."""
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE:
+        return ""
+    _, on_angle, on_rate = (float(value) for value in model.actuator_biasprm[actuator, :3])
+    gains = f"kp = {-on_angle:g}, kv = {-on_rate:g}"
+    return f"actuator '{_name(model, 'actuator', actuator)}': {gains}: not used; servo gains are those of the base"
 
 
 def _name(model: Any, kind: str, index: int) -> str:
