@@ -107,7 +107,7 @@ def test_the_meta_file_of_run_format_md_is_read(tmp_path):
     (tmp_path / "meta.yaml").write_text(example.text, encoding="utf-8")
     (run,) = read_dataset(tmp_path).runs
     assert run.meta.ground == yaml.safe_load(example.text)["ground"]
-    assert run.meta.profile.wheel_acceleration == pytest.approx(11.2)
+    assert not run.meta.states_profile  # numbers of an example would be copied unread
 
 
 def _parameters(env: gym.Env, name: str) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Bad data are named with run, channel, time and remedy before anything is fitted; effects, losses and wear are no bad data."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pandas
 import pytest
 from engine_runs import META, ROBOT, posture_and_turns, record, spaced
 
-from wlr_gym.data import Run
+from wlr_gym.data import Profile, Run, RunMeta
 from wlr_gym.data.runs import write_run
 from wlr_gym.gap import analyse
 from wlr_gym.gap.analysis import NO_PROFILE
@@ -192,6 +193,39 @@ def test_a_servo_profile_that_is_not_stated_is_noted(meta, good, tmp_path):
     assert problem is not None
     assert [one.fatal for one in told] == ([] if meta else [False])
     assert all("does not state the servo profile (profile): none is assumed" in one.text for one in told)
+
+
+def stops_and_starts(t):
+    setpoints = np.full(8, 1.4)
+    setpoints[:4] += 0.0 if t < 0.4 else 0.3 * np.sign(np.sin(2.0 * (t - 0.4)))
+    setpoints[4:] = 0.0 if t < 0.4 else 4.0 * np.sign(np.sin(5.0 * (t - 0.4)))
+    return setpoints
+
+
+@pytest.fixture(scope="module")
+def quick():
+    return record(stops_and_starts, spaced(7.0), noise=3).table
+
+
+@pytest.mark.parametrize(
+    ("profile", "message"),
+    [
+        (
+            {"wheel_acceleration": 5.5, "leg_velocity": 1.5, "leg_acceleration": 15.0},
+            r"followed by up to .* wheel_acceleration = 5.5",
+        ),
+        ({"leg_velocity": 0.75}, r"its setpoints are followed by up to 1.\d+ rad/s; meta.yaml states leg_velocity = 0.75"),
+        ({"wheel_acceleration": 11.0, "leg_velocity": 1.5, "leg_acceleration": 15.0}, None),
+        ({"wheel_acceleration": 30.0, "leg_velocity": 3.0}, None),
+        ({}, None),
+    ],
+)
+def test_a_profile_that_the_motion_contradicts_is_a_fault_of_all_runs(quick, good, tmp_path, profile, message):
+    meta = RunMeta(profile=Profile(**profile))
+    runs = [Run(table, meta, tmp_path / f"run_{k + 1:02d}.csv") for k, table in enumerate((good, quick))]
+    found = findings_of(runs, CHECKS, ROBOT)
+    assert [one.kind for one in found] == (["profile"] * 2 if message else [])
+    assert message is None or re.search(message, found[1].text)
 
 
 def test_lost_rows_frames_and_a_noisier_or_scaled_sensor_are_no_fault(good, tmp_path):

@@ -341,6 +341,12 @@ def test_sentences_say_what_was_found():
         run_gaps=tuple(one for one in examples.EFFECT_FOUND.run_gaps if one.run != "run_09"),
     )
     assert "it removes 95 % (run by run 94 % and 96 %; no interval) of the avoidable" in sentence(two_runs)
+    little = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=0.03, reduction_ci95=(0.01, 0.05)))
+    assert "interval 1 to 5 %) of the avoidable error of the held-out runs, which is too little to help: check" in sentence(
+        little
+    )
+    unsure = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=0.2, reduction_ci95=(0.05, 0.35)))
+    assert "held-out runs, which may be too little to help: check the servo profile in meta.yaml" in sentence(unsure)
     worse = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=-0.27, reduction_ci95=(-0.33, -0.21)))
     assert "added, it makes the error of the held-out runs larger: -27 % (95 % interval -33 to -21 %);" in sentence(worse)
     alike = replace(examples.EFFECT_FOUND, gap=replace(examples.GAP, reduction=-0.02, reduction_ci95=(-0.07, 0.02)))

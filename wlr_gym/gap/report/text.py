@@ -331,6 +331,10 @@ def turned(turning: Turning) -> str:
     )
 
 
+#: Share of the avoidable error that a finding must remove, by the whole of its interval, to be said to help.
+HELPS = 0.1
+
+
 def _improvement(analysis: Analysis) -> str:
     if analysis.gap is None or not analysis.added:
         return ""
@@ -348,7 +352,11 @@ def _improvement(analysis: Analysis) -> str:
     if share < 0.0:
         does = "makes" if one else "make"
         return f"; added, {'it' if one else 'they'} {does} the error of the held-out runs larger: {removed(analysis)}"
-    return f"; added, {'it removes' if one else 'they remove'} {removed(analysis)} of the avoidable error of the held-out runs"
+    text = f"; added, {'it removes' if one else 'they remove'} {removed(analysis)} of the avoidable error of the held-out runs"
+    if not analysis.gap.reduction_ci95[0] <= HELPS:  # of two runs there is no interval
+        return text
+    hint = "check the servo profile in meta.yaml and the robot file before you use it"
+    return f"{text}, which {'may be' if analysis.gap.reduction_ci95[1] > HELPS else 'is'} too little to help: {hint}"
 
 
 def removed(analysis: Analysis) -> str:

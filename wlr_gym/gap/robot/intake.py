@@ -267,6 +267,13 @@ ANSWERS = 0.5
 ASKED_VOLTAGE = 0.1
 
 
+#: Rows over which a profile's ramp is compared, and ramps that are enough.
+RAMP, LEAST_RAMPS = 5, 40
+#: Upper tenth of the measured over the stated ramps that no profile allows: sound data have 0.44 to 0.91, and half the stated
+#: acceleration up to 3.8.
+BEYOND_PROFILE = 1.15
+
+
 def wrapped(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether an angle starts anew after a turn: no joint gets half a turn further between rows so close together."""
     longest = TOO_QUICK * np.pi / _motor(robot, place(channel)).no_load_speed
@@ -282,6 +289,37 @@ def leaps(run: Run, channel: str, robot: Robot) -> Outcome:
     """Whether a joint gets further between two rows than any motor of the robot can move it."""
     leap = find_leap({name: run[name] for name in ("t", *_POS)}, robot)
     return Sound.YES if leap is None else ChannelFault(*leap)
+
+
+def against_profile(run: Run, channel: str, robot: Robot) -> Outcome:
+    """Whether joints follow their setpoints faster than the servo profile in ``meta.yaml`` lets them.
+
+    Slower ones tell nothing: a motor may be weak.
+    """
+    profile = run.meta.profile
+    for joints, name, limit, unit in (
+        (WHEELS, "wheel_acceleration", profile.wheel_acceleration, "rad/s2"),
+        (LEGS, "leg_velocity", profile.leg_velocity, "rad/s"),
+    ):
+        shares = [_share_of_limit(run, joint, limit) for joint in joints] if limit > 0.0 else [np.zeros(0)]
+        pooled = np.concatenate(shares)
+        if len(pooled) >= LEAST_RAMPS and (share := float(np.quantile(pooled, 0.9))) > BEYOND_PROFILE:
+            text = f"its setpoints are followed by up to {share * limit:.3g} {unit}; meta.yaml states {name} = {limit:g}"
+            return ChannelFault(None, text)
+    return Sound.UNDECIDED  # a fault of one run is then that of all: they share the profile
+
+
+def _share_of_limit(run: Run, joint: str, limit: float) -> Array:
+    """How fast a wheel's rate or a leg's angle changes over :data:`RAMP` rows, over the limit at which its profile changes."""
+    t, goals = run["t"], run[f"cmd_{joint}"].tolist()
+    value = rate_of(run, joint) if joint in WHEELS else run[f"pos_{joint}"]
+    reference = value.copy()
+    for row, step in enumerate(np.diff(t).tolist()):
+        if goals[row] == goals[row]:  # else torque off
+            reference[row + 1] = reference[row] + min(max(goals[row] - reference[row], -limit * step), limit * step)
+    moved, span = reference[RAMP:] - reference[:-RAMP], limit * (t[RAMP:] - t[:-RAMP])
+    ramp = np.abs(moved) > 0.99 * span
+    return np.sign(moved[ramp]) * (value[RAMP:] - value[:-RAMP])[ramp] / span[ramp]
 
 
 def dead(run: Run, channel: str, robot: Robot) -> Outcome:
@@ -656,6 +694,9 @@ CHECKS: tuple[IntakeCheck, ...] = (
     IntakeCheck("dead", _POS, dead, *_DEAD),
     IntakeCheck("mirrored", _POS, mirrored, "a ratio near 1", _SIGN),
     IntakeCheck("dead", _POS, stuck, *_DEAD),
+    IntakeCheck(
+        "profile", ("cmd",), against_profile, "the profile that was set", "correct profile in meta.yaml; {} where none was set"
+    ),
     IntakeCheck("mirrored", _VEL, rate_against_angle, "a correlation near 1", _SIGN),
     IntakeCheck("dead", (*_VEL, *_EFF), without_signal, "readings that change with the motion", _LEAVE_OUT),
     IntakeCheck("mirrored", _EFF[:4], leg_effort_against, "a sign that goes with the leg's angle", _TURN),
