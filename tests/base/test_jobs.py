@@ -1,6 +1,7 @@
 """Jobs: processes that end in good order, whatever ends who waits for them. Locks; threads that are interrupted."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 from waiting import wait_until
 
+import wlr_gym
+from wlr_gym.base import jobs
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
 from wlr_gym.base.jobs import Job, follow, in_threads, spread
@@ -121,3 +124,18 @@ def test_a_lock_is_held_among_processes_and_freed_by_death(tmp_path):
     holder.wait()
     with locked(path, 0.2):
         pass
+
+
+@pytest.mark.parametrize(("quota", "expected"), [("max 100000", 6), ("150000 100000", 2), ("50000 100000", 1), ("", 6)])
+def test_cores_are_those_of_the_affinity_and_the_container(monkeypatch, tmp_path, quota, expected):
+    (tmp_path / "cpu.max").write_text(quota)
+    monkeypatch.setattr(jobs, "_QUOTAS", ((str(tmp_path / "cpu.max"),), (str(tmp_path / "none"),)))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(6)), raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    assert jobs.cores() == expected
+
+
+def test_only_one_function_counts_cores():
+    package = Path(str(wlr_gym.__file__)).parent
+    found = [path for path in package.rglob("*.py") if re.search("cpu_count|getaffinity", path.read_text(encoding="utf-8"))]
+    assert found == [package / "base" / "jobs.py"]

@@ -1,7 +1,9 @@
 """What is in a picture, and where."""
 
+import os
 import subprocess
 import sys
+import threading
 from typing import Any
 
 import numpy as np
@@ -422,7 +424,52 @@ def test_without_opengl_the_message_names_the_remedy(monkeypatch, robot, paramet
     monkeypatch.setattr(gl.platform, "system", lambda: "Linux")
     monkeypatch.setattr(gl.importlib, "import_module", broken)
     with pytest.raises(InputError, match=r"no OpenGL .*egl: libEGL.*apt install libegl1"):
-        gl._open_context(64, 64)
+        gl._open_context(Stage(robot, parameters).model, (64, 64))
+
+
+@pytest.mark.parametrize("name", ["osmesa", "glfw"])
+def test_opengl_that_is_asked_for_and_not_there_ends_in_one_line_each_time(name):
+    """MuJoCo itself fails at its import, or ends the process at the second picture."""
+    code = """
+from standing import PLAIN, truth_of
+from wlr_gym import InputError
+from wlr_gym.render import Scene
+from wlr_gym.robot import load_robot
+from wlr_gym.robot.parameters import Parameters
+
+robot = load_robot("nominal")
+parameters = Parameters.nominal(robot, 1)
+for _ in range(2):
+    try:
+        Scene(robot, PLAIN).draw(truth_of(parameters), parameters)
+        print("drawn")
+    except InputError as error:
+        print(error)
+"""
+    own = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    own |= {"MUJOCO_GL": name, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=own)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2
+    assert all(line == "drawn" or (f"({name}: " in line and "unset MUJOCO_GL, or install" in line) for line in lines)
+
+
+def test_a_picture_from_another_thread_is_refused_in_one_line_and_closing_there_does_no_harm(robot, parameters):
+    scene, found = gl.Scene(robot, PLAIN), []
+
+    def draw():
+        try:
+            found.append(scene.draw(truth_of(parameters), parameters).shape)
+        except InputError as error:
+            found.append("refused" if "another thread" in str(error) else str(error))
+
+    for work in (draw, scene.close, lambda: None):
+        draw()
+        (thread := threading.Thread(target=work)).start()
+        thread.join()
+    scene.close()
+    assert found == [found[0], "refused", found[0], found[0]]
 
 
 def test_a_headless_machine_needs_no_setting(monkeypatch):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -194,6 +195,24 @@ def import_modules(names: Iterable[str]) -> None:
         sys.path.insert(0, str(Path.cwd()))
     for name in names:
         importlib.import_module(name)
+
+
+# ---- processors ------------------------------------------------------------------------------------------------------
+
+
+#: Where Linux says how much of the processors a container may use: quota and period, "max" or -1 = no limit.
+_QUOTAS = (("/sys/fs/cgroup/cpu.max",), ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"))
+
+
+def cores() -> int:
+    """Return how many processors this process may use: those of its affinity, at most its container's share of time."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for files in _QUOTAS:
+        with contextlib.suppress(OSError, ValueError):
+            quota, period = map(int, " ".join(Path(file).read_text() for file in files).split())  # "max" is no number
+            if quota > 0:
+                found = min(found, math.ceil(quota / period))
+    return found
 
 
 # ---- threads ---------------------------------------------------------------------------------------------------------

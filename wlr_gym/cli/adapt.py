@@ -7,7 +7,6 @@ names it. See docs/adapt.md.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.jobs import cores
 from wlr_gym.base.progress import progress
 from wlr_gym.base.text import duration, pairs
 from wlr_gym.cli import OK
@@ -73,7 +73,7 @@ class AdaptOptions(JsonOption, PatchOption, FloorOption, SensorsOption):
     seed: Seed = 0
     """Seed of everything random."""
     threads: Count | None = None
-    """Worker threads; default: one per core."""
+    """Worker threads; default: one per core that this process may use."""
 
 
 def run(options: AdaptOptions) -> int:
@@ -94,7 +94,7 @@ def run(options: AdaptOptions) -> int:
                 "driven": real, "effects": options.patch() if options.emulated else None, "environment": options.env,
                 "floor": options.load_floor(),
                 "excitations": options.excitation, "sensors": options.present() or (),
-                "threads": options.threads or os.cpu_count() or 1, "tell": partial(tell, ""),
+                "threads": options.threads or cores(), "tell": partial(tell, ""),
             }  # fmt: skip
             found = adapt(out=options.out, **own)
     except KeyboardInterrupt:

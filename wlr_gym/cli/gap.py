@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -23,6 +22,7 @@ from tyro.conf import Positional
 
 from wlr_gym.base.errors import InputError, Interval, check_folder, check_name
 from wlr_gym.base.files import refuse_existing
+from wlr_gym.base.jobs import cores
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
 from wlr_gym.base.text import duration
@@ -83,7 +83,7 @@ class GapOptions(DecideOptions, JsonOption, OutOption, RunsRobotOption, PatchOpt
     heldout: tuple[str, ...] = ()
     """Runs to hold out for validation; default: chosen by how informative the other runs are."""
     threads: Count | None = None
-    """Worker threads; default: one per core."""
+    """Worker threads; default: one per core that this process may use."""
 
 
 def run(options: GapOptions) -> int:
@@ -97,7 +97,7 @@ def run(options: GapOptions) -> int:
     from wlr_gym.gap.report.result import RESULT_FILE
     from wlr_gym.gap.workflow import analyse
 
-    known, threads = _checked(options), options.threads or os.cpu_count() or 1
+    known, threads = _checked(options), options.threads or cores()
     console = Console(soft_wrap=True, highlight=False)
     if options.until_decided:
         return _decide(options, known, threads, console)

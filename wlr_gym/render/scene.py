@@ -14,12 +14,12 @@ import importlib
 import os
 import platform
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
@@ -28,6 +28,7 @@ from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import replace_file
 from wlr_gym.physics.floor import Floor
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, PlantState, Truth, settle, standing_state
+from wlr_gym.physics.plants.mujoco import mujoco
 from wlr_gym.physics.plants.relief import map_of
 from wlr_gym.render import stage as marks
 from wlr_gym.render.stage import Area, ContactsOf, Mark, Stage, Trail
@@ -85,23 +86,22 @@ class Canvas:
     """
 
     def __init__(self, model: mujoco.MjModel, size: tuple[int, int]) -> None:
+        self._thread = threading.get_ident()
         self._drawing: mujoco.MjrContext | None = None
-        self._context = _open_context(*size)
-        self._context.make_current()
-        self._drawing = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._context, self._drawing = _open_context(model, size)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._drawing)
         self._rectangle = mujoco.MjrRect(0, 0, *size)
         self._upside_down = np.empty((size[1], size[0], 3), np.uint8)
 
     def take_floor(self, model: mujoco.MjModel) -> None:
         """Take the meshes of a floor that is not flat; the model is the one that it was made with."""
-        self._context.make_current()
+        self._take_turn()
         for name in marks.MESHES:
             mujoco.mjr_uploadMesh(model, self._drawing, model.mesh(name).id)
 
     def draw(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
         """Return the picture (H, W, 3) of a scene."""
-        self._context.make_current()
+        self._take_turn()
         mujoco.mjr_render(self._rectangle, scene, self._drawing)
         mujoco.mjr_readPixels(self._upside_down, None, self._rectangle, self._drawing)
         return self._upside_down[::-1].copy()
@@ -113,25 +113,36 @@ class Canvas:
 
     def close(self) -> None:
         """Give the context and its memory back; closing again does nothing."""
-        if self._drawing is not None:
+        if self._drawing is not None and self._thread == threading.get_ident():  # only this one can
             self._context.make_current()
             self._drawing.free()
             self._context.free()
         self._drawing = None
+
+    def _take_turn(self) -> None:
+        """Draw into this context from now on."""
+        if self._thread != threading.get_ident():
+            raise InputError("an earlier picture was drawn in another thread: draw in one, or make an environment for each")
+        self._context.make_current()
 
     def __del__(self) -> None:
         if self._drawing is not None and not sys.is_finalizing():  # then the drivers may be gone, and all is taken back
             self.close()
 
 
-def _open_context(width: int, height: int) -> Any:
+def _open_context(model: mujoco.MjModel, size: tuple[int, int]) -> tuple[Any, mujoco.MjrContext]:
     failures = []
     for name in context_names():
         try:
-            return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+            context = importlib.import_module(f"mujoco.{name}").GLContext(*size)
+            if not getattr(context, "_context", True):  # GLFW's: MuJoCo would end the process
+                raise RuntimeError("no window opens here")
+            context.make_current()
+            return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # drivers fail in every way there is: missing libraries, attributes, devices
             failures.append(f"{name}: {str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__}")
-    remedy = _REMEDY.get(platform.system(), "install an OpenGL driver")
+    remedy = "unset MUJOCO_GL, or " if os.environ.get("MUJOCO_GL") else ""
+    remedy += _REMEDY.get(platform.system(), "install an OpenGL driver")
     raise InputError(f"no OpenGL to draw pictures with ({'; '.join(failures) or 'no context to try'}): {remedy}")
 
 

@@ -14,12 +14,12 @@ from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple, assert_never
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wlr_gym.physics.plants.base import Contacts, Truth
 from wlr_gym.physics.plants.contacts import ContactsOf, contacts_at
+from wlr_gym.physics.plants.mujoco import mujoco
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
 from wlr_gym.render import surface
 from wlr_gym.render.surface import REACH, Relief, Surface

@@ -13,11 +13,11 @@ import time
 from collections.abc import Callable
 from typing import Any, Unpack
 
-import mujoco
 import numpy as np
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.physics.plants.base import Truth
+from wlr_gym.physics.plants.mujoco import mujoco
 from wlr_gym.render.scene import Texts, describe, marks_of
 from wlr_gym.render.stage import MESHES, ContactsOf, Stage, add_marks, areas
 from wlr_gym.render.view import CAMERAS, LOOK_HEIGHT, View, magnification, require_display

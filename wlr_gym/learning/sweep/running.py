@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, check_number, require_package
 from wlr_gym.base.files import alone_in, make_output_folder, require_empty
-from wlr_gym.base.jobs import spread
+from wlr_gym.base.jobs import cores, spread
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.learning.sweep.book import Book, Say, SweepResult
@@ -112,10 +111,10 @@ def _run(plan: SweepPlan, folder: Path, ray: str | None, workers: int | None, sa
     with alone_in(folder, _HANDOVER):
         book = Book(plan, folder, say)
         if ray is None and not plan.needs_ray:
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            say(f"{book.size}; {workers or cores} at a time, processes of this machine")
+            most = workers or cores()
+            say(f"{book.size}; {most} at a time, processes of this machine")
             with _sigterm_interrupts():
-                return book.fill(lambda jobs: spread(jobs, workers or cores))
+                return book.fill(lambda jobs: spread(jobs, most))
         from wlr_gym.learning.sweep.ray import LOCAL, connected, search_with_tune, spread_on_ray
 
         address = ray or LOCAL

@@ -14,11 +14,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, Unpack
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.physics.plants.base import TRUTH_LAYOUT, Truth
+from wlr_gym.physics.plants.mujoco import mujoco
 from wlr_gym.render import stage as marks
 from wlr_gym.render import surface
 from wlr_gym.render.scene import Texts, describe, legend
