@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from velocity import ID, TIMED, make, make_vec
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.envs.interfaces import VelocityEnv, VelocityVectorEnv
 from wlr_gym.envs.settings import EnvironmentOptions
 
 SHORT = {"episode_length": 0.4, "randomization": "wide"}
@@ -91,6 +92,30 @@ def test_the_spec_knows_when_episodes_end(fake):
     assert ends == [False] * 49 + [True]
     assert make(episode_length=60.0).spec.max_episode_steps == 3000
     assert make_vec(2, max_episode_steps=7).spec.max_episode_steps == 7
+
+
+@pytest.mark.parametrize("kind", [VelocityEnv, VelocityVectorEnv])
+def test_an_environment_that_is_made_or_pickled_as_a_class_has_a_spec_as_well(fake, kind):
+    made = kind(episode_length=1.0)
+    for env in (made, pickle.loads(pickle.dumps(made))):
+        assert (env.spec.id, env.spec.max_episode_steps, env.spec.kwargs) == (ID, 50, {"episode_length": 1.0})
+    remade: Any = gym.make(made.spec, max_episode_steps=-1).unwrapped
+    assert remade.core.limit == 50
+
+
+def test_a_batch_has_the_methods_of_gymnasiums_vector_environments(fake):
+    env, loop = make_vec(3), make_vec(3, vectorization_mode="sync")
+    env.reset(seed=0)
+    assert env.get_attr("render_mode") == loop.get_attr("render_mode") == (None,) * 3
+    assert [one["task"] for one in env.call("contract")] == ["velocity"] * 3
+    env.call("set_command", linear_velocity_x=0.02)
+    assert env.core.command[:, 0].tolist() == [0.02] * 3
+    env.set_attr("note", [7] * 3)
+    env.set_attr("other", 8)
+    assert env.call("note") + env.get_attr("other") == (7, 7, 7, 8, 8, 8)
+    for values in ([1, 2, 3], [1, 1]):
+        with pytest.raises(InputError, match="shared by all 3 robots"):
+            env.set_attr("note", values)
 
 
 def test_contract_names_the_task_robot_and_randomization(fake):

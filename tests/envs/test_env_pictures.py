@@ -225,3 +225,13 @@ def test_modes_that_do_not_exist():
     for mode in ("ansi", "rgb", 3):
         with pytest.raises(InputError, match="expected None, 'human' or 'rgb_array'"):
             pictures_module.check_render_mode(mode)  # type: ignore[arg-type]
+
+
+def test_gymnasiums_recording_wrapper_writes_a_film(fake, graphics, tmp_path):
+    pytest.importorskip("moviepy")
+    env = gym.wrappers.RecordVideo(make(render_mode="rgb_array", episode_length=0.2), str(tmp_path), disable_logger=True)
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(np.zeros(8, np.float32))
+    env.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["rl-video-episode-0.mp4"]

@@ -84,6 +84,22 @@ def test_works_with_sb3s_own_tools(fake):
     assert model.ep_info_buffer[0]["l"] == 20
 
 
+def test_episodes_are_reported_as_a_monitor_does(fake):
+    ours, loop = Sb3VecEnv(ID, 3, seed=5, **SHORT), VecMonitor(Sb3VecEnv(ID, 3, seed=5, **SHORT))
+    ours.reset()
+    loop.reset()
+    for action in np.random.default_rng(0).uniform(-1, 1, (45, 3, 8)).astype(np.float32):
+        a, b = ours.step(action), loop.step(action)
+        for one, two, done in zip(a[3], b[3], a[2], strict=True):
+            assert ("episode" in one) == bool(done)
+            if done:
+                assert one["episode"]["l"] == two["episode"]["l"] == 20
+                assert one["episode"]["r"] == pytest.approx(two["episode"]["r"], abs=1e-4)
+    model = PPO("MlpPolicy", Sb3VecEnv(ID, 4, seed=0, **SHORT), n_steps=32, batch_size=64, n_epochs=1, device="cpu", seed=0)
+    model.learn(256)
+    assert [one["l"] for one in model.ep_info_buffer or []][:4] == [20] * 4
+
+
 def test_make_vec_env(fake):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*render_mode.*")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.envs.registration import EnvSpec, registry
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import EzPickle
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -52,6 +52,10 @@ class TaskMethods:
         self.core = Core(task, read_settings(options), count)
         self.metadata = metadata(self.core.task.config.control_period)
         self.pictures, self._infos = Pictures(self.core, render_mode), Infos(self.core)
+        name = f"{type(self).__module__}:{type(self).__name__}" if getattr(self, "task_name", None) else ""
+        self.spec = next((spec for spec in registry.values() if name in (spec.entry_point, spec.vector_entry_point)), None)
+        if self._spec is not None:  # that of a shipped class; gym.make lays its own over it
+            self._spec.kwargs = dict(options)
 
     @cached_property
     def _snapshots(self) -> Snapshots:
@@ -527,7 +531,24 @@ class WlrVectorEnv(TaskMethods, VectorEnv[Any, Any, Any], EzPickle):  # pyright:
         """Info of the robots whose parameters changed within their episode."""
         return _masked(self._infos.change(), self.core.robots.changed) if self.core.robots.changed.any() else {}
 
-    # ---- the rest ----
+    # ---- the rest: as of Gymnasium's own vector environments ----
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute, the same for all robots."""
+        return (getattr(self, name),) * self.num_envs
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute for all robots; of a list or tuple with one value for each, all must be equal."""
+        if isinstance(values, list | tuple):
+            if len(values) != self.num_envs or any(value != values[0] for value in values):
+                raise InputError(f"set_attr('{name}'): one value is shared by all {self.num_envs} robots, got {values!r}")
+            values = values[0]
+        setattr(self, name, values)
+
+    def call(self, name: str, *arguments: Any, **keywords: Any) -> tuple[Any, ...]:
+        """Call a method of the batch once, or read an attribute; the result stands for every robot."""
+        found = getattr(self, name)
+        return ((found(*arguments, **keywords) if callable(found) else found),) * self.num_envs
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return one picture (H, W, 3) per robot with ``rgb_array``; show the first robot with ``human``.

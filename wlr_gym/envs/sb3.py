@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -29,9 +30,10 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
     """N robots for Stable-Baselines3, without the loop of ``DummyVecEnv``; bit-identical to it with the same seeds.
 
     An ended episode is followed by the next in the same step. Its info then holds ``terminal_observation``,
-    ``TimeLimit.truncated``, ``episode_reward_terms`` and ``episode_measures``; infos of other robots are empty, to be cheap
-    (present values of all robots are in ``core``: ``reward``, ``measures``, ``plant.truth()``), but for ``randomization`` when
-    it changed, and ``truth`` with ``truth_info=True``.
+    ``TimeLimit.truncated``, ``episode`` (return ``r``, length ``l`` and time ``t``, as of SB3's ``Monitor``),
+    ``episode_reward_terms`` and ``episode_measures``; others are empty, to be cheap (present values of all robots
+    are in ``core``: ``reward``, ``measures``, ``plant.truth()``), but for ``randomization`` when it changed, and ``truth`` with
+    ``truth_info=True``.
 
     Args:
         env_id: id such as ``WLR-Velocity-v0``, or the spec of an environment.
@@ -66,6 +68,7 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
         super().__init__(self.core.count, self.core.observation_space, self.core.action_space)
         self.metadata = shown
         self._actions: Any = None
+        self._began = time.monotonic()
         if seed is not None:
             self.seed(seed)
 
@@ -107,10 +110,13 @@ class Sb3VecEnv(TaskMethods, VecEnv, EzPickle):
                 info |= more
         done = core.terminated | core.truncated
         if any_done:
+            since = round(time.monotonic() - self._began, 6)
             for row, more in enumerate(self._rows(self._infos.episode(), done)):
                 if done[row]:
                     limit = bool(core.truncated[row] and not core.terminated[row])
                     infos[row] |= {"terminal_observation": core.observations(row), "TimeLimit.truncated": limit, **more}
+                    total, steps = float(core.scores.sums[row].sum()), int(core.episodes.steps[row])
+                    infos[row]["episode"] = {"r": total, "l": steps, "t": since}
             core.begin_episodes(done)
             self._keep_reset_infos(done)
         self.pictures.after_step()
