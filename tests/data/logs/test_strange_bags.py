@@ -24,6 +24,7 @@ from wlr_gym.data import read_run, write_run
 from wlr_gym.data.logs import export_run, import_log, suggest_map
 from wlr_gym.data.logs.map import TopicClock
 from wlr_gym.data.logs.messages import definition, make, typestore
+from wlr_gym.data.logs.topics import numbers
 from wlr_gym.robot import JOINTS, LEGS
 
 
@@ -236,3 +237,46 @@ def test_of_several_poses_none_is_taken(messages, tmp_path):
     found = suggest_map(write_mcap(tmp_path / "a.mcap", sorted([*messages, *again], key=lambda one: one[0])))
     assert "cam" not in found.content["channels"]
     assert any("'/mocap/base', '/mocap/tool'" in one.why for one in found.lines if one.place == "channels.cam")
+
+
+def test_a_voltage_of_a_plain_number_is_known_by_its_topic(messages, tmp_path):
+    changed = [one for one in messages if one[1] != "/power"]
+    for k in range(8):
+        kind = "std_msgs/msg/Float32"
+        changed.append((messages[0][0] + k * 10**9, "/vbat", kind, make(kind, data=12.0 - 0.1 * k)))
+    log = write_mcap(tmp_path / "a.mcap", sorted(changed, key=lambda one: one[0]))
+    known = lab_map(log)
+    assert (known.channels["volt"].topic, known.channels["volt"].field) == ("/vbat", "data")
+    (imported,) = import_log(log, tmp_path / "runs", known)
+    run = read_run(imported.path)
+    assert np.isfinite(run["volt"]).all()
+    assert len(np.unique(run["volt"])) == 8  # held: no value that was not measured
+    assert run["t"][-1] > 7.9  # and no row is lost after the last of it
+
+
+def test_states_of_ros2_control_go_by_joint_and_interface():
+    states = [{"interface_names": ["position", "velocity"], "values": [float(k), 0.5]} for k in range(2)]
+    found = dict(numbers({"header": {}, "joint_names": ["FL_hip", "FR_hip"], "interface_values": states}))
+    assert found == {
+        "interface_values.position[FL_hip]": 0.0, "interface_values.velocity[FL_hip]": 0.5,
+        "interface_values.position[FR_hip]": 1.0, "interface_values.velocity[FR_hip]": 0.5,
+    }  # fmt: skip
+
+
+def test_names_of_a_trajectory_stand_beside_its_points():
+    points = [{"positions": [0.1, 0.2], "velocities": []}]
+    found = dict(numbers({"joint_names": ["FL_hip", "FR_hip"], "points": points}))
+    assert found["points[0].positions[FL_hip]"] == 0.1
+    assert found["points[0].positions[FR_hip]"] == 0.2
+
+
+def test_a_list_without_names_beside_named_joints_is_asked_channel_by_channel(messages, tmp_path):
+    kind = "std_msgs/msg/Float64MultiArray"
+    changed = [
+        (time, topic, kind, make(kind, data=np.zeros(8))) if topic == "/chassis/target" else (time, topic, of, message)
+        for time, topic, of, message in messages
+    ]
+    found = suggest_map(write_mcap(tmp_path / "a.mcap", changed))
+    (said,) = [line.why for line in found.lines if line.place == "channels.cmd_leg"]
+    assert "topic '/chassis/target': data" in said
+    assert "channels: {cmd_leg_lf: {topic: TOPIC, field: 'data[0]'}, ...}" in said

@@ -6,7 +6,8 @@ import pytest
 from foreign_logs import lab_frame, lab_map, made_up
 
 from wlr_gym.base.errors import InputError
-from wlr_gym.data.logs import import_log, read_logs
+from wlr_gym.data import read_run
+from wlr_gym.data.logs import import_log, read_logs, suggest_map
 
 
 @pytest.fixture(scope="module")
@@ -214,3 +215,16 @@ def test_an_axis_stands_apart_from_the_letters_of_a_word(tmp_path, frame):
     }
     path = written(tmp_path / "a.csv", frame.rename(columns=long).to_csv(index=False))
     assert {"gyro", "acc"} <= set(lab_map(path).channels)
+
+
+def test_a_map_names_the_column_of_times(tmp_path):
+    frame = lab_frame(made_up(6.0)).rename(columns={"time_ms": "Zeit [ms]"})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    with pytest.raises(InputError, match=r"no column of times: .* its name in the map \(--map\), such as: time: 'Zeit \[ms\]'"):
+        suggest_map(tmp_path / "a.csv")
+    known = lab_map(tmp_path / "a.csv", {"time": "Zeit [ms]"})
+    assert known.time == "Zeit [ms]"
+    (imported,) = import_log(tmp_path / "a.csv", tmp_path / "runs", known)
+    assert read_run(imported.path)["t"][-1] == pytest.approx(5.98)
+    with pytest.raises(InputError, match=r"time: unknown column 'Zeit' \(did you mean 'Zeit \[ms\]'\?\)"):
+        suggest_map(tmp_path / "a.csv", {"time": "Zeit"})

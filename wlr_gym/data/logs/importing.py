@@ -69,8 +69,8 @@ def suggest_map(
     log: str | Path, given: Mapping[str, Any] | None = None, robot: str | None = None, tell: Share = quiet
 ) -> Proposal:
     """Return a proposed map for a log; what ``given`` (a map's content) says is taken as it is."""
-    meta = parse_config(LogMap, decided(given or {}), "map").meta
-    return propose(next(read_logs(log, most=MOST, tell=tell)), _robot_of(meta, robot), given)
+    known = parse_config(LogMap, decided(given or {}), "map")
+    return propose(next(read_logs(log, most=MOST, tell=tell, time=known.time)), _robot_of(known.meta, robot), given)
 
 
 def import_log(
@@ -122,7 +122,7 @@ def import_log(
         by = f"by the torque constants of '{chosen.name}': name your robot (--robot)"
         general += (f"efforts in {', '.join(units)} become N m {by}",)
     with _beside(out) as folder:
-        for recording in read_logs(log, wanted_fields(resolved), tell=tell):
+        for recording in read_logs(log, wanted_fields(resolved), tell=tell, time=found.time):
             _check_new(recording.name, record, out)
             whole = _possible_part(make_run(recording, found, resolved), recording.name, resolved, chosen, keep_going)
             for one in split_run(whole, split):

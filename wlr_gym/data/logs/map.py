@@ -183,6 +183,7 @@ class LogMap(SettingsModel):
         frames: ``imu`` or ``cam`` -> the axes of the log that our x, y and z are, such as ``[-y, x, z]``.
         clocks: topic -> its clock.
         namespace: topics that do not begin with it are another robot's.
+        time: column of a table's times; None = by its name.
         meta: for ``meta.yaml``.
     """
 
@@ -193,6 +194,7 @@ class LogMap(SettingsModel):
     frames: dict[str, tuple[Axis, Axis, Axis]] = Field(default_factory=dict)
     clocks: dict[str, TopicClock] = Field(default_factory=dict)
     namespace: str | None = None
+    time: str | None = None
     meta: RunMeta = RunMeta()
 
     @field_validator("joints", mode="before")

@@ -21,7 +21,7 @@ from typing import IO, TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.errors import InputError, require_package, unknown_name
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.data.logs.topics import LONGEST, Collector, Log, Message, Share, Topic, cannot_read
 
@@ -37,7 +37,9 @@ def quiet(share: float) -> None:
     """Report no progress."""
 
 
-def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None = None, tell: Share = quiet) -> Iterator[Log]:
+def read_logs(
+    path: str | Path, wanted: Wanted | None = None, most: int | None = None, tell: Share = quiet, time: str | None = None
+) -> Iterator[Log]:
     """Yield what a file or folder holds: one recording, or the episodes of a LeRobot data set.
 
     Of messages, which are read one after the other, only the numbers are kept, 8 bytes each.
@@ -47,6 +49,7 @@ def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None =
         wanted: topics and fields that are read; None = all.
         most: messages per topic that are kept; None = all.
         tell: called with the share that has been read.
+        time: column of a table's times; None = by its name (:data:`TIME_NAMES`).
 
     Raises:
         InputError: no such file, or one that cannot be read.
@@ -60,7 +63,7 @@ def read_logs(path: str | Path, wanted: Wanted | None = None, most: int | None =
     elif path.is_dir():
         yield from read_lerobot(path, columns, tell)
     else:
-        yield read_table(path, columns, most)
+        yield read_table(path, columns, most, time)
 
 
 def first_messages(path: Path) -> Iterator[Message]:
@@ -429,13 +432,14 @@ _UNITS = {10**9: "s", 10**6: "ms", 10**3: "us", 1: "ns"}
 _BY_SIZE, _BY_NAME = (5e5, 5e8), (1e4, 1e10)
 
 
-def read_table(path: Path, wanted: Collection[str] | None = None, most: int | None = None) -> Log:
+def read_table(path: Path, wanted: Collection[str] | None = None, most: int | None = None, time: str | None = None) -> Log:
     """Read a CSV or Parquet file: one topic, whose fields are the columns that hold numbers.
 
     Args:
         path: the file.
         wanted: columns that are kept; None = all.
         most: rows that are read; None = all.
+        time: column of the times; None = by its name.
 
     Raises:
         InputError: not such a file, no column of times, or times that go back.
@@ -443,7 +447,7 @@ def read_table(path: Path, wanted: Collection[str] | None = None, most: int | No
     notes: list[str] = []
     times = np.zeros(0, np.int64)
     frame, decimal = _csv(path, most, notes) if path.suffix.lower() == ".csv" else (_parquet(path, most), ".")
-    name = _time_column([str(column) for column in frame.columns], path)
+    name = _time_column([str(column) for column in frame.columns], path, time)
     if len(frame):
         frame, times = _with_times(frame, name, decimal, path, notes)
     if len(frame) < 2:
@@ -521,13 +525,19 @@ def _texts(column: Any, decimal: str) -> Any:
     return text.str.replace(",", ".", regex=False) if decimal == "," else text
 
 
-def _time_column(columns: list[str], path: Path) -> str:
+def _time_column(columns: list[str], path: Path, time: str | None) -> str:
+    if time is not None:
+        if time not in columns:
+            raise unknown_name("column", time, columns, f"{path}: time")
+        return time
     lowered = {column.lower().split("[")[0].split("(")[0].strip(" _"): column for column in reversed(columns)}
     for wanted in TIME_NAMES:
         for ending in ("", *_ENDINGS):
             if wanted + ending in lowered:
                 return lowered[wanted + ending]
-    raise InputError(f"{path}: no column of times: expected one of {', '.join(TIME_NAMES)}; it has {', '.join(columns[:12])}")
+    likely = next((name for name in columns if name.lower().replace("[", "_").rstrip("]").endswith((*_ENDINGS,))), columns[0])
+    expected = f"expected one of {', '.join(TIME_NAMES)}, or its name in the map (--map), such as: time: '{likely}'"
+    raise InputError(f"{path}: no column of times: {expected}; it has {', '.join(columns[:12])}")
 
 
 def _with_times(

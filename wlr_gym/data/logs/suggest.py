@@ -234,7 +234,11 @@ def _vectors(topic: Topic) -> Iterator[FieldCandidate]:
 
 def _supply(topic: Topic) -> Iterator[FieldCandidate]:
     for field in topic.fields:
-        if _says(field, _VOLTAGE) and _bracket(field) is None and read_name(field).corner is None:
+        if (
+            _says(topic.name if field == "data" else field, _VOLTAGE)
+            and _bracket(field) is None
+            and read_name(field).corner is None
+        ):
             yield FieldCandidate("volt", topic.name, field, unit=stated_unit(field, "volt"))
 
 
@@ -432,7 +436,7 @@ class _Proposer:
             self.content["meta"]["profile"] = OPEN
             text = "the servos' profile: {wheel_acceleration: rad/s2, leg_velocity: rad/s, leg_acceleration: rad/s2}, {} = none"
             self.note("meta.profile", f"{text}. Without this line {NO_PROFILE.partition(': ')[2]}")
-        order = ("rows", "every", "joints", "channels", "frames", "clocks", "namespace", "meta")
+        order = ("time", "rows", "every", "joints", "channels", "frames", "clocks", "namespace", "meta")
         content = overlay({key: self.content[key] for key in order if self.content.get(key)}, self.known)
         unused = tuple(name for name in self.log.topics if name not in self.topics)
         lines = sorted(self.lines, key=lambda line: order.index(line.place.partition(".")[0]))
@@ -599,7 +603,9 @@ class _Proposer:
             stems = sorted({field.rpartition("[")[0] for field in topic.fields if is_unnamed(topic, field)})
             long = [stem for stem in stems if f"{stem}[{len(LEGS) - 1}]" in topic.fields]
             said += [f"topic '{name}': {', '.join(long)}"] if long else []
-        hint = f"say which is which, by place, and suggest again: joints: {{{JOINTS[0]}: '0', ...}}"
+        by_place = f"and suggest again: joints: {{{JOINTS[0]}: '0', ...}}"
+        by_channel = "beside the joints' names: channels: {cmd_leg_lf: {topic: TOPIC, field: 'data[0]'}, ...}"
+        hint = f"say which is which, by place, {by_channel if self.names else by_place}"
         text = f"; lists without names: {'; '.join(said)}; {hint}" if said else ""
         table = self.log.topics.get(TABLE)
         return text if table is None else f"{text}; the table has {', '.join(map(repr, list(table.fields)[:_LISTED]))}"

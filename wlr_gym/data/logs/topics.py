@@ -196,6 +196,11 @@ def numbers(content: Any, prefix: str = "", outer: list[str] | None = None) -> I
 def _elements(name: str, values: Any, names: list[str] | None) -> Iterator[tuple[str, float]]:
     if len(values) == 0 or len(values) > LONGEST or isinstance(values[0], str):
         return
+    if _is_message(values[0]) and "interface_names" in _items(values[0]):  # control_msgs/DynamicJointState
+        for joint, state in zip(names or range(len(values)), map(_items, values), strict=False):
+            for kind, value in zip(state["interface_names"], state.get("values", ()), strict=False):
+                yield f"{name}.{kind}[{joint}]", float(value)
+        return
     if _is_message(values[0]):
         for k, value in enumerate(values):
             yield from numbers(value, f"{name}[{_label(value, k)}].", names)

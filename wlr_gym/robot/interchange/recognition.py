@@ -570,6 +570,8 @@ def _read_drives(assemblies: Sequence[Assembly], reader: _Reader) -> None:
         joints = [getattr(one, f"{group}_joint") for one in assemblies]
         for name, (key, unit) in _DRIVE.items():
             values = [getattr(joint, name) for joint in joints]
+            if wrong := [joint.name for joint, value in zip(joints, values, strict=True) if value is not None and value < 0.0]:
+                raise InputError(f"{reader.source}: joint '{wrong[0]}': {name} is below 0: expected 0 or more {unit}")
             if name != "damping" and not any(values) and None not in values:  # what files say where nobody knows
                 reader.notes.append(f"servo.{group}.{key}: 0 in the file: taken from the base")
             else:
