@@ -11,13 +11,15 @@ import pytest
 from standing import PLAIN, truth_of
 
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.settings import overlay
 from wlr_gym.physics.plants import SIMULATORS, PlantOptions, make_plant
 from wlr_gym.render import scene as gl
 from wlr_gym.render import stage as marks
 from wlr_gym.render import view as camera
-from wlr_gym.render.scene import describe
+from wlr_gym.render.scene import describe, legend
 from wlr_gym.render.stage import Stage
-from wlr_gym.render.view import View, read_view
+from wlr_gym.render.view import View, magnification, read_view
+from wlr_gym.robot import load_robot
 from wlr_gym.robot.parameters import Parameters
 
 
@@ -307,6 +309,17 @@ def test_force_arrows_are_the_friction_on_the_wheels(robot, parameters):
     stage = posed(robot, truth, parameters)
     (arrow,) = marks.force_arrows(stage)
     assert np.allclose(arrow.end - arrow.start, marks.FORCE_SCALE * np.array([2.0, -1.0, 0.0]))
+
+
+def test_force_arrows_of_a_heavy_robot_stay_in_the_picture(robot):
+    """A wheel's share of the weight is as long, beside the picture, as that of the nominal robot."""
+    changes = {"body": {"mass": 13.2}, "hip_position": {"x": 0.3}, "leg": {"length": 0.3}, "name": "heavy"}
+    heavy = load_robot(overlay(robot.model_dump(mode="json"), changes), check=False)
+    share = heavy.total_mass * heavy.gravity / 4
+    assert marks.force_scale(heavy) * share / magnification(heavy) == pytest.approx(marks.FORCE_SCALE * marks.LIGHT / 4)
+    assert marks.force_scale(robot) == marks.FORCE_SCALE
+    (line,) = [one for one in legend(Parameters.nominal(heavy), View(loads=True), marks.force_scale(heavy)) if "load" in one]
+    assert f"0.1 m = {0.1 / marks.force_scale(heavy):.3g} N" in line
 
 
 # ---- slope ----

@@ -226,7 +226,8 @@ class Scene:
             return picture
         lines = describe(stage, slip=self.view.slip, **texts) + [result] * bool(result)
         notes = self._labels(stage, floor)
-        return annotate(picture, lines, legend(stage.parameters, self.view), self.view.friction, notes)
+        means = legend(stage.parameters, self.view, marks.force_scale(self.robot))
+        return annotate(picture, lines, means, self.view.friction, notes)
 
     def pixels(self, points: object) -> NDArray[np.float64]:
         """Return where points (..., 3) of the floor frame are in the last picture: (..., 2) column and row, NaN if behind."""
@@ -275,8 +276,8 @@ def marks_of(stage: Stage, floor: list[Area], view: View) -> list[Mark]:
     return drawn
 
 
-def legend(parameters: Parameters, view: View) -> list[str]:
-    """Return what the colours and arrows of one robot's picture mean, line by line."""
+def legend(parameters: Parameters, view: View, force_scale: float = marks.FORCE_SCALE) -> list[str]:
+    """Return what the colours and arrows of one robot's picture mean, line by line; ``force_scale``: m of arrow per N."""
     mu = 0.5 * (parameters["ground.mu_x"][0] + parameters["ground.mu_y"][0])
     low, high = f"{mu.min():.2f}", f"{mu.max():.2f}"
     floor = f"floor µ {low}" if low == high else f"floors µ {low} to {high}"
@@ -288,7 +289,7 @@ def legend(parameters: Parameters, view: View) -> list[str]:
         lines.append(f"slip: 0.1 m of arrow = {0.1 / marks.SLIP_SCALE:g} m/s")
     lines += [relief] if (relief := _relief(parameters)) else []
     if arrows := ["friction (green)"] * view.forces + ["load (light green)"] * view.loads:
-        lines.append(f"{', '.join(arrows)}: 0.1 m = {0.1 / marks.FORCE_SCALE:g} N")
+        lines.append(f"{', '.join(arrows)}: 0.1 m = {0.1 / force_scale:.3g} N")
     if view.path:
         lines.append("path: pink; as commanded: dashed")
     return lines

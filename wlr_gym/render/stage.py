@@ -23,7 +23,7 @@ from wlr_gym.physics.plants.mujoco import mujoco
 from wlr_gym.physics.plants.mujoco.mjcf import build_model
 from wlr_gym.render import surface
 from wlr_gym.render.surface import REACH, Relief, Surface
-from wlr_gym.render.view import FORCE, LOAD, Colour, friction_colour, slip_colour
+from wlr_gym.render.view import FORCE, LOAD, Colour, friction_colour, magnification, slip_colour
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
 from wlr_gym.robot.parameter_table import PATCHES
 from wlr_gym.robot.parameters import Parameters
@@ -340,9 +340,10 @@ def _geom(body: mujoco.MjsBody, kind: str, **properties: Any) -> None:
 
 SLIP_SCALE = 2.0  # m of arrow per m/s of slip
 SLIP_FLOOR = 0.003  # m/s; less slip is not drawn
-FORCE_SCALE = 0.025  # m of arrow per N of friction
+FORCE_SCALE = 0.025  # m of arrow per N of friction, of robots up to LIGHT
+LIGHT = 32.0  # N; weight of a robot
 FORCE_FLOOR = 0.2  # N; less friction is not drawn
-LONGEST_ARROW = 0.4  # m
+LONGEST_ARROW = 0.4  # m, of robots of usual size
 SHAFT = 0.006  # m; half the width of an arrow
 #: m; slip arrows start this far outside the wheel's middle plane, beside the tyre, where they can be seen.
 SLIP_BESIDE = 0.022
@@ -506,10 +507,15 @@ def slip_arrows(stage: Stage) -> list[Arrow]:
     return _arrows(stage, SLIP_SCALE * slip, SLIP_SCALE * SLIP_FLOOR, SLIP_BESIDE, colours)
 
 
+def force_scale(robot: Robot) -> float:
+    """Return m of arrow per N: of heavier robots less, so that a wheel's share of the weight is as long in the picture."""
+    return FORCE_SCALE * min(1.0, magnification(robot) * LIGHT / (robot.total_mass * robot.gravity))
+
+
 def force_arrows(stage: Stage) -> list[Arrow]:
     """Return one arrow per contact: the floor's friction force on the wheel."""
-    force = stage.contact_frames().force[:, :2]
-    return _arrows(stage, FORCE_SCALE * force, FORCE_SCALE * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * len(force))
+    force, scale = stage.contact_frames().force[:, :2], force_scale(stage.robot)
+    return _arrows(stage, scale * force, scale * FORCE_FLOOR, FORCE_BESIDE, [FORCE] * len(force))
 
 
 def load_arrows(stage: Stage) -> list[Arrow]:
@@ -517,7 +523,8 @@ def load_arrows(stage: Stage) -> list[Arrow]:
     frames = stage.contact_frames()
     load = frames.force[:, 2]
     starts = frames.points + FORCE_BESIDE * _outwards(frames.points) * frames.left
-    ends = starts + np.minimum(FORCE_SCALE * load, LONGEST_ARROW)[:, None] * frames.normal
+    length = np.minimum(force_scale(stage.robot) * load, magnification(stage.robot) * LONGEST_ARROW)
+    ends = starts + length[:, None] * frames.normal
     return [Arrow(starts[contact], ends[contact], LOAD) for contact in np.flatnonzero(load >= FORCE_FLOOR)]
 
 
@@ -531,7 +538,7 @@ def _arrows(stage: Stage, vectors: Array, shortest: float, beside: float, colour
     points, heading, left, normal, _ = (one[: len(vectors)] for one in stage.contact_frames())
     starts = points + beside * _outwards(points) * left + (SHAFT + LAYER * 5) * normal
     length = np.hypot(vectors[:, 0], vectors[:, 1])
-    scale = np.minimum(1.0, LONGEST_ARROW / np.maximum(length, 1e-12))[:, None]
+    scale = np.minimum(1.0, magnification(stage.robot) * LONGEST_ARROW / np.maximum(length, 1e-12))[:, None]
     ends = starts + scale * (vectors[:, :1] * heading + vectors[:, 1:] * left)
     drawn = np.flatnonzero((length >= shortest) & np.isfinite(length))
     return [Arrow(starts[contact], ends[contact], colours[contact]) for contact in drawn]

@@ -407,7 +407,7 @@ class WebViewer(_Page):
             stage = self._show(self._figure, truth, parameters, view, view, contacts)
         if self._texts_are_due():
             lines = describe(stage, slip=view.slip, **texts)
-            self._text.content = page.html_lines([*lines, *legend(stage.parameters, view)])
+            self._text.content = page.html_lines([*lines, *legend(stage.parameters, view, marks.force_scale(stage.robot))])
             if len(self._past) > 1:
                 curves = {name: self.curves(name) for name in self._plots.chosen if name in _TITLES}
                 begin, now = self._past[0][0], self._past[-1][0]
@@ -579,7 +579,8 @@ class Player(_Page):
                 self._ghost.point(arrows_of(self._ghost.pose(ghost.truth, ghost.parameters), arrows))
         if texts:
             lines = describe(stage, slip=moment.slip, time=time, title=recording.name)
-            self._text.content = page.html_lines([*lines, *recording.lines(time), *legend(moment.parameters, view)])
+            means = legend(moment.parameters, view, marks.force_scale(stage.robot))
+            self._text.content = page.html_lines([*lines, *recording.lines(time), *means])
 
     def _plot(self, time: float) -> None:
         width, length, now = WINDOWS[str(self._window.value)], self.recording.length, clock.monotonic()
