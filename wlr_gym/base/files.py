@@ -93,7 +93,7 @@ def require_empty(folder: Path, resume: str) -> None:
     if folder.is_file():
         raise InputError(f"{folder}: cannot be a folder: it is a file")
     if contents(folder):
-        hint = f", or resume what is there: {resume} --resume {folder}" if resume else ""
+        hint = f", or resume what is there: {resume} --resume {shlex.quote(str(folder))}" if resume else ""
         raise InputError(f"{folder}: not empty; give another folder{hint}")
 
 

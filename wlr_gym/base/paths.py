@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,13 +18,18 @@ def data_directory(name: str) -> Path:
     return inside if inside.is_dir() else PACKAGE.parent / name
 
 
+def as_path(given: str | Path) -> Path:
+    """Return a path as users write it: ``~`` is their home."""
+    return Path(os.path.expanduser(given))
+
+
 def find_config(kind: str, name: str | Path) -> Path:
     """Resolve a config given by path or by the name of a file in ``configs/<kind>/``.
 
     Raises:
         InputError: no such file; the message lists the shipped names.
     """
-    path = Path(name)
+    path = as_path(name)
     if path.suffix in {".yaml", ".yml"} and path.is_file():
         return path
     if str(name) in config_names(kind):
@@ -56,8 +62,8 @@ def named_in(file: str | Path, name: str | Path) -> Path:
 
     A file has one absolute path, by whatever way it is named.
     """
-    beside = Path(file).parent / name
-    return beside.resolve() if beside.is_file() else Path(name)
+    beside = Path(file).parent / as_path(name)
+    return beside.resolve() if beside.is_file() else as_path(name)
 
 
 def config_names(kind: str) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -75,3 +76,8 @@ def _json_value(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     raise ValueError(f"{type(value).__name__}: JSON has no such value")
+
+
+def quoted(value: object) -> str:
+    """Return a path or word as a shell takes it, for commands that messages print."""
+    return shlex.quote(str(value))

@@ -25,7 +25,7 @@ from wlr_gym.base.files import refuse_existing
 from wlr_gym.base.jobs import cores
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import record_provenance
-from wlr_gym.base.text import duration
+from wlr_gym.base.text import duration, quoted
 from wlr_gym.cli import FAILED, OK
 from wlr_gym.cli.options import (
     Count,
@@ -251,7 +251,8 @@ def ask(motion: Motion, data: Path, *, out: Path, console: Console, wait: Callab
 
     there = set(run_files(data))
     path = write_commands(out / ASKED, motion)
-    console.print(f"drive {motion.name} ({motion.duration:.0f} s): wlr record --commands {path} --out {data}", markup=False)
+    command = f"wlr record --commands {quoted(path)} --out {quoted(data)}"
+    console.print(f"drive {motion.name} ({motion.duration:.0f} s): {command}", markup=False)
     console.print("(a real robot: with --hardware FILE) waiting for its run; Ctrl-C: the same command goes on later")
     size = -1
     while True:

@@ -20,6 +20,7 @@ from rich.console import Console
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import make_output_folder
 from wlr_gym.base.progress import progress
+from wlr_gym.base.text import quoted
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import JsonOption, Seconds
 from wlr_gym.cli.terminal import print_json, print_table
@@ -71,7 +72,7 @@ def run(options: ImportOptions) -> int:
             return OK
         if found.open:
             count = f"{len(found.open)} entries of the map are open" if len(found.open) > 1 else "an entry of the map is open"
-            again = f"replace each 'open', then: wlr import {options.log[0]} --out {options.out}"
+            again = f"replace each 'open', then: wlr import {quoted(options.log[0])} --out {quoted(options.out)}"
             raise InputError(f"{options.out / MAP_FILE}: no run is made, {count}: {', '.join(found.open)}; {again}")
         given = found.content
     assert options.out is not None

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import inspect
 import operator
+import os
 import re
 import shutil
 import sys
@@ -54,6 +55,7 @@ def parse(kind: Any, program: str, words: Sequence[str], description: str = "") 
     import tyro
     from tyro.constructors import ConstructorRegistry
 
+    words = [re.sub(r"(^|=)~(?=/)", lambda found: found[1] + os.path.expanduser("~"), word) for word in words]  # --out=~/runs
     names = [word.partition("=")[0].replace("_", "-") for word in words if re.match(r"--[A-Za-z]", word)]
     for name in names:
         if names.count(name) > 1:  # tyro takes the last one and drops the others without a word

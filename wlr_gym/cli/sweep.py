@@ -13,7 +13,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.settings import parse_config, parse_yaml
-from wlr_gym.base.text import counted, number, pairs
+from wlr_gym.base.text import counted, number, pairs, quoted
 from wlr_gym.cli import FAILED, IMPORTED, OK
 from wlr_gym.cli.options import Count, FloorOption, JsonOption, ray_address, refuse_given
 from wlr_gym.cli.terminal import print_json
@@ -121,5 +121,5 @@ def _report(found: SweepResult, as_json: bool) -> int:
         _say(f"score it: wlr evaluate {best.policies}")
     _say(f"table: {found.folder / TABLE_FILE}\npage: {found.folder / PAGE_FILE}")
     if found.failed:
-        _say(f"{counted(len(found.failed), 'trial')} FAILED; try them again: wlr sweep --resume {found.folder}")
+        _say(f"{counted(len(found.failed), 'trial')} FAILED; try them again: wlr sweep --resume {quoted(found.folder)}")
     return FAILED if found.failed else OK

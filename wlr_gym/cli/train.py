@@ -12,6 +12,7 @@ import tyro
 from wlr_gym.base.errors import InputError, Interval
 from wlr_gym.base.provenance import CONFIG_FILE
 from wlr_gym.base.settings import read_yaml
+from wlr_gym.base.text import quoted
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import FloorOption, JsonOption, PatchOption, ProgressOption, Seed, environment_of, refuse_given
 from wlr_gym.cli.terminal import print_json
@@ -82,13 +83,13 @@ def run(options: TrainOptions) -> int:
         last = updates[0]
         print(
             f"stopped after {options.max_minutes:g} min at step {last.steps:,} of {last.total_steps:,}; "
-            f"go on with: wlr train --resume {last.folder}"
+            f"go on with: wlr train --resume {quoted(last.folder)}"
         )
     best = policy.with_name("best")
     if options.json:
         print_json({"environment": environment, "policy": policy, "best": best if best.is_dir() else None})
         return OK
-    print(f"policy: {policy}\nscore it: wlr evaluate {policy} --env {environment}")
+    print(f"policy: {policy}\nscore it: wlr evaluate {quoted(policy)} --env {environment}")
     if best.is_dir():
         print(f"best on held-out episodes: {best}")
     return OK

@@ -22,7 +22,7 @@ from pydantic import Field
 
 from wlr_gym.base.errors import InputError, check_folder, unknown_name
 from wlr_gym.base.files import make_output_folder, replace_file, write_text
-from wlr_gym.base.paths import data_directory, named_in
+from wlr_gym.base.paths import as_path, data_directory, named_in
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.base.text import row_words
 from wlr_gym.data.format import COLUMNS, META_FILE, ROBOT_FILE, SUFFIXES, Finding, RunMeta, check_names, check_table
@@ -88,7 +88,7 @@ def read_run(path: str | Path) -> Run:
     """
     import pandas
 
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a run (CSV or Parquet)")
     if path.suffix.lower() not in SUFFIXES:
@@ -105,7 +105,7 @@ def read_dataset(folder: str | Path) -> DataSet:
     Raises:
         InputError: no runs in the folder, the same run in both formats, or a run that is refused.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     paths = some_runs(folder)
     for before, after in pairwise(paths):
         if before.stem == after.stem:
@@ -126,7 +126,7 @@ def some_runs(folder: Path) -> list[Path]:
 
 def read_runs(path: str | Path) -> tuple[Run, ...]:
     """Read a run, or every run of a folder."""
-    path = Path(path)
+    path = as_path(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; expected a run (CSV or Parquet) or a folder of runs")
     return read_dataset(path).runs if path.is_dir() else (read_run(path),)
@@ -219,7 +219,7 @@ def write_run(
     Raises:
         InputError: another suffix, a table that a reader would refuse, or a ``meta.yaml`` that says something else.
     """
-    path = Path(path)
+    path = as_path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: a run is written as {' or '.join(SUFFIXES)}")
     columns = {str(name): np.asarray(table[name], dtype=np.float64) for name in table}

@@ -26,6 +26,7 @@ from pydantic import Field
 
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import alone_in, check_same_request, resumes, write_json
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
 from wlr_gym.data.excitations import EXCITATIONS, GENTLE, Motion, excite
 from wlr_gym.data.format import META_FILE, Profile
@@ -186,7 +187,7 @@ def decide(
         InputError: see :func:`wlr_gym.gap.workflow.analyse`; or ``out`` has a history of other data, robot or simulator, or
             another process works in it.
     """
-    known, data, out = load_patch(known), Path(data), Path(out)
+    known, data, out = load_patch(known), as_path(data), as_path(out)
     session = _Session(data, out, budget or Budget(), known, robot, backend, threads, tell)
     with alone_in(out):
         history, last = session.resumed()

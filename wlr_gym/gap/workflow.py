@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from wlr_gym.base.errors import InputError, check_number, unknown_name
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.provenance import provenance
 from wlr_gym.gap.analysis import (
     BAD_DATA,
@@ -103,7 +104,7 @@ def analyse(
     if out is not None:
         from wlr_gym.gap.report.page import check_folder
 
-        check_folder(Path(out))
+        check_folder(as_path(out))
     tell("reading", STAGES["reading"])
     load, open_runs = system_of(rig, backend, threads, robot)
     known = load(known)
@@ -125,7 +126,7 @@ def analyse(
         from wlr_gym.gap.report.page import save_analysis
 
         tell("drawing", STAGES["drawing"])
-        save_analysis(done, Path(out))
+        save_analysis(done, as_path(out))
     return done
 
 

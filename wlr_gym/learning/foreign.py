@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 
 from wlr_gym.base.errors import InputError, require_package
+from wlr_gym.base.paths import as_path
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.registry import ENVIRONMENTS, task_source_of
 from wlr_gym.learning.evaluation.rollout import seen_observations
@@ -95,7 +96,7 @@ def import_policy(
         definition = (bare.spec and bare.spec.kwargs.get("definition")) or task_source_of(env_id)
         with closing(Core(definition, bare.core.settings, ROBOTS)) as core:
             driven = seen_observations(core, policy, SECONDS)
-        return write_policy_file(Path(out), graph, content, policy, driven)
+        return write_policy_file(as_path(out), graph, content, policy, driven)
     except torch.onnx.OnnxExporterError as error:
         raise InputError(f"the network cannot be written as an ONNX graph: {_reason(error)}") from error
     finally:
@@ -192,7 +193,7 @@ def _normalizer(given: Any, width: int) -> torch.nn.Module:
         return given
     if isinstance(given, str | Path):
         try:
-            given, path = pickle.loads(Path(given).read_bytes()), given
+            given, path = pickle.loads(as_path(given).read_bytes()), given
         except Exception as error:  # pickle raises whatever the bytes lead it to
             raise InputError(f"{given}: not a saved VecNormalize: {error}") from None
         if not isinstance(given, VecNormalize):

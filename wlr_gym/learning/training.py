@@ -9,6 +9,7 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, check_number, nearest
 from wlr_gym.base.files import alone_in, require_empty
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
 from wlr_gym.base.settings import merge_changes, read_yaml
 from wlr_gym.envs.registry import task_name_of
@@ -71,7 +72,7 @@ def train(
     """
     chosen = settings_of(env_id, config, agent, init, settings=settings, seed=seed, robot=robot)
     follow: dict[str, Any] = {"max_seconds": max_seconds, "progress": progress, "on_update": on_update}
-    return run_training(agent, Training(env_id, Path(out), chosen, init=init, **follow))
+    return run_training(agent, Training(env_id, as_path(out), chosen, init=init, **follow))
 
 
 def settings_of(
@@ -146,10 +147,10 @@ def resume_training(
     Raises:
         InputError: not a run folder, nothing in it to resume, or an end before the present one.
     """
-    path = Path(folder) / CONFIG_FILE
+    path = as_path(folder) / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"{folder}: not a run folder: {CONFIG_FILE} is missing")
-    with alone_in(Path(folder)):
+    with alone_in(path.parent):
         saved = read_yaml(path)
         for key in ("environment", "agent", "settings"):
             if not isinstance(saved, dict) or key not in saved:
@@ -158,7 +159,7 @@ def resume_training(
             _extend(saved["settings"], total_steps)
             write_yaml(path, saved)
         follow: dict[str, Any] = {"max_seconds": max_seconds, "progress": progress, "on_update": on_update}
-        request = Training(saved["environment"], Path(folder), saved["settings"], resume=True, init=saved.get("init"), **follow)
+        request = Training(saved["environment"], path.parent, saved["settings"], resume=True, init=saved.get("init"), **follow)
         return run_training(saved["agent"], request)
 
 

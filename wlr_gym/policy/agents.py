@@ -19,7 +19,7 @@ import yaml
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, check_name, nearest, unknown_name
-from wlr_gym.base.paths import config_names, data_directory, named_in
+from wlr_gym.base.paths import as_path, config_names, data_directory, named_in
 from wlr_gym.base.settings import merge_changes, parse_yaml, read_layers
 from wlr_gym.base.text import pairs
 from wlr_gym.policy.file import CONTRACT_FILE, Config, Contract, check_contract, read_contract
@@ -233,7 +233,7 @@ def shipped_names() -> list[str]:
 
 def _policy_place(source: str | Path) -> Path | None:
     """Return the folder or file of a policy that is given by it, by a run folder or by a shipped name; None = none of these."""
-    path = Path(source)
+    path = as_path(source)
     if path.suffix == SUFFIX and path.is_file():
         return path
     for folder in (path, path / "policy"):
@@ -267,9 +267,9 @@ def find_policy(source: str | Path, or_agent: bool = False) -> Path:
     place = _policy_place(source)
     if place is not None:
         return place
-    if Path(source).is_dir():
+    if as_path(source).is_dir():
         raise InputError(f"'{source}': no policy there (looked for {CONTRACT_FILE} in it and in its folder 'policy')")
-    if Path(source).exists():
+    if as_path(source).exists():
         raise InputError(f"'{source}': not a policy: expected a folder, or a file {SUFFIX}")
     if str(source) in agent_names():
         raise InputError(f"'{source}' is an agent: expected a trained policy (folder, file {SUFFIX} or shipped policy)")

@@ -13,6 +13,7 @@ from PIL import Image
 
 from wlr_gym.base.errors import InputError, require_package
 from wlr_gym.base.files import replace_file, require_ending
+from wlr_gym.base.paths import as_path
 
 Picture = NDArray[np.uint8]
 
@@ -49,7 +50,7 @@ def write_video(path: str | Path, pictures: Iterable[Picture], fps: float = FPS,
         InputError: no pictures, pictures of different sizes, a bad path or frame rate.
         MissingPackageError: MP4 without ``imageio-ffmpeg``.
     """
-    path = Path(path)
+    path = as_path(path)
     check_video(path, "path")
     if not 0 < fps <= 1000:
         raise InputError(f"fps = {fps!r}: expected more than 0, at most 1000")

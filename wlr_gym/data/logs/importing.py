@@ -17,7 +17,9 @@ import yaml
 
 from wlr_gym.base.errors import InputError, check_number
 from wlr_gym.base.files import make_output_folder, write_text
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.settings import parse_config, read_yaml
+from wlr_gym.base.text import quoted
 from wlr_gym.data.format import COLUMNS, REQUIRED, Finding, ImpossibleError, RunMeta, check_speeds, check_table
 from wlr_gym.data.logs.map import (
     CURRENTS,
@@ -102,7 +104,7 @@ def import_log(
         InputError: an unreadable log, a map that is not complete, does not fit or names another robot, a run that a reader
             would refuse, another map in ``out``; the message names file, topic and field, and nothing is written.
     """
-    log, out = Path(log), Path(out)
+    log, out = as_path(log), as_path(out)
     if split is not None:
         check_number("split", split, "s", above=0.0)
     if map is None and is_own(log):
@@ -153,7 +155,7 @@ def _map_of(map: LogMap | Mapping[str, Any] | str | Path | None, log: Path, out:
         return parse_map(read_map(path), str(path))
     proposal = suggest_map(log, robot=robot)
     if proposal.open:
-        hint = f"wlr import {log} --suggest writes the map that is proposed, and what the log shows of each"
+        hint = f"wlr import {quoted(log)} --suggest writes the map that is proposed, and what the log shows of each"
         raise InputError(f"{log}: needs a map: its names leave open {', '.join(proposal.open)}; {hint}")
     return proposal.map
 

@@ -26,6 +26,7 @@ from numba import NumbaError, njit
 from numpy.typing import NDArray
 
 from wlr_gym.base.errors import InputError, check_file, check_folder, check_name, check_number, nearest
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.random import generator
 from wlr_gym.base.text import row_words
 from wlr_gym.gap.analysis import IntakeFinding, few_runs
@@ -112,7 +113,7 @@ def load_rig(path: str | Path) -> Rig:
     Raises:
         InputError: no such file, one that does not run or has no ``RIG``, or a rig that contradicts itself, with what and why.
     """
-    path = Path(path)
+    path = as_path(path)
     check_file(path)
     spec = importlib.util.spec_from_file_location(f"wlr_gym_rig_{path.stem}", path)
     assert spec is not None
@@ -206,7 +207,7 @@ def read_rig_runs(folder: str | Path, rig: Rig) -> list[RigRun]:
     Raises:
         InputError: no folder, no tables, a column missing, or values that cannot be: naming file, column and row.
     """
-    folder = Path(folder)
+    folder = as_path(folder)
     check_folder(folder)
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _READERS)
     if not paths:

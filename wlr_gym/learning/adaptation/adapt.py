@@ -11,8 +11,10 @@ from typing import Any
 
 from wlr_gym.base.errors import InputError, check_folder, require_package
 from wlr_gym.base.files import alone_in
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.provenance import record_provenance, write_yaml
 from wlr_gym.base.settings import parse_config, parse_options, read_yaml
+from wlr_gym.base.text import quoted
 from wlr_gym.data.excitations import excite
 from wlr_gym.data.record import same_profile
 from wlr_gym.data.runs import run_files
@@ -110,7 +112,7 @@ def adapt(
         "policy": str(policy),
         "identity": identity(read_subjects([str(policy)])[0]),
         "environment": chosen,
-        "robot_runs": None if robot_runs is None else str(Path(robot_runs).resolve()),
+        "robot_runs": None if robot_runs is None else str(as_path(robot_runs).resolve()),
         "robot": _fitting(policy, chosen, own),
         "driven": ("real" if isinstance(driven, RealRobot) else "emulated") if is_driven else "",
         "effects": [dict(one.content()) for one in patch.effects],
@@ -121,12 +123,12 @@ def adapt(
         raise InputError("--sensors camera: robots are driven without a camera here; give measured runs, or leave it out")
     same_profile([excite(name, request.seed, own) for name in request.excitations])
     if robot_runs is not None:
-        check_folder(Path(robot_runs), "--robot-runs")
-        check_runs(Path(robot_runs), own)  # before anything is written
+        check_folder(as_path(robot_runs), "--robot-runs")
+        check_runs(as_path(robot_runs), own)  # before anything is written
     elif driven is None:
         driven = EmulatedRobot(own, patch, request.backend, floor=on)
-    with alone_in(Path(out)):
-        progress = open_folder(Path(out), request, tell, threads)
+    with alone_in(as_path(out)):
+        progress = open_folder(as_path(out), request, tell, threads)
         if not progress.steps:
             record_provenance(progress.out, request.model_dump(mode="json"), request.seed)
             save_patch(patch, progress.out / "hidden.yaml")
@@ -226,7 +228,7 @@ def find_gap(progress: Progress, robot: AdaptedRobot | None) -> AdaptStep:
     return AdaptStep(
         said=tuple(said),
         driving=history.seconds,
-        command=f"wlr gap {data} --out {progress.out / 'gap'} --until-decided --budget-runs {runs}{record_by}",
+        command=f"wlr gap {quoted(data)} --out {quoted(progress.out / 'gap')} --until-decided --budget-runs {runs}{record_by}",
         numbers={
             "verdict": "" if result is None else result.verdict,
             "effects": [] if result is None else [one.name for one in result.effects],
@@ -244,7 +246,7 @@ def state_uncertainty(progress: Progress, decided: Decided, own: Robot) -> tuple
         return AdaptStep(outcome="left out", said=(why, "The old policy is kept.")), None
     patch = load_patch(decided.folder / PATCH_FILE)
     found = uncertainty_of(result, patch, task_randomization(progress.asked.environment), own, folder)
-    command = f"wlr envs {progress.asked.environment} --randomization {folder / 'randomization.yaml'}"
+    command = f"wlr envs {progress.asked.environment} --randomization {quoted(folder / 'randomization.yaml')}"
     numbers = {"effects": patch.content()["effects"], "families": [one.name for one in found.families]}
     return AdaptStep(said=found.said, command=command, numbers=numbers), found
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import write_json
 from wlr_gym.base.random import generator
+from wlr_gym.base.text import quoted
 from wlr_gym.data.excitations import Motion, excite
 from wlr_gym.data.format import RunMeta
 from wlr_gym.data.record import meta_of
@@ -293,7 +294,7 @@ def drive_after(progress: Progress, robot: AdaptedRobot | None, kept: str) -> Ad
     """Drive fresh episodes with the old policy and the kept one, in turns."""
     asked = progress.asked
     if robot is None:
-        return AdaptStep(outcome="left out", said=(_NO_ROBOT, f"To drive it: wlr deploy {kept}"))
+        return AdaptStep(outcome="left out", said=(_NO_ROBOT, f"To drive it: wlr deploy {quoted(kept)}"))
     if kept == asked.policy:
         return AdaptStep(outcome="left out", said=("The old policy is kept: there is nothing new to drive.",))
     seeds = seeds_of(AFTER, asked)
@@ -343,7 +344,7 @@ def record_runs(progress: Progress, robot: AdaptedRobot | None, own: Robot) -> A
     return AdaptStep(
         said=(f"{len(kept)} of {len(done)} excitations left a run: {', '.join(kept) or 'none'}.", *stopped),
         driving=sum(one["seconds"] for one in done.values()),
-        command=f"wlr record --excitation {' '.join(asked.excitations)} --out {folder}{_emulated_words(progress)}",
+        command=f"wlr record --excitation {' '.join(asked.excitations)} --out {quoted(folder)}{_emulated_words(progress)}",
     )
 
 
@@ -442,7 +443,7 @@ def stops(episodes: Sequence[RobotEpisode]) -> tuple[str, ...]:
 def _deploy_command(policy: str, progress: Progress, seed: int) -> str:
     asked = progress.asked
     stepped = " --stepped" if asked.driven == "emulated" else ""
-    return f"wlr deploy {policy}{_emulated_words(progress)}{stepped} --seconds {asked.drive_seconds:g} --seed {seed}"
+    return f"wlr deploy {quoted(policy)}{_emulated_words(progress)}{stepped} --seconds {asked.drive_seconds:g} --seed {seed}"
 
 
 def _emulated_words(progress: Progress) -> str:

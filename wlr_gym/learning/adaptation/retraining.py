@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from wlr_gym.base.files import write_json
 from wlr_gym.base.provenance import CONFIG_FILE, write_yaml
+from wlr_gym.base.text import quoted
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.hardware.config import load_hardware
@@ -115,7 +116,7 @@ def train_in(progress: Progress, name: str, family: Family, rewards: Mapping[str
     elif not (folder / "policy").is_dir():
         write_yaml(config, training_settings(asked, family, rewards))
         train(asked.environment, folder, config, init=asked.policy, on_update=on_update)
-    return f"wlr train {asked.environment} --config {config} --init {asked.policy} --out {folder}"
+    return f"wlr train {asked.environment} --config {quoted(config)} --init {quoted(asked.policy)} --out {quoted(folder)}"
 
 
 def train_supervised(progress: Progress, found: Uncertainty, own: Robot) -> AdaptStep:
@@ -205,7 +206,8 @@ def accept_policy(progress: Progress, found: Uncertainty, own: Robot) -> AdaptSt
     }
     randomization = progress.out / "model" / "randomization.yaml"
     sensors = " ".join(asked.sensors) or "none"
-    command = f"wlr evaluate new={new} old={asked.policy} --randomization {randomization} --sensors {sensors}"
+    named = f"{quoted(f'new={new}')} {quoted(f'old={asked.policy}')}"
+    command = f"wlr evaluate {named} --randomization {quoted(randomization)} --sensors {sensors}"
     return AdaptStep(said=(verdict,), command=command, numbers=numbers)
 
 

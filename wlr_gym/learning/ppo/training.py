@@ -31,6 +31,7 @@ from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.progress import progress
 from wlr_gym.base.provenance import provenance, record_provenance, write_yaml
+from wlr_gym.base.text import quoted
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.sb3 import Sb3VecEnv
 from wlr_gym.learning.curves import METRICS, CurveFile, best_of, is_better, read_curve
@@ -173,7 +174,7 @@ def _train(training: Training, config: PpoConfig, env: Sb3VecEnv, model: PPO) ->
             _updates(log, meter, stop, partial(tell, ""))
         place = log.save_checkpoint()
         if stop.requested:
-            raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {training.folder}")
+            raise KeyboardInterrupt(f"interrupted; saved {place}; resume with: wlr train --resume {quoted(training.folder)}")
         if model.num_timesteps >= config.total_steps:
             log.score()
         return log.save(training.folder / "policy")

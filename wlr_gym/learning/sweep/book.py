@@ -13,7 +13,7 @@ from typing import Any
 from wlr_gym.base.errors import InputError
 from wlr_gym.base.files import locked
 from wlr_gym.base.jobs import PATIENCE, Ended, Job
-from wlr_gym.base.text import counted, duration
+from wlr_gym.base.text import counted, duration, quoted
 from wlr_gym.learning.sweep.plan import SweepPlan, Trial, trials_of
 from wlr_gym.learning.sweep.results import (
     DONE,
@@ -94,7 +94,7 @@ class Book:
             search: searches in place of training all known settings.
         """
         plan, known = self.plan, self.plan.known_settings() or []
-        resume = f"wlr sweep --resume {self.folder}"
+        resume = f"wlr sweep --resume {quoted(self.folder)}"
         try:
             if search is not None:
                 search()

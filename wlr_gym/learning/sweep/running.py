@@ -12,6 +12,7 @@ from typing import Any
 from wlr_gym.base.errors import InputError, check_number, require_package
 from wlr_gym.base.files import alone_in, make_output_folder, require_empty
 from wlr_gym.base.jobs import cores, spread
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.provenance import PROVENANCE_FILE, provenance, write_yaml
 from wlr_gym.base.settings import parse_config, read_yaml
 from wlr_gym.learning.sweep.book import Book, Say, SweepResult
@@ -66,7 +67,7 @@ def start_sweep(
     plan: SweepPlan, out: str | Path, *, ray: str | None = None, workers: int | None = None, say: Say = print
 ) -> SweepResult:
     """Run a plan in a new folder; arguments, result and errors as of :func:`sweep`."""
-    folder = Path(out)
+    folder = as_path(out)
     with alone_in(folder):
         require_empty(folder, "wlr sweep" if (folder / PLAN_FILE).is_file() else "")
         whole = resolve(plan)
@@ -87,12 +88,12 @@ def resume_sweep(folder: str | Path, *, ray: str | None = None, workers: int | N
         InputError: not the folder of a sweep, or another process runs it.
         KeyboardInterrupt: as for :func:`sweep`.
     """
-    file = Path(folder) / PLAN_FILE
+    file = as_path(folder) / PLAN_FILE
     if not file.is_file():
         raise InputError(f"{folder}: not the folder of a sweep: {PLAN_FILE} is missing")
     plan = parse_config(SweepPlan, read_yaml(file), str(file))
     _check_machines(plan, ray, workers)
-    return _run(plan, Path(folder), ray, workers, say)
+    return _run(plan, as_path(folder), ray, workers, say)
 
 
 def _check_machines(plan: SweepPlan, ray: str | None, workers: int | None) -> None:

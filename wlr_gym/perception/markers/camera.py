@@ -15,8 +15,10 @@ from pydantic import ConfigDict, Field
 
 from wlr_gym.base.compiled import compiled
 from wlr_gym.base.errors import InputError
+from wlr_gym.base.paths import as_path
 from wlr_gym.base.provenance import write_yaml
 from wlr_gym.base.settings import SettingsModel, parse_config, read_yaml
+from wlr_gym.base.text import quoted
 
 Array = NDArray[np.float64]
 
@@ -84,10 +86,10 @@ def load_camera(path: str | Path) -> Camera:
     Raises:
         InputError: no such file, not a camera, impossible numbers.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         new = path if path.suffix in {".yaml", ".yml"} else "camera.yaml"
-        raise InputError(f"{path}: no such camera file; make one with: wlr calibrate camera IMAGES --out {new}")
+        raise InputError(f"{path}: no such camera file; make one with: wlr calibrate camera IMAGES --out {quoted(new)}")
     camera = parse_config(Camera, read_yaml(path), str(path))
     if min(camera.focal) < _SHORTEST_FOCAL * max(camera.width, camera.height):
         raise InputError(f"{path}: focal = {list(camera.focal)}: expected pixels; these look like millimetres")

@@ -22,7 +22,7 @@ import yaml
 
 from wlr_gym.base.errors import InputError, unknown_name
 from wlr_gym.base.files import write_text
-from wlr_gym.base.paths import find_config
+from wlr_gym.base.paths import as_path, find_config
 from wlr_gym.base.settings import read_yaml
 from wlr_gym.physics.codegen.expression import finite_number
 from wlr_gym.physics.plants.base import COORDINATES
@@ -173,7 +173,7 @@ def _compose_entries(entries: Sequence[Any], kinds: EffectKinds) -> Patch:
 def save_patch(patch: Patch, path: str | Path) -> Path:
     """Write a patch as YAML; :func:`load_patch` reads back the same effects, neutral numbers filled in."""
     text = yaml.dump(patch.content(), Dumper=_Dumper, sort_keys=False)  # in ASCII: PyYAML loses U+0085 and its kin otherwise
-    path = Path(path)
+    path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, text)
     return path
