@@ -84,7 +84,7 @@ def test_what_names_do_not_decide_is_asked(proposal):
 
 def test_each_question_says_what_the_log_shows(proposal):
     shown = {
-        "joints.leg_rf": ["pos 72.", "(89.43 at the start); cmd 72."],
+        "joints.leg_rf": ["pos 72.", "(89.43 at the start); cmd 72.", "; correlation with its command 1.00"],
         "channels.pos_leg": ["rad, deg, turn, count?", "'position[{joint}]'", "leg_lf 72."],
         "channels.vel_wheel": ["rpm"],
         "channels.eff_wheel": ["mA", "the motor stalls at 1.5 N m"],

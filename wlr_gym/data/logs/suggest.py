@@ -506,7 +506,7 @@ class _Proposer:
                 entry |= dict.fromkeys(asked, OPEN)
                 found = [f"{kind}_{joint}" for kind in ("pos", "cmd") if f"{kind}_{joint}" in self.chosen]
                 shown = "; ".join(f"{column.partition('_')[0]} {_range(self.raw(column))}" for column in found)
-                self.note(f"joints.{joint}", shown or "no field of it is known")
+                self.note(f"joints.{joint}", f"{shown}{self._follows(joint)}" or "no field of it is known")
             if asked or (joint in self.names and joint not in self.known.get("joints", {})):
                 self.content["joints"][joint] = entry
         if len(self.lines) > place:
@@ -595,6 +595,16 @@ class _Proposer:
         kind = self.log.topics[one.topic].kind
         topic = "" if kind == one.topic else f"topic '{one.topic}' ({kind}), "
         return f"{topic}'{self._field(column)}'"
+
+    def _follows(self, joint: str) -> str:
+        """Return how a joint's motion goes with its command, in words: a leg's angle, a wheel's rate."""
+        moved, asked = f"{'pos' if joint in LEGS else 'vel'}_{joint}", f"cmd_{joint}"
+        if not {moved, asked} <= set(self.chosen):
+            return ""
+        (t, values), (at, goals) = self.raw(moved), self.raw(asked)
+        if min(len(t), len(at)) < 2 or not np.ptp(values) or not np.ptp(goals := np.interp(t, at, goals)):
+            return ""
+        return f"; correlation with its command {np.corrcoef(values, goals)[0, 1]:.2f}"
 
     def _unnamed(self) -> str:
         """Return which lists have as many elements as a robot has joints of a kind, but no names; and a table's columns."""
