@@ -18,7 +18,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("onnxscript")
 
 from stable_baselines3 import PPO, SAC, TD3  # noqa: E402
-from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor, VecNormalize  # noqa: E402
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize  # noqa: E402
 
 ID = "WLR-Velocity-v0"
 TASK = {"observer": {"camera": False}, "observations": {"estimated_slip_velocity": None}}
@@ -122,6 +122,30 @@ def test_a_wrapper_that_no_file_holds_is_refused(env, tmp_path):
         with pytest.raises(InputError, match=rf"the wrapper {type(wrapped).__name__} changes observations or actions"):
             wlr_gym.import_policy(network, wrapped, tmp_path / "p.onnx", normalizer=torch.nn.Identity())
     assert not (tmp_path / "p.onnx").exists()
+
+
+@pytest.mark.parametrize("behind", ["VecNormalize", "VecNormalize of rewards", "NormalizeObservation", "RescaleAction", ""])
+def test_an_archive_that_was_trained_behind_a_wrapper_is_refused_without_what_undoes_it(env, tmp_path, behind):
+    half = np.float32(0.5)
+    kept = {
+        "VecNormalize": lambda: VecNormalize(env),
+        "VecNormalize of rewards": lambda: VecNormalize(env, norm_obs=False),
+        "NormalizeObservation": lambda: DummyVecEnv([lambda: NormalizeObservation(gym.make(ID, task=TASK))]),
+        "RescaleAction": lambda: DummyVecEnv([lambda: RescaleAction(gym.make(ID, task=TASK), -half, half)]),
+        "": lambda: env,
+    }[behind]()
+    model = PPO("MlpPolicy", kept, n_steps=8, batch_size=8, n_epochs=1, device="cpu", seed=4).learn(8)
+    model.save(tmp_path / "model.zip")
+    out = tmp_path / "p.onnx"
+    if not behind:
+        wlr_gym.import_policy(tmp_path / "model.zip", env, out)
+        return
+    said = "trained in actions" if behind == "RescaleAction" else "trained behind"
+    with pytest.raises(InputError, match=said):
+        wlr_gym.import_policy(tmp_path / "model.zip", env, out)
+    assert not out.exists()
+    if "VecNormalize" in behind:
+        wlr_gym.import_policy(tmp_path / "model.zip", env, out, normalizer=kept)
 
 
 def test_a_network_for_a_task_file(tmp_path):

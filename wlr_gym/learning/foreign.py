@@ -77,9 +77,11 @@ def import_policy(
         raise InputError(f"env = {env!r}: expected an environment of wlr_gym, made as it was for the training")
     contract = bare.contract()
     width = len(contract["observation"])
-    source = network if isinstance(network, torch.nn.Module) else sb3_network(Path(network))
     worn = _worn(env, bare)
-    whole = _Whole(_normalizer(worn if normalizer is None else normalizer, width), source)
+    worn = worn if normalizer is None else normalizer
+    seen = bare.core.observation_space if worn is None else None
+    source = network if isinstance(network, torch.nn.Module) else sb3_network(as_path(network), seen, bare.core.action_space)
+    whole = _Whole(_normalizer(worn, width), source)
     task = bare.core.settings.task
     if task is not None and not isinstance(task, Mapping):  # a file, which may be elsewhere tomorrow: its content, scaled
         written = bare.core.task.config.model_dump(mode="json", exclude_none=True)
@@ -227,11 +229,15 @@ class _Sb3Mean(torch.nn.Module):
         return torch.tanh(mean) if policy.squash_output else mean
 
 
-def sb3_network(path: Path) -> torch.nn.Module:
+def sb3_network(path: Path, seen: gymnasium.Space | None = None, done: gymnasium.Space | None = None) -> torch.nn.Module:
     """Return the acting network of an archive that Stable-Baselines3 saved.
 
+    Args:
+        path: of the archive.
+        seen, done: what the training must have observed and acted in, or wrappers lay between; None = not compared.
+
     Raises:
-        InputError: absent, broken, or of a policy that is no torch network of the kinds above.
+        InputError: absent, broken, of a policy that is no torch network of the kinds above, or trained behind wrappers.
     """
     try:
         data, parameters, _ = load_from_zip_file(path, device="cpu")
@@ -244,5 +250,21 @@ def sb3_network(path: Path) -> torch.nn.Module:
         raise InputError(f"{path}: not a readable archive of Stable-Baselines3: {type(error).__name__}: {error}") from None
     if not isinstance(policy, ActorCriticPolicy | SACPolicy | TD3Policy):
         raise InputError(f"{path}: policy '{type(policy).__name__}': expected one of PPO, A2C, SAC or TD3")
+    _refuse_wrappers(path, data, seen, done)
     policy.set_training_mode(False)
     return _Sb3Mean(policy)
+
+
+def _refuse_wrappers(path: Path, data: Mapping[str, Any], seen: gymnasium.Space | None, done: gymnasium.Space | None) -> None:
+    """Refuse an archive whose training saw or did other than the environment, by what is kept of both."""
+    if done is not None and data["action_space"] != done:
+        found = f"trained in actions {data['action_space']}, the environment has {done}"
+        raise InputError(f"{path}: {found}: put into the network what a wrapper changed")
+    is_normalised = data.get("_last_original_obs") is not None  # what a VecNormalize got
+    if seen is None or (data["observation_space"] == seen and not is_normalised):
+        return
+    if is_normalised:
+        between, remedy = "a VecNormalize", "give what its save() wrote as normalizer"
+    else:
+        between, remedy = "a wrapper that changed its observations", "give what it did as normalizer"
+    raise InputError(f"{path}: trained behind {between}: {remedy}, or the environment of the training with it")
