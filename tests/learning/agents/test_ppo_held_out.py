@@ -16,7 +16,7 @@ import wlr_gym
 from wlr_gym.base.errors import InputError
 from wlr_gym.cli import main
 from wlr_gym.learning.curves import read_curve
-from wlr_gym.learning.evaluation.rollout import make_core
+from wlr_gym.learning.evaluation.rollout import make_core, measures_of
 from wlr_gym.policy import Training, export_policy, load_agent, read_contract
 
 torch = pytest.importorskip("torch")
@@ -43,6 +43,21 @@ def test_scores_are_those_of_an_evaluation_of_the_same_episodes(run):
     for name in ("tracking_error", "success", "excess_slip", "reward"):
         assert rows[-1][name] == pytest.approx(scores[name].mean, rel=1e-9, abs=1e-9)
     assert read_contract(run / "policy")["training"]["held_out"]["tracking_error"] == rows[-1]["tracking_error"]
+
+
+@pytest.mark.parametrize("most", [1e9, 1e-12])
+def test_own_measures_and_limits_of_a_training_are_scored(most):
+    from wlr_gym.learning.ppo.policy import parse_settings
+    from wlr_gym.learning.ppo.training import HeldOutEpisodes
+
+    task = {
+        "measures": {"heading_error": {}},
+        "success": {"velocity_error": {"rms": 1e9}, "yaw_rate_error": {"rms": 1e9}, "heading_error": {"max": most}},
+    }
+    core = HeldOutEpisodes(ENVIRONMENT, parse_settings({**SETTINGS, **SCORED, "environment": {"task": task}})).core
+    found = {measure.name: measure for measure in measures_of(core)}
+    assert found["heading_error"].max == most
+    core.close()
 
 
 def test_the_best_policy_is_kept(run):

@@ -401,7 +401,8 @@ SAME = ("backend", "plant", "robot", "floor", "effects", "precision", "control_p
 
 class HeldOutEpisodes:
     """Fixed episodes that neither training nor ``wlr evaluate`` has: the task as it is scored, with its own
-    randomisation, commands and length, on the robot, floor and plant of the training. Where the floor states friction, which
+    randomisation, commands and length, on the robot, floor and plant of the training, by the training's own measures and limits
+    of success where it has some. Where the floor states friction, which
     the task would draw, the randomisation is the training's.
 
     Args:
@@ -413,7 +414,11 @@ class HeldOutEpisodes:
         states_friction = load_floor(config.environment.get("floor")).friction != FloorFriction()
         kept = (*SAME, "randomization") if states_friction else SAME
         same = {name: config.environment[name] for name in kept if name in config.environment}
-        self.core = make_core(environment, config.evaluation_episodes, same | fed_environment(config.environment))
+        task = config.environment.get("task")
+        own = {key: task[key] for key in ("measures", "success") if key in task} if isinstance(task, Mapping) else {}
+        fed = fed_environment(config.environment)
+        fed |= {"task": {**fed.get("task", {}), **own}} if own else {}
+        self.core = make_core(environment, config.evaluation_episodes, same | fed)
 
     def score(self, model: PPO) -> dict[str, float]:
         """Return :data:`METRICS` of the present policy, means over the episodes; the training notices nothing."""
