@@ -173,3 +173,12 @@ def test_an_option_given_twice_is_refused(capsys):
     """The parser would take the last one and drop the others without a word."""
     assert cli.main(["train", "WLR-Velocity-v0", "--set", "total_steps=1000", "--set", "seed=1"]) == 2
     assert "--set is given twice; all its values go behind one: --set FIRST SECOND" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")
+@pytest.mark.parametrize("words", ["envs", "--help", "effects"])
+def test_output_onto_a_full_disk_ends_in_one_line(words):
+    code = "import sys; from wlr_gym.cli import main; sys.exit(main(sys.argv[1:]))"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code, words], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "wlr: output: cannot be written: No space left on device\n")

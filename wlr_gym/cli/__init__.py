@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import _thread
 import contextlib
+import errno
 import gc
 import importlib
 import keyword
@@ -81,12 +82,25 @@ def guarded(dispatch: Callable[[list[str]], int], words: Sequence[str]) -> int:
         finally:
             print(end="", flush=True)  # here, where it can be caught; at its end Python could only complain
     except BrokenPipeError:  # nobody reads the output any more: wlr ... | head; or it is another pipe, and our error
-        try:
-            print(flush=True)  # only writing tells, where nothing is left to be flushed
-        except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return FAILED
-        raise
+        if _output_is_open():
+            raise
+        return FAILED
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        _say(f"{error.filename or 'output'}: cannot be written: {error.strerror}", "red")
+        _output_is_open()
+        return FAILED
+
+
+def _output_is_open() -> bool:
+    """Whether what is printed is still written; where it is not, nothing of it is, and Python does not complain at its end."""
+    try:
+        print(flush=True)  # only writing tells, where nothing is left to be flushed
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
 
 
 def _answered(dispatch: Callable[[list[str]], int], words: list[str]) -> int:
