@@ -12,6 +12,7 @@ from wlr_gym.hardware.config import SafetyLimits, load_hardware
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator.line import NO_TIME
 from wlr_gym.hardware.safety import rules
+from wlr_gym.hardware.safety.status import ratings_of
 from wlr_gym.hardware.servos import JointMap
 from wlr_gym.robot import JOINTS, LEGS, load_robot
 from wlr_gym.robot.parameters import Parameters
@@ -100,7 +101,7 @@ def test_current_mode_gives_the_goal_current_to_a_stalled_leg():
 
 def seconds_until(rule, share, robot, limits):
     """s until ``rule`` stops a robot whose leg servos say ``share`` of the data sheet's stall current; None = never."""
-    ratings, memory = rules.ratings_of(robot, 0.02), rules.Memory()
+    ratings, memory = ratings_of(robot, 0.02), rules.Memory()
     counts = np.r_[np.full(4, share * 4.4 / CURRENT_COUNT), np.zeros(4)]
     effort = JointMap(robot, HARDWARE).effort(counts, np.zeros(8))
     for tick in range(200):
@@ -122,7 +123,7 @@ def test_the_current_limit_counts_true_amperes():
     limits = SafetyLimits(current=10.0, load=1.0)
     assert seconds_until("current", 0.56, EMANUAL, limits) is None  # 4 x 2.46 A
     assert seconds_until("current", 0.58, EMANUAL, limits) == pytest.approx(limits.current_time, abs=0.04)
-    ratings = rules.ratings_of(EMANUAL, 0.02)
+    ratings = ratings_of(EMANUAL, 0.02)
     stalled = np.abs(ratings.currents.current(ratings.stall_torque, np.zeros(8))).sum()
     assert stalled == pytest.approx(23.2)  # "eight stalled take 23"
 

@@ -60,6 +60,21 @@ MATRIX = {
     "encoder_frozen wheel": ("encoder_frozen wheel_lf", "off"),
     "encoder_jump": ("encoder_jump leg_rr", "off"),
     "encoder_jump wheel": ("encoder_jump wheel_rr value=2", "off"),
+    "encoder_jump small": ("encoder_jump leg_rr value=0.153", "off"),
+    "encoder_gain": ("encoder_gain leg_lf value=0.3", "off"),
+    "encoder_gain half": ("encoder_gain leg_rf value=0.5", "off"),
+    "encoder_gain wheel": ("encoder_gain wheel_rf value=0.3", "off"),
+    "encoder_drift": ("encoder_drift leg_lr", "off"),
+    "encoder_reversed": ("encoder_reversed leg_lf", "off"),
+    "encoder_reversed wheel": ("encoder_reversed wheel_lr", "off"),
+    "motor_reversed": ("motor_reversed leg_rf", "off"),
+    "motor_reversed wheel": ("motor_reversed wheel_rf", "off"),
+    "current_stuck": ("current_stuck leg_rr value=300", "off"),
+    "late_answers": ("late_answers value=0.006", "off"),
+    "eeprom_worn": ("eeprom_worn", "runs"),
+    "imu_axis_dead": ("imu_axis_dead value=2", "off"),
+    "imu_axis_constant": ("imu_axis_constant value=5", "off"),
+    "imu_axis_saturated": ("imu_axis_saturated value=0", "off"),
     "slow_servo": ("slow_servo leg_lf", "off"),
     "slow_servo wheel": ("slow_servo wheel_rf value=0.02", "off"),
     "limit_changed": ("limit_changed leg_rf", "off"),
@@ -70,13 +85,17 @@ MATRIX = {
 }
 #: s that an overheating or a sagging supply takes until its limit, and a stop in good order after that.
 SLOW = {"overheat": 1.4, "sag": 1.1, "overload": 0.6, "imu dead": 0.6, "imu unplugged": 0.6, "imu silent": 0.6}
-SLOW |= {"imu_frozen": 0.6, "imu_stale": 0.6}
+SLOW |= {"imu_frozen": 0.6, "imu_stale": 0.6, "current_stuck": 0.2}
+SLOW |= {"imu_axis_dead": 0.6, "imu_axis_constant": 0.6, "imu_axis_saturated": 0.6}
 #: Faults that may pass a start: they are over, or harmless, before torque comes on.
 PASSING = ("overheat", "sag", "brownout", "overload")
+PASSING += ("encoder_jump small", "encoder_gain", "encoder_gain half", "encoder_gain wheel")
 PASSING += ("torque_lost", "torque_lost wheel", "encoder_jump", "encoder_jump wheel")
 #: Faults of one joint, s until torque is off (a joint that does not follow must first be asked to), and how far it may move.
 JOINT_FAULTS = {"torque_lost": 0.03, "encoder_jump": 0.03, "encoder_frozen": 0.36, "encoder_frozen wheel": 0.8}
 JOINT_FAULTS |= {"reboot_matching_tick": 0.45, "duplicate_id": 0.45, "limit_changed": 0.45}
+JOINT_FAULTS |= {"encoder_gain": 0.2, "encoder_gain wheel": 0.8, "encoder_drift": 0.8}
+JOINT_FAULTS |= {"encoder_reversed": 0.1, "motor_reversed": 0.1}
 JOINT_FAULTS |= {"slow_servo": 0.9, "slow_servo wheel": 1.5}
 LEG_BOUND, LEG_BOUND_TIME, TRAVEL_BOUND = 0.1, 0.1, 0.035
 LONG = {"overheat": 2.2, "sag": 2.2, "slow_servo": 2.2}

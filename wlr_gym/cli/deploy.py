@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from wlr_gym.hardware.deployment import Deployment
     from wlr_gym.hardware.loop import ControlLoop
     from wlr_gym.hardware.operator import DrivingPad, Keys
-    from wlr_gym.hardware.safety.rules import RobotStatus
+    from wlr_gym.hardware.safety.status import RobotStatus
     from wlr_gym.physics.floor import Floor
     from wlr_gym.physics.plants.base import RobotOptions
 
@@ -439,7 +439,8 @@ class RobotView:
 
 def supervised(loop: ControlLoop, status: RobotStatus) -> str:
     """Return what the safety rules look at, each with its limit."""
-    from wlr_gym.hardware.safety.rules import ratings_of, tilt_of
+    from wlr_gym.hardware.safety.rules import tilt_of
+    from wlr_gym.hardware.safety.status import ratings_of
 
     limits = loop.limits
     load = np.abs(status.effort) / ratings_of(loop.robot, loop.pacer.period).stall_torque

@@ -65,8 +65,13 @@ class SafetyLimits(SettingsModel):
         1.5, "of no-load speed", "largest joint speed that is believed; more, twice, is a fault", ge=1.0, le=10.0
     )
     jump_noise: float = _limit(0.03, "rad", "sensor noise that is allowed on top of it", ge=0.0, le=0.5)
-    frozen_leg: float = _limit(0.03, "rad", "way a leg should have gone while its reading stayed the same", gt=0.0, le=0.5)
-    frozen_wheel: float = _limit(0.5, "rad", "way a wheel should have gone meanwhile", gt=0.0, le=6.3)
+    frozen_leg: float = _limit(0.02, "rad", "way that a leg's motor has gone and its reading has not", gt=0.0, le=0.5)
+    frozen_wheel: float = _limit(
+        0.5, "rad", "way that a wheel's setpoint or motor has gone, and its reading not", gt=0.0, le=6.3
+    )
+    line_noise: float = _limit(
+        0.01, "of no-load speed", "speed by which voltage and current may tell another one than the encoder", gt=0.0, le=0.5
+    )
     leg_error: float = _limit(
         0.2, "rad", "distance of a leg from its setpoint, without coming nearer, that may last", gt=0.0, le=1.6
     )

@@ -25,6 +25,10 @@ Counts = tuple[int, int, int]
 
 #: One g as the MPU-6050's data sheet counts it, m/s2.
 STANDARD_GRAVITY = 9.80665
+#: Axes of the chip, in the order of :attr:`ImuReading.counts`.
+IMU_AXES = tuple(f"{sensor} {axis}" for sensor in ("accelerometer", "gyroscope") for axis in "xyz")
+#: Counts at the ends of an axis' range.
+COUNT_ENDS = (-32768, 32767)
 
 
 class ImuGoneError(ConnectionError):
@@ -39,6 +43,7 @@ class ImuReading:
     accelerometer: Array  #: (3,) m/s2, specific force (+9.81 on z at rest)
     temperature: float  #: degC, of the chip
     age: float  #: s since the sensor was read; grows when nothing new comes
+    counts: tuple[int, ...] = ()  #: (6,) as the chip gave them, along its own axes: :data:`IMU_AXES`
 
 
 @dataclass
@@ -64,7 +69,8 @@ def accel_per_count(accel_range: int) -> float:
 
 def to_counts(values: ArrayLike, per_count: float) -> Counts:
     """Return three SI values as counts, clipped to the sensor's range as the sensor does."""
-    x, y, z = (round(min(max(value / per_count, -32768.0), 32767.0)) for value in np.asarray(values, np.float64).tolist())
+    low, high = COUNT_ENDS
+    x, y, z = (round(min(max(value / per_count, low), high)) for value in np.asarray(values, np.float64).tolist())
     return x, y, z
 
 
@@ -94,7 +100,7 @@ class Conversion:
         force = self._accel_scale * (counts[:3] * self._accel_count - self._accel_offset)
         rate = counts[4:] * self._gyro_count - self._gyro_bias
         celsius = burst[3] / 340.0 + 36.53  # register map
-        return ImuReading(self._to_body @ rate, self._to_body @ force, celsius, age)
+        return ImuReading(self._to_body @ rate, self._to_body @ force, celsius, age, (*burst[:3], *burst[4:]))
 
     def counts(self, accelerometer: ArrayLike, gyro: ArrayLike) -> tuple[Counts, Counts]:
         """Return what the chip counts at a specific force (m/s2) and a rate (rad/s) in the body frame."""

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from wlr_gym.hardware.flow import FlowStream
 from wlr_gym.hardware.flow_comparison import FlowSupervision
 from wlr_gym.hardware.imu import STANDARD_GRAVITY, Imu, ImuGoneError, ImuReading, make_imu
 from wlr_gym.hardware.safety.camera import CameraWatch, camera_statistics
+from wlr_gym.hardware.safety.joints import is_far, possible_way, unseen
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.preflight import NotReadyError
-from wlr_gym.hardware.safety.rules import VERTICAL_BAND, Mask, RobotStatus, next_up, reach, tilt_of, unseen
+from wlr_gym.hardware.safety.rules import VERTICAL_BAND, next_up, tilt_of
+from wlr_gym.hardware.safety.status import Array, Mask, RobotStatus
 from wlr_gym.hardware.serial_frames import SharedPorts
 from wlr_gym.hardware.servos import JointReadings, ServoRegisters, Servos
 from wlr_gym.hardware.timing import Clock, MonotonicClock
@@ -159,6 +161,7 @@ class Sensing:
             gyro=reading.gyro,
             accelerometer=reading.accelerometer,
             imu_silence=reading.age,
+            imu_counts=reading.counts,
             up=up,
             flow=None if self._flow is None else self._flow.first(),
         )
@@ -201,7 +204,7 @@ class Sensing:
         else:
             gyro, force = reading.gyro, reading.accelerometer
             up = next_up(before.up, gyro, force, elapsed)
-            status = replace(status, gyro=gyro, accelerometer=force, imu_silence=reading.age, up=up)
+            status = replace(status, gyro=gyro, accelerometer=force, imu_silence=reading.age, up=up, imu_counts=reading.counts)
         if self._flow is not None:
             status = replace(status, flow=self._flow.next(status.position, status.velocity, before.gyro, elapsed))
         if link.camera is not None and self.watch is not None:
@@ -212,15 +215,18 @@ class Sensing:
 
     def _next_joints(self, before: RobotStatus, now: float) -> RobotStatus:
         limiter = self._limiter
-        readings, hidden, possible = self._read_possible(before)
-        far = is_far(readings, before, possible)
+        readings, hidden, ways = self._read_ways(before)
+        far = readings.answered & is_far(*ways)
         is_far_again = far & before.suspect
         if (far & ~before.suspect).any() or not (readings.answered.all() or before.silence.any()):
             # once, while there is time: a lost packet costs nothing then, and a jump is true or not
-            again, hidden, possible = self._read_possible(before)
-            is_far_again |= far & is_far(again, before, possible)
-            readings = filled(readings, again, (far | ~readings.answered) & again.answered)
-            far = is_far(readings, before, possible)
+            again, hidden, ways_again = self._read_ways(before)
+            fill = (far | ~readings.answered) & again.answered
+            far_again = again.answered & is_far(*ways_again)
+            is_far_again |= far & far_again
+            readings = filled(readings, again, fill)
+            far = np.where(fill, far_again, far)
+            ways = Ways(*(np.where(fill, these, those) for these, those in zip(ways_again, ways, strict=True)))
         good = readings.answered & ~far
         silence = before.silence + (now - before.time)
         self.count += 1
@@ -246,22 +252,27 @@ class Sensing:
             broken=limiter.broken_packets - self._broken,
             suspect=far,
             unseen=hidden,
-            jump=np.where(is_far_again & far, readings.position - before.position, 0.0),
+            jump=np.where(is_far_again & far, ways.way, 0.0),
+            reach=np.abs(ways.told) + ways.off,
         )
 
-    def _read_possible(self, before: RobotStatus) -> tuple[JointReadings, np.ndarray, np.ndarray]:
-        """Read the joints; return also for how long (8,) in s they were not seen, and how far (8,) in rad they can have turned.
+    def _read_ways(self, before: RobotStatus) -> tuple[JointReadings, Array, Ways]:
+        """Read the joints; return also for how long (8,) in s they were not seen, and what ways they made and can have made.
 
         By the time at which the answers are there: a program may wait long before it is given the processor to ask.
         """
-        readings = self._limiter.read()
-        hidden = unseen(self._limiter.ratings, before, self._clock.now())
-        return readings, hidden, reach(self._limiter.limits, self._limiter.ratings, hidden)
+        limiter, readings = self._limiter, self._limiter.read()
+        hidden = unseen(limiter.ratings, before, self._clock.now())
+        possible = possible_way(limiter.limits, limiter.ratings, before, readings, hidden)
+        return readings, hidden, Ways(readings.position - before.position, *possible)
 
 
-def is_far(readings: JointReadings, before: RobotStatus, possible: np.ndarray) -> Mask:
-    """Return which joints (8,) say that they are further away from where they were than is possible (8,), rad."""
-    return readings.answered & (np.abs(readings.position - before.position) > possible)
+class Ways(NamedTuple):
+    """Ways of the joints since they were last read, (8,) in rad: read, told by their speeds, and how far that may be off."""
+
+    way: Array
+    told: Array
+    off: Array
 
 
 def filled(readings: JointReadings, again: JointReadings, fill: Mask) -> JointReadings:

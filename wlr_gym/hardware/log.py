@@ -23,7 +23,8 @@ from wlr_gym.data.format import CAMERA, COLUMNS, COMMANDS, RunMeta
 from wlr_gym.data.runs import note_robot, write_meta
 from wlr_gym.data.sensors import LIVE_CAMERA, channels, sensed_columns
 from wlr_gym.hardware.link import Link
-from wlr_gym.hardware.safety.rules import Decision, RobotStatus
+from wlr_gym.hardware.safety.rules import Decision
+from wlr_gym.hardware.safety.status import RobotStatus
 from wlr_gym.physics.plants.base import SENSOR_LAYOUT, Sensors
 from wlr_gym.robot import JOINTS, WHEEL_SLICE, Robot
 

@@ -36,7 +36,8 @@ from wlr_gym.hardware.log import RunRecorder, sensors_of
 from wlr_gym.hardware.operator import Operator
 from wlr_gym.hardware.safety.limiter import CommandLimiter
 from wlr_gym.hardware.safety.preflight import NotReadyError
-from wlr_gym.hardware.safety.rules import REQUESTS, Decision, Level, RobotStatus, Verdict, resting
+from wlr_gym.hardware.safety.rules import REQUESTS, Decision, Level, Verdict, resting
+from wlr_gym.hardware.safety.status import RobotStatus
 from wlr_gym.hardware.safety.watchdog import Guard
 from wlr_gym.hardware.timing import Clock, Pacer
 from wlr_gym.physics.plants.base import RobotOptions, Sensors

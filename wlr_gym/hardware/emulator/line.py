@@ -99,6 +99,8 @@ class BusLine:
     ) -> Iterator[Emission]:
         """Put answers on the wire one after the other; the adapter passes them on in USB packets."""
         held: list[tuple[float, bytes]] = []  # (delay by a fault, bytes) of the USB packet being filled
+        late = self._faults.active(now, "late_answers", [self.name])
+        latency = self.timing.usb_latency if late is None else late.value
         for k, (servo, raw) in enumerate(answers):
             waits = self.timing.wire and (k == 0 or raw.startswith(protocol.HEADER))
             pause = servo["return_delay_time"] * 2e-6 if waits else 0.0
@@ -108,7 +110,7 @@ class BusLine:
             if sum(len(data) for _, data in held) >= USB_PACKET:
                 yield from (Emission(start + delay, data) for delay, data in held if data)
                 held = []
-        yield from (Emission(start + self.timing.usb_latency + delay, data) for delay, data in held if data)
+        yield from (Emission(start + latency + delay, data) for delay, data in held if data)
         self._busy_until = start
 
     def apply_faults(self, now: float) -> None:
@@ -130,9 +132,14 @@ class BusLine:
                 servo.write(servo.table["torque_enable"].address, b"\0")
             if "limit_changed" in values:
                 servo.set("goal_pwm", round(values["limit_changed"]))
-            servo.shaft.strength = values.get("slow_servo", 1.0)
-            servo.shaft.offset = values.get("encoder_jump", 0.0)
-            servo.shaft.is_frozen = "encoder_frozen" in values
+            servo.is_worn = "eeprom_worn" in values
+            shaft = servo.shaft
+            shaft.strength = -1.0 if "motor_reversed" in values else values.get("slow_servo", 1.0)
+            shaft.offset = values.get("encoder_jump", 0.0)
+            backwards = -1.0 if "encoder_reversed" in values else 1.0
+            shaft.gain = 0.0 if "encoder_frozen" in values else backwards * values.get("encoder_gain", 1.0)
+            shaft.drift = values.get("encoder_drift", 0.0)
+            shaft.stuck = round(values["current_stuck"]) if "current_stuck" in values else None
 
     # ---- who answers ----
 
@@ -168,7 +175,10 @@ class BusLine:
             error, data = _carry_out(servo, packet)
             is_silent = packet.id == BROADCAST and packet.instruction != Instruction.PING
             if level >= _ANSWER_LEVEL.get(packet.instruction, 2) and not is_silent:
-                answers.append((servo, protocol.encode_status(own, error | alert, data)))
+                raw = protocol.encode_status(own, error | alert, data)
+                if answers and answers[-1][0]["id"] == own:  # two servos of one id speak at the same time: zeros win
+                    raw = bytes(byte & other for byte, other in zip(answers.pop()[1], raw, strict=False))
+                answers.append((servo, raw))
         return answers
 
 

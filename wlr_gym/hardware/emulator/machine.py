@@ -38,7 +38,7 @@ from wlr_gym.hardware.emulator.faults import Fault, FaultBoard, parse_fault
 from wlr_gym.hardware.emulator.line import BusLine, Emission, LineTiming
 from wlr_gym.hardware.emulator.servo import FIRMWARE, EmulatedServo, MotorDrive
 from wlr_gym.hardware.flow import FULL_QUALITY, FlowConversion
-from wlr_gym.hardware.imu import IDENTITY, Conversion
+from wlr_gym.hardware.imu import IDENTITY, Conversion, Counts
 from wlr_gym.hardware.serial_frames import (
     FIRMWARE_VERSION,
     FLOW_FRAMES,
@@ -156,7 +156,8 @@ class Machine:
         self._imu = Conversion(hardware.imu)
         self._frames = 0
         self._paused = 0.0
-        self._imu_values = (0, 0, 0), (0, 0, 0)
+        self._imu_values: tuple[Counts, Counts] = (0, 0, 0), (0, 0, 0)
+        self._imu_last = [0] * 6
         self._imu_frame = IMU_FRAMES.encode((0, 0, 0, 0, 0, _IMU_TEMPERATURE, 0, 0, 0))
         self.servos: dict[str, EmulatedServo] = {joint: self._make_servo(joint) for joint in JOINTS}
         servos = list(self.servos.values())
@@ -240,15 +241,28 @@ class Machine:
         self._frames += 1
         stamp = self._frames / self.hardware.imu.rate + self._paused
         if not self.faults.active(self.time, "imu_frozen", ["imu"]):
-            force, (x, y, z) = self._imu.counts(sensors.accelerometer[0], sensors.gyro[0])
-            # the chip's last bit never rests, also where the plant's sensors have no noise
-            self._imu_values = force, (x, y, z if self.options.sensor_noise else z + self._frames // DITHER % 2)
-        force, rate = self._imu_values
+            counts = self._imu.counts(sensors.accelerometer[0], sensors.gyro[0])
+            # the chip's last bits never rest, also where the plant's sensors have no noise
+            bit = 0 if self.options.sensor_noise else self._frames // DITHER % 2
+            (a, b, c), (x, y, z) = counts
+            self._imu_values = (a + bit, b + bit, c + bit), (x + bit, y + bit, z + bit)
+        force, rate = self._imu_values = self._lying_axes(*self._imu_values)
         if not self.faults.active(self.time, "imu_stale", ["imu"]):
             self._imu_frame = IMU_FRAMES.encode((self._frames, round(stamp * 1e6), *force, _IMU_TEMPERATURE, *rate))
         raw, delay = self.faults.mangle(self.time, self._imu_frame, ["imu"])
         if raw and not self.faults.happens(self.time, "dead", ["imu"]):
             self._send("imu", [Emission(self.time + delay, raw)])
+
+    def _lying_axes(self, force: Counts, rate: Counts) -> tuple[Counts, Counts]:
+        """Return the counts of the IMU with those of axes that lie (a fault)."""
+        kinds = {"imu_axis_dead": 0, "imu_axis_saturated": 32767, "imu_axis_constant": None}
+        counts = [*force, *rate]
+        for kind, lie in kinds.items():
+            if fault := self.faults.active(self.time, kind, ["imu"]):
+                axis = min(round(fault.value), 5)
+                counts[axis] = self._imu_last[axis] if lie is None else lie
+        self._imu_last = counts
+        return (counts[0], counts[1], counts[2]), (counts[3], counts[4], counts[5])
 
     # ---- the adapters ----
 
@@ -498,14 +512,14 @@ class PlantCoupling:
     def _voltage_setpoint(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> tuple[float, tuple[float, ...]]:
         """Return the setpoint that makes the plant put a mode's voltage on the motor, and the gains that do it."""
         self._own_voltage[k] = self._voltage(k, drive, servo)
-        voltage = self._sign[k] * self._own_voltage[k]
+        voltage = self._sign[k] * self._own_voltage[k] * math.copysign(1.0, servo.shaft.strength)
         if _IS_LEG[k]:
             return self._sign[k] * (servo.shaft.true_position - self._zero[k]) + voltage, _LEG_CARRIER
         return self._sign[k] * servo.shaft.true_velocity + voltage, _WHEEL_CARRIER
 
     def _voltage(self, k: int, drive: MotorDrive, servo: EmulatedServo) -> float:
         """Return the voltage (V, encoder frame) of a law the plant has not got, and move its profile on by a tick."""
-        shaft, supply, step = servo.shaft, servo.shaft.strength * self.supply, self.plant.options.control_period
+        shaft, supply, step = servo.shaft, abs(servo.shaft.strength) * self.supply, self.plant.options.control_period
         if not self._own_law[k]:
             self._reference[:, k] = shaft.reference()
             self._own_law[k] = True
@@ -554,13 +568,14 @@ class PlantCoupling:
         for servo, p, v, strain in columns:
             shaft = servo.shaft
             shaft.load, shaft.voltage = strain, volt
-            shaft.move(p, v)
+            shaft.move(p, v, self.plant.options.control_period)
 
     def _output_of(self, k: int) -> tuple[int, float]:
         """Return counts of current or load, and part of the supply, of motor ``k``; worked out when a register is read."""
         if self._output is None:
             effort, velocity = self._sign * self.sensors.joint_effort[0], self._sign * self.sensors.joint_velocity[0]
-            counts = np.rint((effort + self._torque[0] * self._idle_effort * velocity) / self._effort_count)
+            turned = np.array([math.copysign(1.0, servo.shaft.strength) for servo in self._servos])  # -1: swapped wires
+            counts = np.rint(turned * (effort + self._torque[0] * self._idle_effort * velocity) / self._effort_count)
             constant, resistance = self._nominal_line
             inferred = resistance / constant * effort + constant * velocity  # the plant does not tell its voltage
             voltage = np.where(self._own_law, self._own_voltage, inferred)

@@ -186,22 +186,26 @@ class Shaft:
     #: Asks for the counts of Present Current or Present Load, and for the part of the supply on the motor, -1 to 1.
     output: Callable[[], tuple[int, float]] = lambda: (0, 0.0)
     reference: Callable[[], tuple[float, float]] = lambda: (0.0, 0.0)  #: asks where the profile generator stands: rad, rad/s
-    offset: float = 0.0  #: rad that the encoder is off: a fault
-    is_frozen: bool = False  #: the encoder repeats its reading: a fault
-    strength: float = 1.0  #: part of the supply that reaches the motor
+    # Faults of the encoder: what it says, also to the servo's own control loop.
+    offset: float = 0.0  #: rad that the reading is off
+    gain: float = 1.0  #: part of the motion that is counted; 0 = frozen, -1 = backwards
+    drift: float = 0.0  #: rad/s by which the reading runs away
+    missed: float = 0.0  #: rad that gain and drift have made of it so far
+    # Faults of motor and current sensor.
+    strength: float = 1.0  #: part of the supply that reaches the motor; -1 = its wires are swapped
+    stuck: int | None = None  #: counts of current or load that are repeated; None = they are measured
 
     @property
     def is_well(self) -> bool:
         """Whether the encoder says what is, and the motor gets what it should."""
-        return self.offset == 0.0 and not self.is_frozen and self.strength == 1.0
+        return (self.offset, self.gain, self.drift, self.strength) == (0.0, 1.0, 0.0, 1.0)
 
-    def move(self, position: float, velocity: float) -> None:
-        """Take what the physics made of the shaft, rad and rad/s."""
+    def move(self, position: float, velocity: float, step: float) -> None:
+        """Take what the physics made of the shaft in ``step`` s, rad and rad/s."""
+        missed = self.missed + (self.gain - 1.0) * (position - self.true_position) + self.drift * step
+        self.missed = 0.0 if self.is_well else missed
         self.true_position, self.true_velocity = position, velocity
-        if self.is_frozen:
-            self.velocity = 0.0
-        else:
-            self.position, self.velocity = position + self.offset, velocity
+        self.position, self.velocity = position + self.offset + self.missed, self.gain * velocity + self.drift
 
 
 @dataclass(frozen=True)
@@ -274,6 +278,7 @@ class EmulatedServo(Registers):
         shaft: written by the physics before :meth:`advance`.
         temperature: degC; a reboot does not cool the motor. heating_rate: degC/s that a fault adds.
         dead: no power at the electronics: silent, motor off.
+        is_worn: its EEPROM keeps nothing that is written: a fault.
     """
 
     def __init__(self, name: str, table: ControlTable, eeprom: Mapping[str, int], firmware: int = FIRMWARE) -> None:
@@ -281,7 +286,7 @@ class EmulatedServo(Registers):
         self.firmware = firmware
         self.shaft: Shaft = Shaft(voltage=table.supply)
         self.temperature, self.heating_rate = AMBIENT, 0.0
-        self.dead = False
+        self.dead = self.is_worn = False
         self._drive: MotorDrive | None = None
         self._frame = EncoderFrame(table)
         super().__init__(table, self._make_present_values(table))
@@ -363,6 +368,8 @@ class EmulatedServo(Registers):
 
     def _apply(self, item: Item, count: int) -> None:
         name = item.name
+        if item.in_eeprom and self.is_worn:
+            return
         if name == "torque_enable":
             self._torque(bool(count))
             return
@@ -529,7 +536,7 @@ class EmulatedServo(Registers):
         return {
             "realtime_tick": lambda: int(self._clock * 1000 + 1e-6) % 32768,
             "present_pwm": lambda: self._frame.direction * round(shaft.output()[1] * full_pwm),
-            table.effort: lambda: self._frame.direction * shaft.output()[0],
+            table.effort: lambda: shaft.stuck if shaft.stuck is not None else self._frame.direction * shaft.output()[0],
             "present_velocity": lambda: self._frame.direction * round(shaft.velocity / speed),
             "present_position": lambda: self._frame.count(shaft.position),
             "velocity_trajectory": lambda: self._frame.direction * round(shaft.reference()[1] / speed),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wlr_gym.hardware.camera.reading import CameraReading
-from wlr_gym.hardware.safety.rules import CameraStatus
+from wlr_gym.hardware.safety.status import CameraStatus
 from wlr_gym.hardware.timing import percentiles
 from wlr_gym.robot import CORNER_SIGNS, LEG_SLICE, WHEEL_SLICE, Robot
 

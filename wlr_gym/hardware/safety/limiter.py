@@ -19,7 +19,8 @@ from wlr_gym.hardware.config import Hardware
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError
 from wlr_gym.hardware.safety import preflight, rules
 from wlr_gym.hardware.safety.preflight import Check, NotReadyError
-from wlr_gym.hardware.safety.rules import Decision, Level, Memory, RobotStatus
+from wlr_gym.hardware.safety.rules import Decision, Level, Memory
+from wlr_gym.hardware.safety.status import RobotStatus, ratings_of
 from wlr_gym.hardware.servos import JointReadings, Servos
 from wlr_gym.hardware.timing import Clock
 from wlr_gym.robot import JOINTS, LEGS, WHEELS, Robot
@@ -94,7 +95,7 @@ class CommandLimiter:
         self.setpoints = np.zeros(len(JOINTS))
         self.torque_on = np.zeros(len(JOINTS), bool)
         self._clock = clock
-        self.ratings = rules.ratings_of(robot, period)
+        self.ratings = ratings_of(robot, period, hardware.measured.load_per_pwm)
         self._memory = Memory()
         self.armed = self.is_calm = False
         speed = min(self.limits.leg_speed, CALM_SPEED * self.limits.start_speed)
@@ -140,7 +141,8 @@ class CommandLimiter:
         self._memory = Memory()
         self.__servos.set_patience(max(CALM_PATIENCE, self.limits.patience))
         low, high = self._register_limits()
-        self.ratings = rules.ratings_of(self.robot, self.ratings.period, low=low, high=high)
+        measured = self.hardware.measured.load_per_pwm
+        self.ratings = ratings_of(self.robot, self.ratings.period, measured, low=low, high=high)
         if not self.dry_run:
             goal_pwm = self._prepare()
             self.ratings = replace(

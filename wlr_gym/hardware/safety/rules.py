@@ -3,50 +3,32 @@
 :func:`decide` puts them together once per control step: take the request, count how long things have been beyond their limits,
 judge, limit. :mod:`wlr_gym.hardware.safety.limiter` carries its decisions out. Limits are the hardware file's.
 
-Servos and sensors that fail without an error bit are found by what they say: registers that are not what was written, readings
-no motor can have made, readings that stand still where motion is expected, joints that stay away from their setpoints.
+Servos and sensors that fail without an error bit are found by what they say: :mod:`wlr_gym.hardware.safety.joints` and
+:mod:`wlr_gym.hardware.safety.imu`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from wlr_gym.data.format import Profile
 from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.dynamixel.tables import error_names
-from wlr_gym.hardware.flow import FlowReading
 from wlr_gym.hardware.imu import STANDARD_GRAVITY
-from wlr_gym.hardware.servos import UNREAD, ServoRegisters
-from wlr_gym.physics.servo import CurrentLaw, current_law
-from wlr_gym.robot import JOINTS, LEGS, Robot
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-_N = len(JOINTS)
-_IS_LEG = np.arange(_N) < len(LEGS)
+from wlr_gym.hardware.safety.imu import ImuMemory, judge_imu, remember_imu
+from wlr_gym.hardware.safety.joints import JointMemory, judge_joints, remember_joints
+from wlr_gym.hardware.safety.status import IS_LEG, Array, Mask, Ratings, RobotStatus, between, each
+from wlr_gym.robot import JOINTS
 
 #: s over which the accelerometer corrects the gyroscope's vertical.
 VERTICAL_TIME = 0.5
 #: m/s2 that the accelerometer may differ from gravity while it is used for that.
 VERTICAL_BAND = 2.0
-#: Part of the no-load speed by which a healthy motor may be off the line between stall torque and no-load speed ...
-LINE_ERROR = 0.05
-#: ... and part of its torque's share of that line: resistance grows with temperature, constants are nominal.
-LINE_SLOPE_ERROR = 0.3
-#: rad by which a reading that stands still may rattle, 3 counts, and rad/s that it then shows.
-RATTLE, RATTLE_SPEED = 0.005, 0.25
-#: rad/s below which a wheel's setpoint need not move it: it may be less than its friction for long.
-CREEP = 0.05
-#: s in which the wheels' velocity loop follows.
-WHEEL_LAG = 0.25
-#: Part of the no-load speed: a leg that comes nearer to its setpoint faster than this follows it.
-CLOSING = 0.2
 
 
 # ---- what is known, and what is said about it ----
@@ -76,115 +58,18 @@ FINE = Verdict(Level.DRIVE, "", "")
 REQUESTS = ("stop", "emergency stop")
 
 
-def _each(value: float) -> Callable[[], NDArray[Any]]:
-    """Return what makes an array of a value for each joint (8,)."""
-    return lambda: np.full(_N, value)
-
-
-@dataclass(frozen=True)
-class CameraStatus:
-    """What the camera says."""
-
-    pose: Array = field(default_factory=lambda: np.zeros(3))  #: (3,) believed last: m, rad (unwrapped), from the start
-    time: float = 0.0  #: s at which it was exposed; the run's start before the first
-    is_new: bool = False  #: it came in this control step
-    reason: str = ""  #: why no pose comes; empty = nothing is wrong
-    is_wrong: bool = False  #: there are poses, and they contradict the robot's other sensors: they are kept back
-    doubt: str = ""  #: what is not known of the camera that its poses suffer from; empty = nothing
-
-
-@dataclass(frozen=True)
-class RobotStatus:
-    """What is known of the robot at a control step. Arrays are in joint order."""
-
-    time: float  #: s
-    position: Array  #: (8,) rad, last good readings
-    velocity: Array  #: (8,) rad/s
-    effort: Array  #: (8,) N m
-    silence: Array  #: (8,) s since the joint's last good reading; 0 = it answered in this step
-    alert: Mask  #: (8,) hardware error
-    restarted: Mask  #: (8,) rebooted since the last reading
-    voltage: Array  #: (8,) V, as last read
-    temperature: Array  #: (8,) degC, as last read
-    gyro: Array  #: (3,) rad/s, body frame
-    accelerometer: Array  #: (3,) m/s2, body frame
-    imu_silence: float  #: s since the IMU's last reading
-    up: Array  #: (3,) the vertical in the body frame
-    late_ticks: int = 0  #: control steps in a row that started a period late or more
-    late_share: float = 0.0  #: of the last second's
-    operator_silence: float = 0.0  #: s since the operator's last sign
-    idle: float = 0.0  #: s for which nothing was sent to the servos
-    lost: str = ""  #: ports that are gone, in words
-    trouble: str = ""  #: why log or terminal failed
-    asked_to_stop: str = ""  #: why a stop was asked for
-    asked_off: str = ""  #: why torque is to go off at once
-    broken: int = 0  #: packets with a wrong checksum since all joints answered last
-    flow: FlowReading | None = None  #: of the optical-flow sensor in this step; None = the robot has none
-    registers: ServoRegisters = UNREAD  #: of the servos, as last read
-    suspect: Mask = field(default_factory=_each(False))  #: (8,) the last reading was impossible, and is not confirmed
-    unseen: Array = field(default_factory=_each(0.0))  #: (8,) s not seen before the last answer, or the first impossible
-    jump: Array = field(default_factory=_each(0.0))  #: (8,) rad that readings jumped for good, beyond a motor; 0 = not
-    camera: CameraStatus | None = None  #: what the camera says; None = there is none
-
-
-@dataclass(frozen=True)
-class Ratings:
-    """Ratings of the robot's motors, and what its servos' registers allow."""
-
-    leg_limits: tuple[float, float]  #: rad, of the robot file
-    stall_torque: Array  #: (8,) N m
-    no_load_speed: Array  #: (8,) rad/s
-    currents: CurrentLaw  #: of torques and rates
-    period: float  #: s of a control step
-    supply: float  #: V that these hold at
-    low: Array = field(default_factory=_each(-np.inf))  #: (8,) rad and rad/s, lowest setpoints that the servos' registers take
-    high: Array = field(default_factory=_each(np.inf))  #: (8,) and highest
-    watchdog: float = np.nan  #: count that Bus Watchdog is armed with
-    goal_pwm: Array = field(default_factory=_each(np.nan))  #: (8,) counts that Goal PWM is set to
-    pwm_share: Array = field(default_factory=_each(1.0))  #: (8,) part of the supply that this is
-    profile: Profile = field(default_factory=Profile)  #: of the servos
-
-
-def ratings_of(robot: Robot, period: float, **registers: Any) -> Ratings:
-    """Return the ratings of a robot; ``registers``: what its servos' registers allow (:class:`Ratings`)."""
-    leg, wheel = robot.servo.leg, robot.servo.wheel
-    return Ratings(
-        leg_limits=robot.leg_limits,
-        stall_torque=np.repeat([leg.stall_torque, wheel.stall_torque], 4),
-        no_load_speed=np.repeat([leg.no_load_speed, wheel.no_load_speed], 4),
-        currents=current_law(robot),
-        period=period,
-        supply=robot.servo.supply_voltage,
-        **registers,
-    )
-
-
-@dataclass(frozen=True)
-class JointMemory:
-    """What lasts from step to step of joints and IMU."""
-
-    still_at: Array = field(default_factory=_each(np.nan))  #: (8,) rad, reading since which only the encoder's last bits differ
-    position: Array = field(default_factory=_each(np.nan))  #: (8,) rad, last read
-    velocity: Array = field(default_factory=_each(np.nan))  #: (8,) rad/s; a leg that turns back may repeat one, not both
-    ramp: Array = field(default_factory=_each(0.0))  #: (8,) rad/s, speed that the wheels' profile asks for by now; legs 0
-    reference: Array = field(default_factory=_each(0.0))  #: (8,) rad/s, speed that the wheels should have by now; legs 0
-    unmoved: Array = field(default_factory=_each(0.0))  #: (8,) rad a joint should have moved since then
-    away: Array = field(default_factory=_each(0.0))  #: (8,) s for which a joint has stayed away from its setpoint
-    imu: Array = field(default_factory=lambda: np.full(6, np.nan))  #: (6,) last rates and specific forces
-    imu_same: float = 0.0  #: s for which they have not changed at all
-
-
 @dataclass(frozen=True)
 class Memory:
     """What lasts from step to step: how long (s) things have been beyond their limits, and more."""
 
-    loaded: Array = field(default_factory=_each(0.0))
+    loaded: Array = field(default_factory=each(0.0))
     current: float = 0.0
     sagged: float = 0.0
     tilted: float = 0.0
     tilting: float = 0.0
-    torque_on: Mask = field(default_factory=_each(True))  #: (8,) motors that are on
+    torque_on: Mask = field(default_factory=each(True))  #: (8,) motors that are on
     joints: JointMemory = field(default_factory=JointMemory)
+    imu: ImuMemory = field(default_factory=ImuMemory)
 
 
 class Decision(NamedTuple):
@@ -222,7 +107,7 @@ def decide(
         wanted: setpoints asked for: anything; only eight finite numbers are taken.
         torque_on: (8,) motors that are to be on; setpoints of the others are not looked at. None = all.
     """
-    on = np.ones(_N, bool) if torque_on is None else np.asarray(torque_on, bool)
+    on = np.ones(len(JOINTS), bool) if torque_on is None else np.asarray(torque_on, bool)
     setpoints, refusal = take_request(wanted, on, status.position, previous)
     memory = remember(limits, ratings, status, memory, previous)
     found = list(judge(limits, ratings, status, memory))
@@ -231,10 +116,10 @@ def decide(
     if level == Level.COAST:
         setpoints = previous
     elif level >= Level.HOLD:
-        setpoints = np.where(_IS_LEG, previous, 0.0)
+        setpoints = np.where(IS_LEG, previous, 0.0)
     start = np.where(on, previous, resting(status.position))
-    hottest = np.nanmax(status.temperature, initial=-np.inf)
-    wheel_share = float(np.clip((limits.hot - hottest) / (limits.hot - limits.warm), 0.0, 1.0))
+    hottest = float(np.fmax.reduce(status.temperature, initial=-np.inf))
+    wheel_share = min(1.0, max(0.0, (limits.hot - hottest) / (limits.hot - limits.warm)))
     setpoints, limited = limit_setpoints(limits, ratings, setpoints, start, status.position, wheel_share)
     return Decision(level, setpoints, on, verdicts, limited if level == Level.DRIVE else {}, replace(memory, torque_on=on))
 
@@ -244,7 +129,7 @@ def decide(
 
 def resting(position: Array) -> Array:
     """Return setpoints (8,) that ask for no motion: legs where they are, wheels still."""
-    return np.where(_IS_LEG, position, 0.0)
+    return np.where(IS_LEG, position, 0.0)
 
 
 def take_request(wanted: object, on: Mask, position: Array, previous: Array) -> tuple[Array, Verdict | None]:
@@ -253,8 +138,8 @@ def take_request(wanted: object, on: Mask, position: Array, previous: Array) -> 
         setpoints = np.asarray(wanted, np.float64)
     except (TypeError, ValueError):
         return previous, Verdict(Level.STOP, "finite", f"setpoints of type {type(wanted).__name__} are no numbers")
-    if setpoints.shape != (_N,):
-        return previous, Verdict(Level.STOP, "shape", f"setpoints have shape {setpoints.shape}, expected ({_N},)")
+    if setpoints.shape != (len(JOINTS),):
+        return previous, Verdict(Level.STOP, "shape", f"setpoints have shape {setpoints.shape}, expected ({len(JOINTS)},)")
     setpoints = np.where(on, setpoints, resting(position))
     if not np.isfinite(setpoints).all():
         bad = int(np.flatnonzero(~np.isfinite(setpoints))[0])
@@ -270,24 +155,21 @@ def limit_setpoints(
     The slew limit comes last, so no setpoint ever jumps: not even back into range from outside. ``position`` is (8,) rad, as
     last read; ``wheel_share`` is what a hot servo leaves of the wheel speed limit, 1 to 0.
     """
-    low = np.where(_IS_LEG, ratings.leg_limits[0] + limits.leg_margin, -limits.wheel_speed * wheel_share)
-    high = np.where(_IS_LEG, ratings.leg_limits[1] - limits.leg_margin, limits.wheel_speed * wheel_share)
+    low = np.where(IS_LEG, ratings.leg_limits[0] + limits.leg_margin, -limits.wheel_speed * wheel_share)
+    high = np.where(IS_LEG, ratings.leg_limits[1] - limits.leg_margin, limits.wheel_speed * wheel_share)
     low, high = np.maximum(low, ratings.low), np.minimum(high, ratings.high)
     middle = (low + high) / 2.0  # both ends of a range that is inverted: clipping to it would pass a leg's end
     low, high = np.minimum(low, middle), np.maximum(high, middle)
-    inside = np.clip(setpoints, low, high)
-    near = np.clip(inside, position - limits.leg_lead, position + limits.leg_lead)
-    near = np.where(_IS_LEG, np.clip(near, low, high), inside)
-    step = ratings.period * np.where(_IS_LEG, limits.leg_speed, limits.wheel_acceleration)
-    to_low, to_high = np.where(_IS_LEG, (previous - low, high - previous), np.inf)
-    tapered = np.clip(
-        near,
-        previous - step * np.clip(to_low / limits.leg_taper, 0.0, 1.0),
-        previous + step * np.clip(to_high / limits.leg_taper, 0.0, 1.0),
-    )
-    slewed = np.clip(near, previous - step, previous + step)
+    inside = between(low, setpoints, high)
+    near = between(position - limits.leg_lead, inside, position + limits.leg_lead)
+    near = np.where(IS_LEG, between(low, near, high), inside)
+    step = ratings.period * np.where(IS_LEG, limits.leg_speed, limits.wheel_acceleration)
+    to_low, to_high = np.where(IS_LEG, (previous - low, high - previous), np.inf)
+    down, up = (step * between(0.0, way / limits.leg_taper, 1.0) for way in (to_low, to_high))
+    tapered = between(previous - down, near, previous + up)
+    slewed = between(previous - step, near, previous + step)
     # beyond a limit the way back is never barred
-    final = np.where(_IS_LEG & (previous >= low) & (previous <= high), tapered, slewed)
+    final = np.where(IS_LEG & (previous >= low) & (previous <= high), tapered, slewed)
     changes = {"limit": setpoints != inside, "lead": inside != near, "slew": near != slewed, "taper": final != slewed}
     return final, {rule: mask for rule, mask in changes.items() if mask.any()}
 
@@ -302,82 +184,19 @@ def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory
     loaded = np.maximum(memory.loaded + np.where(over, period, -period), 0.0)
     amperes = float(np.abs(ratings.currents.current(status.effort, status.velocity)).sum())
     current = max(memory.current + (period if amperes > limits.current else -period), 0.0)
-    sagging = bool(np.nanmin(status.voltage, initial=np.inf) < limits.low_voltage)
-    tilting = max(tilt_of(status.up), tilt_of(turned(status.up, status.gyro, limits.tilt_horizon))) > limits.tilt
+    sagging = bool(np.fmin.reduce(status.voltage) < limits.low_voltage)
+    tilt = tilt_of(status.up)
+    tilting = max(tilt, tilt_of(turned(status.up, status.gyro, limits.tilt_horizon))) > limits.tilt
     return Memory(
         loaded,
         current,
         memory.sagged + period if sagging else 0.0,
-        memory.tilted + period if tilt_of(status.up) > limits.tilt else 0.0,
+        memory.tilted + period if tilt > limits.tilt else 0.0,
         memory.tilting + period if tilting else 0.0,
         memory.torque_on,
         remember_joints(limits, ratings, status, memory.joints, previous, memory.torque_on),
+        remember_imu(status, memory.imu, period),
     )
-
-
-def remember_joints(
-    limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: JointMemory, previous: Array, torque_on: Mask
-) -> JointMemory:
-    """Return the memory after a step with the setpoints (8,) and motors (8,) of the step before.
-
-    Arrays of joints in ``status`` may be those of several robots, (N, 8).
-    """
-    # driven, heard in this step, and telling their registers
-    seen = torque_on & (status.silence == 0.0) & np.isfinite(status.registers.torque)
-    largest = ratings.no_load_speed * ratings.pwm_share * status.voltage / ratings.supply  # no setpoint makes a wheel faster
-    change = ratings.profile.wheel_acceleration * ratings.period or np.inf
-    asked = np.clip(previous, -largest, largest)
-    ramp = np.where(torque_on & ~_IS_LEG, memory.ramp + np.clip(asked - memory.ramp, -change, change), 0.0)
-    reference = np.where(torque_on, memory.reference + (ramp - memory.reference) * ratings.period / WHEEL_LAG, 0.0)
-    expected = np.where(_IS_LEG, line_speed(ratings, status), np.where(np.abs(reference) > CREEP, reference, 0.0))
-    same = (status.position == memory.position) & (status.velocity == memory.velocity)
-    rattles = (np.abs(status.position - memory.still_at) <= RATTLE) & (np.abs(status.velocity) <= RATTLE_SPEED)
-    moved = seen & ~(same | rattles)
-    unmoved = np.where(moved, 0.0, memory.unmoved + np.where(seen, expected * ratings.period, 0.0))
-    off = seen & is_away(limits, ratings, status, previous, reference)
-    away = np.where(off, memory.away + ratings.period, np.where(seen, 0.0, memory.away))
-    imu = np.concatenate([status.gyro, status.accelerometer])
-    heard = ratings.period if status.imu_silence <= ratings.period else 0.0  # silence has a rule of its own
-    imu_same = memory.imu_same + heard if np.array_equal(imu, memory.imu) else 0.0
-    return JointMemory(
-        np.where(moved, status.position, memory.still_at),
-        status.position,
-        status.velocity,
-        ramp,
-        reference,
-        np.where(torque_on, unmoved, 0.0),
-        np.where(torque_on, away, 0.0),
-        imu,
-        imu_same,
-    )
-
-
-def line_speed(ratings: Ratings, status: RobotStatus) -> Array:
-    """Return the speed (8,) in rad/s that voltage and current of a leg's motor tell; 0 where it may stand.
-
-    A motor turns at ``no-load speed * (voltage share - torque / stall torque)``. So a leg that stands or is blocked draws what
-    keeps this at 0, and one that turns does not, whatever its encoder says. Wheels have no current sensor.
-    """
-    strain = status.effort / ratings.stall_torque
-    share = status.registers.voltage_share * status.voltage / ratings.supply
-    speed = ratings.no_load_speed * (share - strain)
-    unsure = ratings.no_load_speed * (LINE_ERROR + LINE_SLOPE_ERROR * np.abs(strain))
-    return np.nan_to_num(np.sign(speed) * np.maximum(np.abs(speed) - unsure, 0.0))
-
-
-def is_away(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, setpoints: Array, reference: Array) -> Mask:
-    """Return which joints (8,) are away from where, or how fast, they should be, and do not come nearer."""
-    behind = setpoints - status.position
-    comes_nearer = status.velocity * np.sign(behind) > closing_speed(ratings)
-    leg = (np.abs(behind) > limits.leg_error) & ~comes_nearer
-    return np.where(_IS_LEG, leg, np.abs(reference - status.velocity) > limits.wheel_error)
-
-
-def closing_speed(ratings: Ratings) -> Array:
-    """Return the speed (8,) in rad/s above which a leg follows its setpoint; a velocity profile is slower."""
-    speed = CLOSING * ratings.no_load_speed
-    profile = ratings.profile.leg_velocity
-    return np.minimum(speed, 0.5 * profile) if profile > 0.0 else speed
 
 
 # ---- verdicts ----
@@ -401,7 +220,10 @@ def judge(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: M
         yield Verdict(Level.STOP, "computer", status.trouble)
     yield from _judge_answers(limits, status)
     yield from _judge_servos(limits, status, memory)
-    yield from judge_joints(limits, ratings, status, memory.joints, memory.torque_on)
+    for rule, text, is_gentle in judge_joints(limits, ratings, status, memory.joints, memory.torque_on):
+        yield Verdict(Level.STOP if is_gentle else Level.OFF, rule, text)
+    for rule, text, _ in judge_imu(limits, memory.imu):
+        yield Verdict(Level.STOP, rule, text)
     lean = f"{tilt_of(status.up):.2f} rad, turning at {np.linalg.norm(status.gyro[:2]):.1f} rad/s"
     if memory.tilted > limits.tilt_time:
         yield Verdict(Level.OFF, "tilt", f"{lean}, limit {limits.tilt:g}")
@@ -451,100 +273,15 @@ def _judge_servos(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> 
         yield Verdict(Level.STOP, "voltage", f"supply at {lowest:.1f} V, limit {limits.low_voltage:g}")
 
 
-def judge_joints(
-    limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: JointMemory, on: Mask
-) -> Iterator[Verdict]:
-    """Yield what is wrong with joints and IMU.
-
-    A joint that does not do what it is told cannot be stopped by setpoints either: torque goes off at once.
-    """
-    yield from _judge_registers(ratings, status, on)
-    for k in np.flatnonzero(status.jump):
-        reading, possible = status.position[k] + status.jump[k], reach(limits, ratings, status.unseen)[k]
-        text = f"{JOINTS[k]} reads {reading:.2f} rad, {abs(status.jump[k]):.2f} rad from its reading {status.unseen[k]:.3f} s "
-        text += f"before: no motor turns that far (limit {possible:.2f} rad); check horn and encoder, exchange the servo"
-        yield Verdict(Level.OFF, "jump", text)
-    frozen = frozen_limit(limits)
-    for k in np.flatnonzero(is_frozen(limits, memory)):
-        text = f"{JOINTS[k]} reads {status.position[k]:.3f} rad again and again while it should have turned by "
-        text += f"{abs(memory.unmoved[k]):.2f} rad (limit {frozen[k]:g} rad): is it blocked? If not, its encoder has failed: "
-        yield Verdict(Level.OFF, "frozen", text + "exchange the servo")
-    for k in np.flatnonzero(is_lost(limits, ratings, memory)):
-        seconds = f"for {memory.away[k]:.2f} s (limit {error_time(limits, ratings)[k]:.2f} s)"
-        found = f"is at {status.position[k]:.2f} rad, more than {limits.leg_error:g} rad from its setpoint {seconds}"
-        if not _IS_LEG[k]:
-            expected = f"expected {memory.reference[k]:.2f} within {limits.wheel_error:g}"
-            found = f"turns at {status.velocity[k]:.2f} rad/s, {expected} {seconds}"
-        remedy = "is it blocked, or its motor weak? Turn it by hand with torque off, check supply and gears"
-        yield Verdict(Level.OFF, "tracking", f"{JOINTS[k]} {found}: {remedy}")
-    if memory.imu_same > limits.imu_frozen:
-        text = f"imu repeats the same six values for {memory.imu_same:.2f} s (limit {limits.imu_frozen:g} s): "
-        yield Verdict(Level.STOP, "imu frozen", text + "restart its microcontroller, check the wires to the chip")
-
-
-def _judge_registers(ratings: Ratings, status: RobotStatus, on: Mask) -> Iterator[Verdict]:
-    registers, end_others = status.registers, "end other programs on its bus"
-    explained = status.restarted | status.alert  # these have rules of their own
-    for k in np.flatnonzero(np.isfinite(registers.torque) & ~explained & (status.silence == 0.0)):
-        joint, torque, watchdog, pwm = JOINTS[k], registers.torque[k], registers.watchdog[k], registers.goal_pwm[k]
-        if torque != on[k]:
-            text = f"{joint}: Torque Enable is {torque:.0f}, expected {on[k]:d}: it was switched or rebooted by something else"
-            yield Verdict(Level.OFF, "torque", f"{text}; check its supply and cable, {end_others}")
-        elif watchdog >= 0.0 and watchdog != ratings.watchdog:
-            text = f"{joint}: Bus Watchdog is {watchdog:.0f}, expected {ratings.watchdog:.0f}"
-            yield Verdict(Level.STOP, "register", f"{text}: it would not stop if this program died; {end_others}")
-        if torque and pwm != ratings.goal_pwm[k]:
-            text = f"{joint}: Goal PWM is {pwm:.0f}, expected {ratings.goal_pwm[k]:.0f}: something else changed its limit"
-            yield Verdict(Level.STOP, "register", f"{text}; {end_others}")
-
-
-def error_time(limits: SafetyLimits, ratings: Ratings) -> Array:
-    """Return for how long (8,) in s joints may be away; a leg's acceleration profile is given its time, to turn back too."""
-    profile = ratings.profile
-    is_ramped = profile.leg_velocity > 0.0 and profile.leg_acceleration > 0.0
-    more = (profile.leg_velocity + closing_speed(ratings)) / profile.leg_acceleration if is_ramped else np.zeros(_N)
-    return np.where(_IS_LEG, limits.leg_error_time + more, limits.wheel_error_time)
-
-
-def frozen_limit(limits: SafetyLimits) -> Array:
-    """Return by how many rad (8,) a joint should have turned, when it has not moved, at most."""
-    return np.where(_IS_LEG, limits.frozen_leg, limits.frozen_wheel)
-
-
-def is_frozen(limits: SafetyLimits, memory: JointMemory) -> Mask:
-    """Return which joints (..., 8) repeat their reading while they should turn."""
-    return np.abs(memory.unmoved) > frozen_limit(limits)
-
-
-def is_lost(limits: SafetyLimits, ratings: Ratings, memory: JointMemory) -> Mask:
-    """Return which joints (..., 8) have stayed away from their setpoints for too long."""
-    return memory.away > error_time(limits, ratings)
-
-
-# ---- readings that no motor can have made ----
-
-
-def reach(limits: SafetyLimits, ratings: Ratings, seconds: Array) -> Array:
-    """Return how far (8,) in rad joints can have turned in so many seconds (8,)."""
-    return limits.jump_speed * ratings.no_load_speed * seconds + limits.jump_noise
-
-
-def unseen(ratings: Ratings, before: RobotStatus, time: float) -> Array:
-    """Return for how long (8,) in s joints were not seen before an answer at ``time``.
-
-    Not longer than until their first reading that was rejected: what stays impossible must not become possible by waiting.
-    """
-    elapsed = before.silence + np.maximum(time - before.time, ratings.period)
-    return np.where(before.suspect, before.unseen, elapsed)
-
-
 # ---- the vertical ----
 
 
 def turned(up: Array, gyro: Array, time: float) -> Array:
     """Return the vertical in the body frame after turning at ``gyro`` for ``time`` (s)."""
-    moved = up - np.cross(gyro, up) * time
-    return moved / np.linalg.norm(moved)
+    x, y, z = up.tolist()
+    p, q, r = (gyro * time).tolist()
+    moved = np.array([x - q * z + r * y, y - r * x + p * z, z - p * y + q * x])
+    return moved / math.sqrt(moved @ moved)
 
 
 def next_up(up: Array, gyro: Array, accelerometer: Array, time: float) -> Array:
@@ -561,4 +298,4 @@ def next_up(up: Array, gyro: Array, accelerometer: Array, time: float) -> Array:
 
 def tilt_of(up: Array) -> float:
     """Return the angle (rad) between the body's z axis and the vertical."""
-    return float(np.arccos(np.clip(up[2], -1.0, 1.0)))
+    return math.acos(min(1.0, max(-1.0, float(up[2]))))

@@ -17,7 +17,8 @@ from wlr_gym.base.text import quoted
 from wlr_gym.envs.core import Core
 from wlr_gym.envs.tasks.task import having
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.safety.rules import JointMemory, RobotStatus, is_frozen, is_lost, ratings_of, remember_joints
+from wlr_gym.hardware.safety.joints import JointMemory, is_apart, is_lost, remember_joints
+from wlr_gym.hardware.safety.status import RobotStatus, ratings_of
 from wlr_gym.hardware.servos import UNREAD
 from wlr_gym.learning.adaptation.state import AdaptStep, Asked, Progress
 from wlr_gym.learning.adaptation.uncertainty import STATED, TRAINED_SHARE, Family, Uncertainty
@@ -279,7 +280,7 @@ class _Watched:
         """Judge the robots whose episodes go on."""
         core, limits, ratings = self._core, self._limits, self._ratings
         self._memory = remember_joints(limits, ratings, self._status(), self._memory, core.actions.setpoints.copy(), self._on)
-        bad = is_frozen(limits, self._memory) | is_lost(limits, ratings, self._memory)
+        bad = is_apart(limits, self._memory) | is_lost(limits, ratings, self._memory)
         self.stopped |= bad.any(axis=1) & ~(core.terminated | core.truncated)
 
     def _status(self) -> RobotStatus:
