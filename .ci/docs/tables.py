@@ -23,6 +23,7 @@ from studies.bench.adapt import markdown as markdown_of_cases
 from studies.bench.adapt import read_lines
 from studies.bench.decide import markdown as markdown_of_decisions
 from studies.bench.gap import markdown, score_answers
+from studies.bench.lying_sensors import markdown as markdown_of_faults
 from studies.paper.verdicts import verdict_table
 from wlr_gym.base.paths import config_names
 from wlr_gym.data.excitations import EXCITATIONS
@@ -166,6 +167,11 @@ def adapt_table() -> list[str]:
 def decide_table() -> list[str]:
     """Return the robots of ``python -m studies.bench decide`` that were run."""
     return markdown_of_decisions(json.loads((DATA / "decide.json").read_text(encoding="utf-8"))).strip().splitlines()
+
+
+def lying_table() -> list[str]:
+    """Return what becomes of sensors that lie: what ``python -m studies.bench.lying_sensors`` measured."""
+    return markdown_of_faults(json.loads((DATA / "lying_sensors.json").read_text(encoding="utf-8")))
 
 
 def parameter_text(name: str, parameter: EffectParameter) -> str:
@@ -349,6 +355,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "equations": verdict_table,
     "adapt": adapt_table,
     "decide": decide_table,
+    "lying_sensors": lying_table,
     **{f"results_{task}": partial(result_table, task) for task in learning.ROWS},
     "both_simulators": simulator_table,
     **{name: partial(measured_table, name) for name in measured.TABLES},

@@ -17,7 +17,7 @@ import numpy as np
 
 from wlr_gym.cli.options import environment_of
 from wlr_gym.hardware.config import load_hardware
-from wlr_gym.hardware.deployment import deploy, loop_of
+from wlr_gym.hardware.deployment import deploy
 from wlr_gym.hardware.emulator import Machine, MachineOptions
 from wlr_gym.hardware.emulator import link as emulated
 from wlr_gym.hardware.emulator.line import NO_TIME
@@ -30,7 +30,7 @@ from wlr_gym.robot.parameters import Parameters
 ROBOT, HARDWARE = load_robot("emanual"), load_hardware()
 #: Times the file's tolerances that robots differ, sigma that they are cut at, and V of the weakest battery.
 WIDER, CUT, WEAK = 3.0, 2.0, 11.0
-LINE = ("drop legs wheels probability=0.01", "late legs wheels probability=0.05")
+LINE = ("drop legs wheels probability=0.01 after=5", "late legs wheels probability=0.05 after=5")  # the start refuses it
 
 
 def drawn(robot: Robot, rng: np.random.Generator) -> Parameters:
@@ -58,9 +58,10 @@ def drive(policy: str, seed: int, seconds: float, floor: str = "rough") -> tuple
 
     def make(robot: Robot, hardware: Any, effects: Any = None, **options: Any) -> Any:
         machine_options = MachineOptions(timing=NO_TIME, tick=0.002, seed=seed)
-        return emulated.emulated_link(
-            Machine(robot, hardware, machine_options, parameters=drawn(robot, rng), floor=options["floor"])
-        )
+        machine = Machine(robot, hardware, machine_options, parameters=drawn(robot, rng), floor=options["floor"])
+        for fault in LINE:
+            machine.inject(fault)
+        return emulated.emulated_link(machine)
 
     whole, emulated.emulated_robot = emulated.emulated_robot, make
     try:
@@ -69,26 +70,15 @@ def drive(policy: str, seed: int, seconds: float, floor: str = "rough") -> tuple
         core = make_core(environment_of(None, policy), 1, environment_for(policy, keywords))
     finally:
         emulated.emulated_robot = whole
-    loop = loop_of(core)
-    assert isinstance(loop.clock, Machine)
-    machine = loop.clock
-    loop.recorder.phase, phase = (
-        lambda name, reason: (phase(name, reason), name == "running" and _disturb(machine)),
-        loop.recorder.phase,
-    )
     result = deploy(core, make_policy(policy, core.contract()), seed=seed)
     core.close()
     return ("" if result.well else result.reason), result.ticks * 0.02
 
 
-def _disturb(machine: Machine) -> None:
-    for fault in LINE:
-        machine.inject(fault)
-
-
 def main(policy: str, robots: str, seconds: str, path: str) -> None:
     """Drive, and write what stopped how many."""
-    stops, driven, reasons = Counter(), 0.0, []
+    stops: Counter[str] = Counter()
+    driven, reasons = 0.0, []
     for seed in range(int(robots)):
         reason, time = drive(policy, seed, float(seconds))
         driven += time

@@ -33,8 +33,8 @@ COMMISSIONED = HARDWARE.model_copy(
 HOME = np.r_[[1.5, 1.6, 1.5, 1.6], [0.0] * 4]
 _LEGS, _WHEELS = np.r_[[1.0] * 4, [0.0] * 4], np.r_[[0.0] * 4, [1.0] * 4]
 #: s for which a healthy robot is driven before a fault begins, and for which it is driven with it.
-BEFORE, AFTER = 4.0, 10.0
-LOADS = (1.0,)
+BEFORE, AFTER = 3.0, 3.0
+LOADS = (0.5, 1.0, 2.0)
 
 #: Phase -> setpoints (8,) at a time since the start (s).
 PHASES: dict[str, Callable[[float], Array]] = {
@@ -107,7 +107,7 @@ def drive(fault: str, phase: str, load: float, hardware: Hardware = HARDWARE, af
         on = np.array(times)
         end = int(np.flatnonzero(on)[-1]) + 1
     machine.close()
-    return np.array(angles)[:end], np.arange(end) * options.tick, reason
+    return np.array(angles)[:end], options.tick * np.arange(end, dtype=np.float64), reason
 
 
 @cache
@@ -130,16 +130,42 @@ def examine(fault: str, phase: str, load: float) -> Outcome:
     return Outcome(rule, round(float(times[-1]), 3), round(leg, 3), round(way, 4), reason)
 
 
-def main(path: str, only: str = "") -> None:
-    """Write the matrix."""
+def markdown(found: list[dict[str, Any]]) -> list[str]:
+    """Return the documentation's table: a line for each fault."""
+    lines = ["| fault | stopped | rule | torque off after | leg out of its range | tread off its way | where not stopped |"]
+    lines.append("|---|---|---|---|---|---|---|")
+    for fault in dict.fromkeys(row["fault"] for row in found):
+        rows = [row for row in found if row["fault"] == fault]
+        stopped, driven = ([row for row in rows if bool(row["rule"]) is is_stopped] for is_stopped in (True, False))
+        rules = ", ".join(f"`{rule}`" for rule in dict.fromkeys(row["rule"] for row in stopped))
+        cells = [fault, f"{len(stopped)} of {len(rows)}", rules, *(_most(stopped, *of) for of in _COLUMNS)]
+        phases = ", ".join(dict.fromkeys(row["phase"] for row in driven))
+        moved = " and ".join(most for most in (_most(driven, *of) for of in _COLUMNS[1:]) if most not in ("", "0"))
+        lines.append(f"| {' | '.join(cells)} | {phases}{f': {moved} in {AFTER:g} s' if moved else ''} |")
+    return lines
+
+
+#: Number of an outcome, its factor, format and unit.
+_COLUMNS = (("time", 1.0, ".2f", "s"), ("leg", 1.0, ".2f", "rad"), ("way", 1000.0, ".0f", "mm"))
+
+
+def _most(rows: list[dict[str, Any]], name: str, factor: float, form: str, unit: str) -> str:
+    """Return the largest number of some outcomes in words; nothing where there are none, ``0`` where it rounds to that."""
+    most = max((factor * row[name] for row in rows), default=None)
+    if most is None:
+        return ""
+    return f"{most:{form}} {unit}" if float(f"{most:{form}}") else "0"
+
+
+def main(path: str, *loads: str) -> None:
+    """Write the matrix, or its rows of some loads."""
     found: list[dict[str, Any]] = []
     for fault in FAULTS:
         for phase in PHASES:
-            for load in LOADS:
-                if only in fault:
-                    outcome = examine(fault, phase, load)
-                    found.append({"fault": fault, "phase": phase, "load": load, **outcome._asdict()})
-                    print(f"{fault:40} {phase:17} {load:3g} {outcome.rule:15} {outcome.time:6.2f} s {outcome.leg:5.2f} rad "
+            for load in map(float, loads or LOADS):
+                outcome = examine(fault, phase, load)
+                found.append({"fault": fault, "phase": phase, "load": load, **outcome._asdict()})
+                print(f"{fault:40} {phase:17} {load:3g} {outcome.rule:15} {outcome.time:6.2f} s {outcome.leg:5.2f} rad "
                           f"{outcome.way:6.3f} m", flush=True)  # fmt: skip
     with open(path, "w", encoding="utf-8") as file:
         json.dump(found, file, indent=1)

@@ -6,6 +6,7 @@ import re
 import sys
 from functools import partial
 
+import numpy as np
 import pytest
 
 from wlr_gym.base.errors import InputError, MissingPackageError
@@ -61,6 +62,8 @@ def test_a_good_robot_passes(machine, capsys):
         ("overload leg_lf", "leg_lf, hardware error: overload", "reboot it"),
         ("sag value=3", "leg_lf, supply: 9.", "Charge the battery"),
         ("dead imu", "imu, readings: none", "baud rate"),
+        ("imu_axis_dead value=5", "imu, axis: gyroscope z reads 0 counts", "supply and wires of the chip"),
+        ("imu_axis_saturated value=0", "imu, axis: accelerometer x reads 32767 counts", "exchange it"),
     ],
 )
 def test_each_fault_is_named_first_with_its_remedy(machine, capsys, fault, first, remedy):
@@ -97,11 +100,28 @@ def test_a_tilted_robot_and_a_lossy_imu(machine, capsys):
     assert (code, "Look first at imu, losses:" in text) == (0, True)
     assert "0 faults, 1 warning in" in text
     machine.clear()
-    machine.coupling.sensors.accelerometer[0] = [3.0, 0.0, 9.3]
-    machine.plant.step = lambda setpoints, torque: machine.coupling.sensors
+
+    def tilted(setpoints, torque):
+        sensors = machine.coupling.sensors
+        sensors.accelerometer[0] = np.array([3.0, 0.0, 9.3]) + 0.02 * (machine.ticks // 5 % 2)
+        sensors.gyro[0] = 0.001 * (machine.ticks // 5 % 2)
+        return sensors
+
+    machine.plant.step = tilted
     code, text = look(capsys)
     assert (code, "Look first at imu, level:" in text) == (1, True)
     assert "wlr calibrate imu --mounting" in text
+
+
+def test_an_eeprom_that_keeps_nothing_is_called_that(machine, capsys, monkeypatch):
+    machine.servos["leg_lr"].set("return_delay_time", 250)
+    machine.inject("eeprom_worn leg_lr")
+    machine.step()
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    code, text = look(capsys, mend=True)
+    assert code == 0  # it is only slow
+    assert "mended: 0, left: 1" in text
+    assert "leg_lr: return_delay_time was written and did not stick" in text
 
 
 def test_mending_asks_writes_registers_and_looks_again(machine, capsys, monkeypatch):

@@ -122,6 +122,32 @@ def test_an_interrupt_while_torque_goes_off_leaves_none_on(call, monkeypatch):
     assert rig.loop.phase in (Phase.TORQUE_OFF, Phase.FAULT)
 
 
+def test_an_adapter_that_answers_late_is_no_servo_that_does_not_obey():
+    """Its answers come too late for a control step, not for switching off."""
+    rig = Rig()
+    rig.loop.start()
+    rig.inject("late_answers value=0.02")
+    rig.inject("drop wheels duration=0.6")
+    with pytest.raises(Exception, match="silence") as stopped:
+        drive(rig, 2.0, lambda t: square(t, wheels=1.0))
+    assert "CUT THE POWER" not in str(stopped.value)
+    assert not rig.torque().any()
+
+
+def test_a_computer_that_slept_is_called_that():
+    """The servos' clocks went on, its own did not: no servo was rebooted."""
+    rig = Rig()
+    slept = [7.0]
+    rig.link.asleep = lambda: slept[0]
+    rig.loop.start()
+    drive(rig, 0.2)
+    rig.machine.pause(5.0)
+    slept[0] += 5.0
+    with pytest.raises(Exception, match=r"suspend: the computer was suspended for 5\.00 s"):
+        drive(rig, 0.1)
+    assert not rig.torque().any()
+
+
 def test_an_imu_that_is_unplugged_is_silent_and_not_frozen():
     rig = Rig()
     rig.loop.start()

@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from wlr_gym.physics.floor import Floor
     from wlr_gym.physics.plants.base import RobotOptions
 
+#: Part of the control steps in which answers may be missing before it is said at the end.
+MANY_MISSED = 0.05
 #: How a stop begins that an emulated robot in real time owes to a busy computer.
 _LATE = ("deadlines:", "silence:", "idle:", "watchdog:", "imu: no reading", "no answer from", "NoAnswerError:")
 #: s for which the dead-man button of a gamepad may be let go.
@@ -396,6 +398,9 @@ def _report(result: Deployment, loop: ControlLoop, console: Console) -> None:
     else:  # in emulated time nothing takes any
         console.print(steps)
     console.print(f"command limiter, steps: {_counted(loop.interventions)}")
+    if (missed := loop.interventions["silence"]) > MANY_MISSED * statistics["ticks"]:
+        share = f"{missed / statistics['ticks']:.0%} of the steps ({missed} of {statistics['ticks']})"
+        console.print(f"answers were missing in {share}: check cables and latency timers: wlr doctor", style="yellow")
     if camera := statistics.get("camera"):
         console.print(camera_line(camera))
     if written := [result.run] if result.run is not None else loop.recorder.files:

@@ -103,7 +103,7 @@ def examine(link: Link, robot: Robot, hardware: Hardware, options: DoctorOptions
 
 
 def _mend(link: Link, checks: Sequence[Check], console: Console) -> bool:
-    """Say which registers will be written, ask, write; return whether there were any."""
+    """Say which registers will be written, ask, write; return whether any were."""
     from wlr_gym.hardware.safety.preflight import mend, mendable
 
     registers = [(check.where, check.found, *check.fix) for check in mendable(checks) if check.fix]
@@ -114,7 +114,9 @@ def _mend(link: Link, checks: Sequence[Check], console: Console) -> bool:
     wait_for_enter(console, "Nothing moves. Write it?", "write it", "")
     left = mend(link.servos, checks)
     console.print(f"mended: {sum(not check.ok for check in checks) - len(left)}, left: {len(left)}")
-    return True
+    for check in (unkept := mendable(left)):
+        console.print(f"{check.where}: {check.what} was written and did not stick: the servo is worn or locked: exchange it")
+    return len(unkept) < len(registers)
 
 
 def check_policy(source: str, robot: str, has_camera: bool = False) -> list[Check]:

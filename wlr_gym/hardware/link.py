@@ -28,7 +28,7 @@ from wlr_gym.hardware.safety.rules import VERTICAL_BAND, next_up, tilt_of
 from wlr_gym.hardware.safety.status import Array, Mask, RobotStatus
 from wlr_gym.hardware.serial_frames import SharedPorts
 from wlr_gym.hardware.servos import JointReadings, ServoRegisters, Servos
-from wlr_gym.hardware.timing import Clock, MonotonicClock
+from wlr_gym.hardware.timing import Clock, MonotonicClock, time_asleep
 from wlr_gym.robot import JOINTS, Robot
 
 
@@ -43,6 +43,7 @@ class Link:
     finish: Callable[[], None] = lambda: None  #: called after closing
     flow: FlowStream | None = None  #: optical-flow sensor; None = there is none
     camera: CameraReader | None = None  #: above the floor; None = there is none
+    asleep: Callable[[], float] = lambda: 0.0  #: s for which the clock has stood because the computer was suspended
     seed: int | None = None  #: of an emulated robot's noise; None = not one of this process
 
     def _devices(self) -> list[Servos | Imu | FlowStream | CameraReader]:
@@ -78,7 +79,9 @@ def serial_link(robot: Robot, hardware: Hardware, camera: CameraFile | None = No
     ports = SharedPorts()  # one board may have both sensors
     flow = None if port is None or sensor is None else FlowStream(port, sensor, clock.now, ports)
     eye = None if camera is None else LiveCamera(camera, robot, poses)
-    return Link(servos, make_imu(hardware.imu, clock.now, ports), clock, is_serial=True, flow=flow, camera=eye)
+    return Link(
+        servos, make_imu(hardware.imu, clock.now, ports), clock, is_serial=True, flow=flow, camera=eye, asleep=time_asleep
+    )
 
 
 # ---- what is known ----
@@ -111,6 +114,7 @@ class Sensing:
         self._limiter, self._link, self._clock, self._period = limiter, link, link.clock, period
         self.watch: CameraWatch | None = None if link.camera is None else CameraWatch(limiter.robot, link.camera.file.doubt)
         self._flow = None if link.flow is None else FlowSupervision(link.flow, limiter.robot)
+        self._asleep = link.asleep()
         self._broken = 0  # packets until all joints answered last
 
     @property
@@ -147,7 +151,7 @@ class Sensing:
             silent = ", ".join(JOINTS[k] for k in np.flatnonzero(~readings.answered))
             raise NotReadyError(f"no answer from {silent}")
         voltage, temperature = self._limiter.read_health()
-        self.count = 0
+        self.count, self._asleep = 0, self._link.asleep()
         self.status = RobotStatus(
             time=self._clock.now(),
             position=readings.position,
@@ -192,7 +196,7 @@ class Sensing:
         before, now, link = self.known, self._clock.now(), self._link
         elapsed = now - before.time
         try:
-            status = replace(self._next_joints(before, now), lost="")
+            status = replace(self._next_joints(before, now), lost="", asleep=link.asleep() - self._asleep)
         except ConnectionError as error:
             status = replace(before, time=now, lost=str(error))
         try:

@@ -46,6 +46,12 @@ class MonotonicClock:
             time.sleep(left)
 
 
+def time_asleep() -> float:
+    """Return for how many s this computer has been suspended since it booted; 0 where the system does not tell (not Linux)."""
+    boot = getattr(time, "CLOCK_BOOTTIME", None)  # goes on while CLOCK_MONOTONIC stands
+    return 0.0 if boot is None else time.clock_gettime(boot) - time.monotonic()
+
+
 def percentiles(milliseconds: np.ndarray) -> dict[str, float]:
     """Return what 50, 95, 99 and 100 % of the times (ms, one or more) do not exceed: ``p50``, ``p95``, ``p99`` and ``max``."""
     points = np.percentile(milliseconds, (50, 95, 99, 100)).round(3).tolist()

@@ -258,7 +258,14 @@ _SLOW = 1.0
 _LEAN, _LEAN_TIME = 0.1, 0.8
 _STOP = "Do not drive until this is understood: nothing else stops the wheels when this computer dies."
 _LEG_WEAK = "If the test load or stall differs too, the leg is weak or something holds it. Otherwise: "
-_GOAL = "The start-up order (setpoint first, then torque) is right for neither case alone: report it before driving."
+_GIVEN = (
+    "Torque-on drops a setpoint that was written before. Driving is safe if the kept setpoint is dropped, too. If not, joints "
+    "go back to where the last run ended when torque comes on: switch power off and on before each start."
+)
+_KEPT = (
+    "Torque-on takes up the setpoint left from before. Driving is safe if a given setpoint is followed: wlr writes one that "
+    "asks for no motion first. If not, switch power off and on before each start."
+)
 
 
 @stand_test(
@@ -266,10 +273,10 @@ _GOAL = "The start-up order (setpoint first, then torque) is right for neither c
     "What torque-on does to the setpoint",
     "Legs straight down. One leg is to be turned by hand in between, motors off.",
     f"Wheels turn at {_SLOW:g} rad/s, and each leg moves by {_LEAN:g} rad.",
-    StandQuantity("wheel_follows_given", "-", "speed over the setpoint written before torque came on", 0.15, _GOAL),
-    StandQuantity("wheel_follows_kept", "-", "speed over the setpoint left from before torque went off", 0.15, _GOAL),
-    StandQuantity("leg_follows_given", "-", "way over the way asked for before torque came on", 0.2, _LEG_WEAK + _GOAL),
-    StandQuantity("leg_follows_kept", "-", "way over the way back to the setpoint from before torque went off", 0.2, _GOAL),
+    StandQuantity("wheel_follows_given", "-", "speed over the setpoint written before torque came on", 0.15, _GIVEN),
+    StandQuantity("wheel_follows_kept", "-", "speed over the setpoint left from before torque went off", 0.15, _KEPT),
+    StandQuantity("leg_follows_given", "-", "way over the way asked for before torque came on", 0.2, _LEG_WEAK + _GIVEN),
+    StandQuantity("leg_follows_kept", "-", "way over the way back to the setpoint from before torque went off", 0.2, _KEPT),
 )
 def _measure_torque_on(stand: Stand, person: Person) -> None:
     stand.prepare(WHEELS)

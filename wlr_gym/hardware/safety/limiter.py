@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 WATCHDOG_UNIT = 0.02
 #: s an answer may take at least while nothing moves: where no control step waits for it, a slow computer is no dead servo.
 CALM_PATIENCE = 0.05
+#: s an answer to torque off may take at least: an adapter that answers late (16 ms) is no servo that does not obey.
+OFF_PATIENCE = 0.025
 #: Fastest setpoints of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
 CALM_SPEED = 2.0
 #: Times that the watchdogs are written and looked at.
@@ -285,6 +287,7 @@ class CommandLimiter:
             self.armed = False
             return []
         self.__servos.unsupervise()
+        self.__servos.set_patience(max(OFF_PATIENCE, self.limits.patience))  # no control step waits
         left = switch_off(self.__servos, self._clock, self.limits.off_time)
         with contextlib.suppress(ConnectionError):
             # it stays armed where a motor may still be on

@@ -26,7 +26,7 @@ from wlr_gym.hardware.config import FIXED_REGISTERS, Bus, FlowPort, Hardware, Im
 from wlr_gym.hardware.dynamixel.protocol import NoAnswerError, RefusedError, RestlessLineError
 from wlr_gym.hardware.dynamixel.tables import error_names, load_table
 from wlr_gym.hardware.flow import FlowStream
-from wlr_gym.hardware.imu import RELATIVES, STANDARD_GRAVITY, Imu, ImuGoneError, ImuStream
+from wlr_gym.hardware.imu import COUNT_ENDS, IMU_AXES, RELATIVES, STANDARD_GRAVITY, Imu, ImuGoneError, ImuStream
 from wlr_gym.hardware.safety.camera import LARGEST_AGE, LARGEST_SIGMA
 from wlr_gym.hardware.serial_frames import FIRMWARE_VERSION, SENSORS, PortInUseError, is_pseudo_terminal
 from wlr_gym.hardware.servos import JointMap, Servos
@@ -362,6 +362,7 @@ class ImuSamples(NamedTuple):
     accelerometer: NDArray[np.float64]  #: (T, 3) m/s2
     temperature: float  #: degC, mean; NaN without a sample
     seconds: float  #: for which was listened
+    counts: NDArray[np.float64]  #: (T, 6) of the chip's axes: :data:`wlr_gym.hardware.imu.IMU_AXES`
 
 
 def sample_imu(imu: Imu, clock: Clock, seconds: float = _LOOK_TIME) -> ImuSamples:
@@ -374,10 +375,10 @@ def sample_imu(imu: Imu, clock: Clock, seconds: float = _LOOK_TIME) -> ImuSample
         reading = imu.read()
         if reading is not None and imu.statistics.readings > seen:
             seen = imu.statistics.readings
-            rows.append(np.concatenate([reading.gyro, reading.accelerometer, [reading.temperature]]))
-    table = np.array(rows).reshape(-1, 7)
+            rows.append(np.concatenate([reading.gyro, reading.accelerometer, [reading.temperature], reading.counts]))
+    table = np.array(rows).reshape(-1, 13)
     temperature = float(table[:, 6].mean()) if rows else float("nan")
-    return ImuSamples(table[:, :3], table[:, 3:6], temperature, clock.now() - start)
+    return ImuSamples(table[:, :3], table[:, 3:6], temperature, clock.now() - start, table[:, 7:])
 
 
 _LIGHT = "Give it light and a floor with texture, 80 mm or more below it; check its supply, port and wiring."
@@ -390,6 +391,7 @@ _REMEDIES = {
         "readings": "Check its supply, its port and baud rate; a microcontroller must run the firmware that sends the frames.",
         "rate": "Write the rate the microcontroller sends at into the hardware file, or raise its baud rate.",
         "losses": _CABLE,
+        "axis": "It measures nothing: check supply and wires of the chip, power it off and on, else exchange it.",
         "rest": "Keep the robot still and look again.",
         "gyroscope": "Run wlr calibrate imu.",
         "gravity": "Run wlr calibrate imu --poses 6; is accel_range the sensor's?",
@@ -441,6 +443,7 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
         checks.append(_sensor_check("imu", "rate", near, f"{rate:.0f} Hz", f"{port.rate:g} Hz within 10 %"))
     found, few = f"{lost} lost, {errors} broken of {count + lost}", lost + errors <= 0.01 * (count + lost)
     checks.append(_sensor_check("imu", "losses", few, found, "1 % or less"))
+    checks += _check_axes(samples.counts)
     if len(samples.gyro) < 2 or motion(samples.gyro) > GYRO_REST or motion(samples.accelerometer) > ACCEL_REST:
         return [*checks, _sensor_check("imu", "rest", False, "it moves", "a robot that stands still")]
     bias, force = float(np.linalg.norm(samples.gyro.mean(axis=0))), samples.accelerometer.mean(axis=0)
@@ -455,6 +458,15 @@ def check_imu(imu: Imu, port: ImuPort, clock: Clock) -> list[Check]:
         _sensor_check("imu", "gravity", right, f"{length:.2f} m/s2", f"{gravity} within {LARGEST_LENGTH_ERROR:.0%}"),
         _sensor_check("imu", "level", tilt < LARGEST_TILT, f"{math.degrees(tilt):.1f} deg", level, True),
     ]
+
+
+def _check_axes(counts: NDArray[np.float64]) -> Iterator[Check]:
+    """Does every axis move its last bits, inside its range? One that does not measures nothing."""
+    for axis, column in zip(IMU_AXES, counts.T, strict=True):
+        at_end, spread = bool(np.isin(column, COUNT_ENDS).any()), float(np.ptp(column))
+        found = f"{column[-1]:.0f} counts, {'the end of its range' if at_end else f'noise of {spread:.0f}'}"
+        if at_end or spread == 0.0:
+            yield _sensor_check("imu", "axis", False, f"{axis} reads {found}", "noise, inside the range", True)
 
 
 def board_status(imu: ImuStream, clock: Clock) -> dict[str, int] | None:

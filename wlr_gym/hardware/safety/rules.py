@@ -29,6 +29,8 @@ from wlr_gym.robot import JOINTS
 VERTICAL_TIME = 0.5
 #: m/s2 that the accelerometer may differ from gravity while it is used for that.
 VERTICAL_BAND = 2.0
+#: s for which a computer may have been suspended, beyond which two clocks are not read at the same time.
+LONGEST_SLEEP = 0.05
 
 
 # ---- what is known, and what is said about it ----
@@ -210,6 +212,9 @@ def judge(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: M
         yield Verdict(Level.STOP, "stop", status.asked_to_stop)
     if status.lost:
         yield Verdict(Level.OFF, "port", status.lost)
+    if status.asleep > LONGEST_SLEEP:
+        text = f"the computer was suspended for {status.asleep:.2f} s: forbid it meanwhile (systemd-inhibit wlr deploy ...)"
+        yield Verdict(Level.OFF, "suspend", text)
     if status.idle > limits.watchdog:
         text = f"nothing was sent for {status.idle:.2f} s: the servos' watchdog has stopped them, and they refuse setpoints"
         yield Verdict(Level.OFF, "idle", text)
@@ -255,7 +260,7 @@ def _judge_answers(limits: SafetyLimits, status: RobotStatus) -> Iterator[Verdic
 
 
 def _judge_servos(limits: SafetyLimits, status: RobotStatus, memory: Memory) -> Iterator[Verdict]:
-    for k in np.flatnonzero(status.restarted):
+    for k in np.flatnonzero(status.restarted & (status.asleep <= LONGEST_SLEEP)):  # their clocks went on, ours did not
         yield Verdict(Level.OFF, "restart", f"{JOINTS[k]} was rebooted or had no power")
     for k in np.flatnonzero(status.alert):
         bits = status.registers.error[k]

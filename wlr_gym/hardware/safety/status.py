@@ -69,6 +69,7 @@ class RobotStatus:
     late_share: float = 0.0  #: of the last second's
     operator_silence: float = 0.0  #: s since the operator's last sign
     idle: float = 0.0  #: s for which nothing was sent to the servos
+    asleep: float = 0.0  #: s for which the computer was suspended since the start
     lost: str = ""  #: ports that are gone, in words
     trouble: str = ""  #: why log or terminal failed
     asked_to_stop: str = ""  #: why a stop was asked for

@@ -34,6 +34,8 @@ TRY_TIME = 60.0
 KILL_TIME = 5.0
 #: s between looks at whether its parent lives.
 LOOK_TIME = 0.05
+#: s an answer may take: nothing else waits, and an adapter that answers late is no servo that refuses.
+PATIENCE = 0.05
 #: s between tries to switch off.
 _PAUSE = 0.05
 
@@ -156,7 +158,7 @@ def main() -> int:
         text += data
     spec = json.loads(text)
     groups = [
-        BusGroup(name, port, baud_rate, dict.fromkeys(ids, load_table(model)))
+        BusGroup(name, port, baud_rate, dict.fromkeys(ids, load_table(model)), PATIENCE)
         for name, port, baud_rate, model, ids in spec["buses"]
     ]
     os.write(1, b"ready\n")
