@@ -66,6 +66,11 @@ def remember_imu(status: RobotStatus, memory: ImuMemory, period: float) -> ImuMe
     )
 
 
+def is_blind(memory: ImuMemory) -> bool:
+    """Return whether an axis stays at the end of its range: no lean can be told from it."""
+    return any(same > 0.0 and count in COUNT_ENDS for same, count in zip(memory.axis_same, memory.counts, strict=False))
+
+
 def judge_imu(limits: SafetyLimits, memory: ImuMemory) -> Iterator[Finding]:
     """Yield what is wrong with the IMU."""
     remedy = "restart its microcontroller, check the wires to the chip"

@@ -20,7 +20,7 @@ import numpy as np
 from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.dynamixel.tables import error_names
 from wlr_gym.hardware.imu import STANDARD_GRAVITY
-from wlr_gym.hardware.safety.imu import ImuMemory, judge_imu, remember_imu
+from wlr_gym.hardware.safety.imu import ImuMemory, is_blind, judge_imu, remember_imu
 from wlr_gym.hardware.safety.joints import JointMemory, judge_joints, remember_joints
 from wlr_gym.hardware.safety.status import IS_LEG, Array, Mask, Ratings, RobotStatus, between, each
 from wlr_gym.robot import JOINTS
@@ -187,17 +187,18 @@ def remember(limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory
     amperes = float(np.abs(ratings.currents.current(status.effort, status.velocity)).sum())
     current = max(memory.current + (period if amperes > limits.current else -period), 0.0)
     sagging = bool(np.fmin.reduce(status.voltage) < limits.low_voltage)
-    tilt = tilt_of(status.up)
-    tilting = max(tilt, tilt_of(turned(status.up, status.gyro, limits.tilt_horizon))) > limits.tilt
+    imu = remember_imu(status, memory.imu, period)
+    tilt = 0.0 if is_blind(imu) else tilt_of(status.up)
+    ahead = 0.0 if is_blind(imu) else tilt_of(turned(status.up, status.gyro, limits.tilt_horizon))
     return Memory(
         loaded,
         current,
         memory.sagged + period if sagging else 0.0,
         memory.tilted + period if tilt > limits.tilt else 0.0,
-        memory.tilting + period if tilting else 0.0,
+        memory.tilting + period if max(tilt, ahead) > limits.tilt else 0.0,
         memory.torque_on,
         remember_joints(limits, ratings, status, memory.joints, previous, memory.torque_on),
-        remember_imu(status, memory.imu, period),
+        imu,
     )
 
 
