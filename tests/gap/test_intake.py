@@ -12,7 +12,7 @@ from wlr_gym.data import Profile, Run, RunMeta
 from wlr_gym.data.runs import write_run
 from wlr_gym.gap import analyse
 from wlr_gym.gap.analysis import NO_PROFILE
-from wlr_gym.gap.robot.intake import CHECKS, ChannelFault, findings_of, wrapped
+from wlr_gym.gap.robot.intake import CHECKS, ChannelFault, against_profile, findings_of, wrapped
 from wlr_gym.gap.robot.problem import open_robot
 
 
@@ -226,6 +226,17 @@ def test_a_profile_that_the_motion_contradicts_is_a_fault_of_all_runs(quick, goo
     found = findings_of(runs, CHECKS, ROBOT)
     assert [one.kind for one in found] == (["profile"] * 2 if message else [])
     assert message is None or re.search(message, found[1].text)
+
+
+def test_free_wheels_may_change_speed_faster_than_the_profile(quick, tmp_path):
+    rear = ("wheel_lr", "wheel_rr")
+    free = quick.assign(**dict.fromkeys((f"cmd_{wheel}" for wheel in rear), np.nan))
+    turning = 4.0 * np.sin(5.0 * quick["t"])
+    free = free.assign(**{f"vel_{wheel}": turning for wheel in rear})
+    meta = RunMeta(profile=Profile(wheel_acceleration=11.0))
+    driven = free.assign(**{f"cmd_{wheel}": 4.0 * np.sign(turning) for wheel in rear})
+    outcomes = [against_profile(Run(table, meta, tmp_path / "run_01.csv"), "cmd", ROBOT) for table in (free, driven)]
+    assert [isinstance(outcome, ChannelFault) for outcome in outcomes] == [False, True]
 
 
 def test_lost_rows_frames_and_a_noisier_or_scaled_sensor_are_no_fault(good, tmp_path):

@@ -310,7 +310,10 @@ def against_profile(run: Run, channel: str, robot: Robot) -> Outcome:
 
 
 def _share_of_limit(run: Run, joint: str, limit: float) -> Array:
-    """How fast a wheel's rate or a leg's angle changes over :data:`RAMP` rows, over the limit at which its profile changes."""
+    """How fast a wheel's rate or a leg's angle changes over :data:`RAMP` rows, over the limit at which its profile changes.
+
+    Rows without torque tell nothing: the floor may move a free wheel faster.
+    """
     t, goals = run["t"], run[f"cmd_{joint}"].tolist()
     value = rate_of(run, joint) if joint in WHEELS else run[f"pos_{joint}"]
     reference = value.copy()
@@ -318,7 +321,8 @@ def _share_of_limit(run: Run, joint: str, limit: float) -> Array:
         if goals[row] == goals[row]:  # else torque off
             reference[row + 1] = reference[row] + min(max(goals[row] - reference[row], -limit * step), limit * step)
     moved, span = reference[RAMP:] - reference[:-RAMP], limit * (t[RAMP:] - t[:-RAMP])
-    ramp = np.abs(moved) > 0.99 * span
+    driven = np.lib.stride_tricks.sliding_window_view(np.isfinite(run[f"cmd_{joint}"]), RAMP)[:-1].all(1)
+    ramp = driven & (np.abs(moved) > 0.99 * span)
     return np.sign(moved[ramp]) * (value[RAMP:] - value[:-RAMP])[ramp] / span[ramp]
 
 
