@@ -94,7 +94,8 @@ PASSING += ("torque_lost", "torque_lost wheel", "encoder_jump", "encoder_jump wh
 JOINT_FAULTS = {"torque_lost": 0.03, "encoder_jump": 0.03, "encoder_frozen": 0.36, "encoder_frozen wheel": 0.8}
 JOINT_FAULTS |= {"reboot_matching_tick": 0.45, "duplicate_id": 0.45, "limit_changed": 0.45}
 JOINT_FAULTS |= {"encoder_gain": 0.2, "encoder_gain wheel": 1.5}
-JOINT_FAULTS |= {"encoder_reversed": 0.1, "motor_reversed": 0.1}
+JOINT_FAULTS |= {"encoder_gain half": 0.55, "encoder_reversed": 0.1, "motor_reversed": 0.2}
+JOINT_FAULTS |= {"encoder_reversed wheel": 0.65, "motor_reversed wheel": 0.65}  # the ramp asks wheels after 0.42 s
 JOINT_FAULTS |= {"slow_servo": 0.9, "slow_servo wheel": 1.5}
 LEG_BOUND, LEG_BOUND_TIME, TRAVEL_BOUND = 0.1, 0.1, {"encoder_gain": 0.1}
 LONG = {"overheat": 2.2, "sag": 2.2, "slow_servo": 2.2, "encoder_gain": 2.2}
@@ -326,12 +327,12 @@ def test_a_drift_inside_the_servos_loop_is_found_where_a_leg_stands():
     """The servo follows its encoder: the reading stays, and the leg goes."""
     rig = Rig()
     rig.loop.start()
-    rig.drive(2.0, np.r_[DRIVE[:4], [0.0] * 4])
+    rig.drive(6.0, np.r_[DRIVE[:4], [0.0] * 4])  # the motor's line is learned meanwhile
     rig.inject("encoder_drift leg_lr value=0.153")
     begin = true_angles(rig)[2]
     with pytest.raises(StoppedError, match=r"frozen: leg_lr .* its encoder drifts"):
         rig.drive(2.0, np.r_[DRIVE[:4], [0.0] * 4])
-    assert abs(true_angles(rig)[2] - begin) < 0.1
+    assert abs(true_angles(rig)[2] - begin) < 0.14
     assert not rig.torque().any()
 
 

@@ -390,6 +390,7 @@ def test_the_doctor_sees_the_true_rate_whatever_piled_up(clock, memory, stream, 
     checks = {check.what: check for check in check_imu(stream, ImuPort(port="x", rate=200.0), feed)}
     assert 196 <= float(checks["rate"].found.split()[0]) <= 204
     assert checks["losses"].found.startswith("0 lost")
+    del checks["axis"]  # the feed moves one axis only
     assert all(check.ok for check in checks.values()), list(map(str, checks.values()))
 
 

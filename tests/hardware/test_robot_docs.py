@@ -44,7 +44,7 @@ def test_what_the_software_sees_of_the_power_switch():
 
     page = " ".join(ROBOT.split())
     for fault, words in (
-        ("dead legs wheels", "ends after 3.1 s with `{}` and `CUT THE POWER`"),
+        ("dead legs wheels", "ends after 2.6 s with `{}` and `CUT THE POWER`"),
         ("brownout legs wheels", "ends it after 0.4 s with `{}`"),
     ):
         rig = Rig()
@@ -56,5 +56,5 @@ def test_what_the_software_sees_of_the_power_switch():
         reason, _, demand = str(stopped.value).partition("; ")
         assert words.format(reason.partition(":")[0]) in page
         assert demand.startswith("CUT THE POWER") == fault.startswith("dead")
-        assert rig.machine.time - start == pytest.approx(3.1 if demand else 0.4, abs=0.05)
+        assert rig.machine.time - start == pytest.approx(2.6 if demand else 0.4, abs=0.05)
         rig.loop.close()

@@ -423,6 +423,30 @@ def test_a_blocked_leg_with_a_resistance_that_is_off_is_not_frozen(factor):
     assert run(1000, lambda tick: blocked)[0] is rules.FINE
 
 
+@pytest.mark.parametrize("factor", [0.85, 1.15])
+def test_a_leg_that_is_held_after_it_carried_little_is_not_frozen(factor):
+    """What its resistance is at small loads is not taken for sure at large ones."""
+
+    def see(tick):
+        strain = (0.05 if tick < 200 else 0.6) + 0.001 * (tick % 2)
+        return {"effort": at(strain * RATINGS.stall_torque[0], 0), "registers": registers(voltage_share=at(factor * strain, 0))}
+
+    assert run(245, see)[0] is rules.FINE
+
+
+def test_a_wheel_that_stands_once_it_is_told_to_stop_is_not_frozen():
+    """A bump or a weak battery stops it at once, faster than its velocity loop would."""
+    memory, position = Memory(), HOME.copy()
+    for tick in range(200):
+        setpoints, speed = (HOME + at(4.0, 6), 4.0) if tick < 100 else (HOME, 0.0)
+        position = position + at(0.02 * speed, 6)
+        share = registers(voltage_share=at(speed / RATINGS.no_load_speed[6], 6))
+        rolled = status(position=position, velocity=at(speed, 6), registers=share)
+        decision = rules.decide(LIMITS, ARMED, noisy(rolled, tick), memory, setpoints, setpoints)
+        memory = decision.memory
+        assert not decision.verdicts
+
+
 def test_a_leg_whose_motor_turns_and_whose_count_does_not_is_frozen():
     verdict, ticks = run(50, lambda tick: turning(2, 0.0, 0.2), HOME + at(0.2, 2))
     assert (verdict.rule, verdict.level) == ("frozen", Level.OFF)

@@ -446,7 +446,7 @@ class Stand:
         self.operator.is_switching_off = True
         try:
             self.sign_of_life(LONGEST_OFF)
-            left = switch_off(self.servos, self.clock, self.hardware.safety.off_time)
+            left = switch_off(self.servos, self.clock, self.hardware.safety.off_time, CALM_PATIENCE, CALM_PATIENCE)
             with contextlib.suppress(ConnectionError, NoAnswerError, RefusedError):
                 is_off = [joint for joint in JOINTS if joint not in left]
                 for joint in is_off:

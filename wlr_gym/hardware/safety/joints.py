@@ -37,6 +37,8 @@ LEARNED, MARGIN = 0.03, 4.0
 #: Speed and load, parts of the line's ends, at which it is learned fastest; s in which its slopes are learned then, s in which
 #: its doubts fall, and times slower that they rise. Both ends' parts together tell little below the last number.
 FAST, HEAVY, LEARN_TIME, DOUBT_TIME, RISES, LITTLE = 0.1, 0.05, 10.0, 0.7, 5.0, 0.01
+#: s in which a faster motion, or a larger load, counts as learned.
+WIDEN_TIME = 0.4
 #: s in which motor and reading of a leg that agree again are forgiven; a wheel's at once.
 FORGIVEN = 0.5
 #: Readings in a row that must tell the same before anything follows: one may be a spike.
@@ -69,6 +71,8 @@ class JointMemory:
     load_factor: Array = field(default_factory=each(1.0))  #: (8,) learned: load over what the nominal stall torque makes of it
     speed_doubt: Array = field(default_factory=each(np.inf))  #: (8,) part by which the line's speeds may still be off
     load_doubt: Array = field(default_factory=each(np.inf))  #: (8,) part by which its loads may still be off
+    fastest: Array = field(default_factory=each(0.0))  #: (8,) part of the no-load speed up to which that holds
+    heaviest: Array = field(default_factory=each(0.0))  #: (8,) part of the stall torque up to which that holds
     told: Array = field(default_factory=each(0.0))  #: (8,) rad/s, speed that the motor's line tells
     apart: Array = field(default_factory=each(0.0))  #: (8,) rad that motor or setpoint have gone and the reading has not
     current: Array = field(default_factory=each(np.nan))  #: (8,) N m, last current as a torque
@@ -107,9 +111,13 @@ def remember_joints(
     tells = np.isfinite(told)
     gap = np.where(tells, told - speed, 0.0)
     moves, loaded = np.abs(speed), np.abs(load)
-    width = limits.line_noise + ratings.unknown_load + speed_doubt * moves + load_doubt * loaded
+    # no faster and no heavier than it was learned: what is right at small loads need not be so at large ones
+    width = limits.line_noise + ratings.unknown_load + ratings.line_error * (moves + loaded)
+    width -= (ratings.line_error - speed_doubt) * np.minimum(moves, memory.fastest)
+    width -= (ratings.line_error - load_doubt) * np.minimum(loaded, memory.heaviest)
     beyond = full * (gap - between(-width, gap, width))
-    beyond = np.where(~IS_LEG & is_still & (np.abs(reference) > CREEP), reference, beyond)
+    should = between(np.minimum(ramp, 0.0), reference, np.maximum(ramp, 0.0))  # a wheel told to stop may stand at once
+    beyond = np.where(~IS_LEG & is_still & (np.abs(should) > CREEP), should, beyond)
     most = frozen_limit(limits) / SAMPLES
     kept = np.where(beyond != 0.0, 1.0, np.where(IS_LEG, 1.0 - period / FORGIVEN, 0.0))
     apart = memory.apart * kept + between(-most, beyond * period, most)
@@ -137,6 +145,8 @@ def remember_joints(
         load_factor=between(low, memory.load_factor + step * load, high),
         speed_doubt=learned_doubt(speed_doubt, error, teaches * np.minimum(moves / FAST, 1.0)),
         load_doubt=learned_doubt(load_doubt, error, teaches * np.minimum(loaded / HEAVY, 1.0)),
+        fastest=memory.fastest + np.maximum(moves - memory.fastest, 0.0) * teaches / WIDEN_TIME,
+        heaviest=memory.heaviest + np.maximum(loaded - memory.heaviest, 0.0) * teaches / WIDEN_TIME,
         told=np.where(tells, full * told, 0.0),
         apart=np.where(torque_on, np.where(seen, apart, memory.apart), 0.0),
         current=current,

@@ -31,8 +31,10 @@ Array = NDArray[np.float64]
 WATCHDOG_UNIT = 0.02
 #: s an answer may take at least while nothing moves: where no control step waits for it, a slow computer is no dead servo.
 CALM_PATIENCE = 0.05
-#: s an answer to torque off may take at least: an adapter that answers late (16 ms) is no servo that does not obey.
+#: s an answer to torque off may take: an adapter that answers late (16 ms) is no servo that does not obey.
 OFF_PATIENCE = 0.025
+#: Times of it that a servo is waited for in a round: for a quiet line and an answer, of a write and a read.
+OFF_WAITS = 4
 #: Fastest setpoints of legs on the way to the start pose, over ``start_speed``: a minimum-jerk path needs 1.9 of it.
 CALM_SPEED = 2.0
 #: Times that the watchdogs are written and looked at.
@@ -46,19 +48,22 @@ def watchdog_count(seconds: float) -> int:
     return math.ceil(seconds / WATCHDOG_UNIT - 1e-9)
 
 
-def switch_off(servos: Servos, clock: Clock, seconds: float) -> list[str]:
+def switch_off(servos: Servos, clock: Clock, seconds: float, quick: float, patience: float) -> list[str]:
     """Switch every motor off, and go on trying for so long; return the joints that did not confirm it.
 
     All buses at once and unconfirmed first, so that a dead one does not delay the others; then each servo until it has
-    confirmed. A port that is gone is opened again when it is back.
+    confirmed. A port that is gone is opened again when it is back. An answer may take ``quick`` s at first, so that a dead line
+    delays nobody; after a quarter of the time ``patience`` s, while a round of such answers still ends in time.
     """
     for _ in range(2):
         servos.torque_off_unacknowledged()
-    end = clock.now() + seconds
+    begin = clock.now()
     left: list[str] = list(JOINTS)
-    while (left := servos.torque_off(1, left)) and clock.now() < end:
+    while (left := servos.torque_off(1, left)) and (spent := clock.now() - begin) < seconds:
         clock.wait_until(clock.now() + _OFF_PAUSE)
         servos.reopen_gone()
+        is_calm = spent > seconds / 4.0 and spent + OFF_WAITS * len(left) * patience < seconds
+        servos.set_patience(patience if is_calm else quick)
     return left
 
 
@@ -287,8 +292,7 @@ class CommandLimiter:
             self.armed = False
             return []
         self.__servos.unsupervise()
-        self.__servos.set_patience(max(OFF_PATIENCE, self.limits.patience))  # no control step waits
-        left = switch_off(self.__servos, self._clock, self.limits.off_time)
+        left = switch_off(self.__servos, self._clock, self.limits.off_time, self.limits.patience, OFF_PATIENCE)
         with contextlib.suppress(ConnectionError):
             # it stays armed where a motor may still be on
             self.__servos.write_item("bus_watchdog", {joint: 0 for joint in JOINTS if joint not in left})
