@@ -423,6 +423,14 @@ def test_a_blocked_leg_with_a_resistance_that_is_off_is_not_frozen(factor):
     assert run(1000, lambda tick: blocked)[0] is rules.FINE
 
 
+def test_a_wheel_whose_motor_still_brakes_is_not_frozen():
+    """Told to turn back slowly, it stands until the servo's integral has changed its sign."""
+    turn_back = HOME + at(-0.4, 6)
+    for share, found in ((0.05, False), (-0.05, True)):
+        verdict, _ = run(120, lambda tick: {"registers": registers(voltage_share=at(share, 6))}, turn_back)  # noqa: B023
+        assert (verdict.rule == "frozen") is found
+
+
 @pytest.mark.parametrize("factor", [0.85, 1.15])
 def test_a_leg_that_is_held_after_it_carried_little_is_not_frozen(factor):
     """What its resistance is at small loads is not taken for sure at large ones."""

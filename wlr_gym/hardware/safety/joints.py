@@ -117,7 +117,8 @@ def remember_joints(
     width -= (ratings.line_error - load_doubt) * np.minimum(loaded, memory.heaviest)
     beyond = full * (gap - between(-width, gap, width))
     should = between(np.minimum(ramp, 0.0), reference, np.maximum(ramp, 0.0))  # a wheel told to stop may stand at once
-    beyond = np.where(~IS_LEG & is_still & (np.abs(should) > CREEP), should, beyond)
+    # nor does one turn whose motor still brakes: the servo's integral needs its time to change sign
+    beyond = np.where(~IS_LEG & is_still & (np.abs(should) > CREEP) & ~(volts * should < 0.0), should, beyond)
     most = frozen_limit(limits) / SAMPLES
     kept = np.where(beyond != 0.0, 1.0, np.where(IS_LEG, 1.0 - period / FORGIVEN, 0.0))
     apart = memory.apart * kept + between(-most, beyond * period, most)
