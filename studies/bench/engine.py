@@ -68,7 +68,7 @@ def motions(robot: Robot, ticks: int = TICKS) -> list[BenchMotion]:
     def drive(name: str, friction: Array | float, *wheels: Array, legs: bool = False) -> BenchMotion:
         speeds = np.array(wheels)
         angles = robot.home.leg_angle + rng.uniform(-0.3, 0.3, (len(wheels), 4)) * legs
-        return BenchMotion(name, np.full(4, friction), _ramps(np.hstack([angles, speeds]), robot.home.leg_angle, ticks))
+        return BenchMotion(name, np.full(4, friction), ramps(np.hstack([angles, speeds]), robot.home.leg_angle, ticks))
 
     def slide(name: str, friction: float, velocity: tuple[float, float]) -> BenchMotion:
         distance = float(np.square(velocity).sum()) / (2.0 * friction * robot.gravity)
@@ -91,7 +91,7 @@ def motions(robot: Robot, ticks: int = TICKS) -> list[BenchMotion]:
     ]
 
 
-def _ramps(targets: Array, home: float, ticks: int) -> Array:
+def ramps(targets: Array, home: float, ticks: int) -> Array:
     """Return setpoints (ticks, 8) that reach each target in RAMP and hold it for an equal share of the time."""
     share = ticks * PERIOD / len(targets)
     starts = share * np.arange(len(targets))

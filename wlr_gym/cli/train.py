@@ -16,7 +16,8 @@ from wlr_gym.base.text import quoted
 from wlr_gym.cli import OK
 from wlr_gym.cli.options import FloorOption, JsonOption, PatchOption, ProgressOption, Seed, environment_of, refuse_given
 from wlr_gym.cli.terminal import print_json
-from wlr_gym.learning.training import resume_training, run_training, settings_of
+from wlr_gym.envs.registry import task_name_of
+from wlr_gym.learning.training import recipe_of, resume_training, run_training, settings_of
 from wlr_gym.policy import Training, TrainingProgress, find_policy
 
 
@@ -27,7 +28,8 @@ class TrainOptions(ProgressOption, JsonOption, PatchOption, FloorOption):
     agent: str = "ppo"
     """Agent to train: a folder of agents/."""
     config: str | None = None
-    """Settings of the agent: name in configs/agent/ or path of a YAML file; default: the agent's own."""
+    """Settings of the agent: name in configs/agent/ or path of a YAML file; default: of ppo on the tasks that ship those of the
+    shipped policies (ppo_slip_aware; with --robot ppo_slip_aware_no_camera), else the agent's own. Plain PPO: ppo."""
     set: tuple[str, ...] = ()
     """Settings to change, as key=value: --set total_steps=20_000_000 environment.randomization=wide"""
     backend: str | None = None
@@ -97,5 +99,6 @@ def run(options: TrainOptions) -> int:
 
 def default_folder(options: TrainOptions, environment: str, config: dict[str, Any]) -> Path:
     """Return the run folder of a training without ``--out``: its environment, settings and seed."""
-    settings = Path(options.config or options.init or options.agent).stem
+    own = recipe_of(options.agent, task_name_of(environment), options.robot)
+    settings = Path(options.config or options.init or own).stem
     return Path("runs_out") / f"{environment.rpartition(':')[2]}_{settings}_{config.get('seed', 0)}"

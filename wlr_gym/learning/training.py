@@ -46,8 +46,8 @@ def train(
     Args:
         env_id: id of the environment, such as ``WLR-Velocity-v0``, or of a registered task.
         out: run folder to fill; it must be empty or absent.
-        config: settings of the agent: name in ``configs/agent/`` or path of a YAML file; None = the agent's own, with
-            ``init`` those of that policy's training.
+        config: settings of the agent: name in ``configs/agent/`` or path of a YAML file; None = of
+            :func:`recipe_of`, with ``init`` those of that policy's training.
         agent: a folder of ``agents/``.
         settings: changes laid over the settings, such as
             ``{"total_steps": 100_000, "environment": {"randomization": "ice"}}``.
@@ -75,6 +75,22 @@ def train(
     return run_training(agent, Training(env_id, as_path(out), chosen, init=init, **follow))
 
 
+#: Settings of the shipped policies, for the tasks that they name; and the same for robots without camera and optical flow.
+RECIPE, RECIPE_WITHOUT_CAMERA = "ppo_slip_aware", "ppo_slip_aware_no_camera"
+
+
+def recipe_of(agent: str, task: str, robot: RobotSource | None = None) -> str:
+    """Return the settings of a training that names none: of ``ppo`` what ships, where the task has that, else the agent's own.
+
+    Args:
+        agent, task: their names.
+        robot: as for :func:`train`. On one that is named, no sensors are expected that not every robot has.
+    """
+    if agent != "ppo" or task not in load_agent_config(RECIPE)["tasks"]:
+        return agent
+    return RECIPE if robot is None else RECIPE_WITHOUT_CAMERA
+
+
 def settings_of(
     env_id: str,
     config: str | Path | None,
@@ -86,7 +102,7 @@ def settings_of(
     seed: int | None = None,
     robot: RobotSource | None = None,
 ) -> dict[str, Any]:
-    """Return all settings of a training: of ``config``, of the policy to start from, or the agent's own, with what is changed.
+    """Return all settings of a training, with changes: of ``config``, of the policy to start from, or of :func:`recipe_of`.
 
     Args:
         env_id, config, agent, init, settings, seed, robot: as for :func:`train`.
@@ -100,7 +116,7 @@ def settings_of(
     task = task_name_of(env_id)
     load_agent(agent)  # an unknown one is refused as that, not as settings
     if init is None or config is not None:
-        chosen = load_agent_config(config or agent, changes, task)
+        chosen = load_agent_config(config or recipe_of(agent, task, robot), changes, task)
     else:
         chosen = {**agent_function(agent, "settings_to_start_from")(init), "tasks": {}}
         apply_changes(chosen, changes)

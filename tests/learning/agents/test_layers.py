@@ -20,7 +20,7 @@ torch = pytest.importorskip("torch")
 TASK = {"controller": {"steering": 1.6, "velocity_i": 6.0}, "observations": {"velocity_controller": {}}}
 LAYERS = {
     "environment": {"episode_length": 0.2, "observation": "dict", "task": TASK},
-    "normalise": True, "residual": 0.5, "mirror": True, "desired_kl": 0.01, "total_steps": 1200, "learning_rate": 0.01,
+    "normalise": True, "residual": [0.2, 0.5], "mirror": True, "desired_kl": 0.01, "total_steps": 1200, "learning_rate": 0.01,
 }  # fmt: skip
 
 
@@ -71,7 +71,7 @@ def test_policy_is_the_network_that_was_trained(run, core, seen):
     for layer in (0, 2):
         hidden = np.tanh(hidden @ saved[f"{net}.1.{layer}.weight"].T + saved[f"{net}.1.{layer}.bias"])
     added = hidden @ saved["action_net.last.weight"].T + saved["action_net.last.bias"]
-    expected = np.clip(seen[:, columns] + 0.5 * added, -1.0, 1.0)
+    expected = np.clip(seen[:, columns] + np.repeat([0.2, 0.5], 4) * added, -1.0, 1.0)  # of legs and of wheels
     np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert np.abs(added).max() > 1e-3
     assert np.ptp(saved[f"{net}.0.deviation"]) > 0.01
@@ -156,7 +156,9 @@ def test_mirror_image_is_what_a_mirrored_robot_sees():
     from wlr_gym.learning.ppo.networks import mirror_of
 
     level = {"randomization": {"name": "none", "base": "none", "sensor_noise": False}, "observation": "dict"}
-    core = make_core(ENVIRONMENT, 2, {"task": TASK, **level})
+    warped = {"controller": {**TASK["controller"], "warp": 0.05, "turn_lead": 0.1, "warp_rise": 90.0}}
+    task = warped | {"observations": {"velocity_controller": {}, "velocity_memory": {}}}
+    core = make_core(ENVIRONMENT, 2, {"task": task, **level})
     columns = {"policy": core.task.policy, "privileged": core.task.privileged}
     mirrors = {group: mirror_of([column_name(column) for column in some]) for group, some in columns.items()}
     of_action = mirror_of([column.joint for column in core.task.actions])

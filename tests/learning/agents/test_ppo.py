@@ -21,6 +21,7 @@ from wlr_gym.envs import Sb3VecEnv
 from wlr_gym.learning.evaluation.rollout import make_core
 from wlr_gym.learning.ppo.policy import parse_settings
 from wlr_gym.learning.ppo.training import TrainingLog, begin_episodes, make_model
+from wlr_gym.learning.training import recipe_of, settings_of
 from wlr_gym.physics.plants.gibbs_appell.plant import GibbsAppellPlant
 from wlr_gym.policy import Training, load_agent, load_policy, make_policy, read_contract
 
@@ -284,8 +285,18 @@ def test_bad_input_exits_with_2(arguments, message, capsys, tmp_path, monkeypatc
 def test_runs_of_different_settings_have_different_folders():
     from wlr_gym.cli import train as command
 
-    for config, folder in ((None, "WLR-Velocity-v0_ppo_0"), ("ppo_blind", "WLR-Velocity-v0_ppo_blind_0")):
+    for config, folder in ((None, "WLR-Velocity-v0_ppo_slip_aware_0"), ("ppo_blind", "WLR-Velocity-v0_ppo_blind_0")):
         assert command.default_folder(command.TrainOptions(config=config), ENVIRONMENT, {"seed": 0}).name == folder
+
+
+def test_a_training_that_names_no_settings_has_those_of_what_ships(tmp_path):
+    def chosen(**given):
+        return settings_of(ENVIRONMENT, None, given.pop("agent", "ppo"), None, **given)
+
+    assert chosen() == settings_of(ENVIRONMENT, "ppo_slip_aware", "ppo", None)
+    assert chosen(robot="kit") == settings_of(ENVIRONMENT, "ppo_slip_aware_no_camera", "ppo", None, robot="kit")
+    assert chosen(agent="pid") == settings_of(ENVIRONMENT, "pid", "pid", None)
+    assert recipe_of("ppo", "a_task_of_mine") == "ppo"
 
 
 def test_a_full_folder_is_not_overwritten(run, capsys):

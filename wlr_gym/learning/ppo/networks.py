@@ -105,13 +105,13 @@ class Layers:
     Attributes:
         normalise: observations to mean 0 and standard deviation 1.
         controller: columns of the observation with the controller's action; empty = none.
-        residual: what the network adds to it is its output times this.
+        residual: what the network adds to it is its output times this, action by action; empty = no controller.
         residual_share: of that, how much the finished policy adds.
     """
 
     normalise: bool = False
     controller: tuple[int, ...] = ()
-    residual: float = 0.0
+    residual: tuple[float, ...] = ()
     residual_share: float = 1.0
 
 
@@ -168,12 +168,14 @@ class BesideController(nn.Module):
 
 
 class OnTop(nn.Module):
-    """The controller's action plus ``residual`` times what the network adds."""
+    """The controller's action plus ``residual`` (8,) times what the network adds."""
 
-    def __init__(self, last: nn.Linear, residual: float) -> None:
+    residual: torch.Tensor
+
+    def __init__(self, last: nn.Linear, residual: torch.Tensor) -> None:
         super().__init__()
         self.last = last
-        self.residual = residual
+        self.register_buffer("residual", residual, persistent=False)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the mean actions (N, 8)."""
@@ -207,7 +209,7 @@ class LayeredPolicy(ActorCriticPolicy):
             last: Any = self.action_net
             nn.init.zeros_(last.weight)  # at the start the network adds nothing
             nn.init.zeros_(last.bias)
-            self.action_net: nn.Module = OnTop(last, layers.residual)
+            self.action_net: nn.Module = OnTop(last, torch.tensor(layers.residual))
         keywords: dict[str, Any] = {"lr": lr_schedule(1), **self.optimizer_kwargs}
         self.optimizer = self.optimizer_class(self.parameters(), **keywords)
 
@@ -241,12 +243,13 @@ _ROTATIONS = ("gyro", "angular_velocity_in_body", "quaternion")
 #: Labels and terms that are positive to the left.
 _LEFTWARD = {
     "yaw", "yaw_rate", "lateral", "heading", "y", "yaw_rate_integral", "path_curvature", "path_offset", "path_heading",
-    "estimated_yaw", "estimated_yaw_rate", "camera_yaw",
+    "estimated_yaw", "estimated_yaw_rate", "camera_yaw", "warp", "yaw_rate_error", "side_difference", "turn",
 }  # fmt: skip
 #: Labels and terms that the mirror leaves as they are.
 _SAME = {
     "x", "z", "w", "linear_velocity_x", "velocity_integral", "slip_difference", "speed_command", "climb_command",
     "body_clearance", "supply_voltage", "leg_rate", "path_shape", "path_wavelength", "climb_speed", "climb_time",
+    "warp_level", "slip_size", "forward",
     "front_leg_first", "front_leg_second", "rear_leg_first", "rear_leg_second", "mechanical_energy", "electrical_energy",
 }  # fmt: skip
 _SIDES = {"_lf": "_rf", "_rf": "_lf", "_lr": "_rr", "_rr": "_lr"}

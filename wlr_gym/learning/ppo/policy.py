@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from wlr_gym.base.errors import LARGEST_SEED, InputError, require_package
 from wlr_gym.base.settings import SettingsModel, parse_config
 from wlr_gym.policy import contract_of
+from wlr_gym.robot import LEGS, WHEELS
 
 if TYPE_CHECKING:
     import torch
@@ -43,7 +44,8 @@ class PpoConfig(SettingsModel):
             None = the rate falls as ``final_learning_rate`` says.
         hidden_layers, activation: of the networks of policy and value, which share nothing.
         normalise: bring the observations to mean 0 and deviation 1, as the untrained policy meets them, inside the network.
-        residual: the network's output times this is added to the action of the task's ``controller``; None = no controller.
+        residual: the network's output times this is added to the action of the task's ``controller``: of all joints, or of
+            (legs, wheels); None = no controller.
         residual_share: how much of the residual the finished policy adds; all of it in training. Less than 1 shrinks what is
             one seed's own more than what all seeds learn.
         mirror: learn from the left-right mirror image of every other sample.
@@ -77,7 +79,7 @@ class PpoConfig(SettingsModel):
     target_kl: float | None = Field(None, gt=0)
     desired_kl: float | None = Field(None, gt=0)
     normalise: bool = False
-    residual: float | None = Field(None, gt=0)
+    residual: PositiveFloat | tuple[PositiveFloat, PositiveFloat] | None = None
     residual_share: float = Field(1.0, gt=0, le=1)
     mirror: bool = False
     hidden_layers: tuple[PositiveInt, ...] = (64, 64)
@@ -233,6 +235,12 @@ def parse_settings(config: Mapping[str, Any]) -> PpoConfig:
     return parse_config(PpoConfig, dict(config), "agent 'ppo'")
 
 
+def each_joint(given: float | tuple[float, float]) -> tuple[float, ...]:
+    """Return a setting of all joints, or of (legs, wheels), joint by joint."""
+    legs, wheels = given if isinstance(given, tuple) else (given, given)
+    return (legs,) * len(LEGS) + (wheels,) * len(WHEELS)
+
+
 def network_kind(config: PpoConfig, contract: Mapping[str, Any], *, asymmetric: bool = False) -> tuple[Any, dict[str, Any]]:
     """Return the class of the configured network for an environment's contract, and the keywords that make it."""
     from stable_baselines3.common.policies import ActorCriticPolicy
@@ -245,7 +253,8 @@ def network_kind(config: PpoConfig, contract: Mapping[str, Any], *, asymmetric: 
     if not config.normalise and config.residual is None:
         return networks.AsymmetricPolicy if asymmetric else ActorCriticPolicy, keywords
     columns = () if config.residual is None else networks.controller_columns(contract)
-    layers = networks.Layers(config.normalise, columns, config.residual or 0.0, config.residual_share)
+    residual = () if config.residual is None else each_joint(config.residual)
+    layers = networks.Layers(config.normalise, columns, residual, config.residual_share)
     return networks.LayeredAsymmetricPolicy if asymmetric else networks.LayeredPolicy, keywords | {"layers": layers}
 
 

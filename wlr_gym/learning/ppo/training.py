@@ -38,10 +38,17 @@ from wlr_gym.learning.curves import METRICS, CurveFile, best_of, is_better, read
 from wlr_gym.learning.evaluation.metrics import summarise
 from wlr_gym.learning.evaluation.rollout import make_core, roll_out
 from wlr_gym.learning.ppo import networks
-from wlr_gym.learning.ppo.policy import MODEL_FILE, PpoConfig, PpoPolicy, network_kind, parse_settings, with_network_of
+from wlr_gym.learning.ppo.policy import (
+    MODEL_FILE,
+    PpoConfig,
+    PpoPolicy,
+    each_joint,
+    network_kind,
+    parse_settings,
+    with_network_of,
+)
 from wlr_gym.physics.floor import FloorFriction, load_floor
 from wlr_gym.policy import Training, TrainingProgress, fed_environment, read_contract, write_contract
-from wlr_gym.robot import LEGS, WHEELS
 
 #: Control steps over which observations are gathered for their scales.
 GATHERED = 100
@@ -152,10 +159,8 @@ def make_model(env: Sb3VecEnv, config: PpoConfig) -> PPO:
         device="cpu",
         rollout_buffer_class=mirrored if config.mirror else None,
     )
-    noise = config.initial_log_std
-    legs, wheels = noise if isinstance(noise, tuple) else (noise, noise)
     with torch.no_grad():
-        model.policy.get_parameter("log_std").copy_(torch.tensor((legs,) * len(LEGS) + (wheels,) * len(WHEELS)))
+        model.policy.get_parameter("log_std").copy_(torch.tensor(each_joint(config.initial_log_std)))
     if config.mirror:
         networks.set_mirror(model.rollout_buffer, env)
     return model

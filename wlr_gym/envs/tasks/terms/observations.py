@@ -434,7 +434,7 @@ def climb_command(signals: Signals) -> list[Value]:
 #: by how much the front wheels slip more than the rear ones (m/s), where load is shifted.
 MEMORY = ("yaw_rate_integral", "velocity_integral", "slip_difference")
 #: What the term ``<task>_memory`` keeps, where the task has it: of the warp (``Warp`` of the agent), and the step's commands.
-MORE_MEMORY = ("warp", "warp_level", "yaw_rate_error", "slip_difference", "slip_size", "forward", "turn")
+MORE_MEMORY = ("warp", "warp_level", "yaw_rate_error", "side_difference", "slip_size", "forward", "turn")
 #: Where the legs sweep also integrals of the errors of their angles (rad), times their gain.
 LEG_MEMORY = tuple(f"{leg}_integral" for leg in LEGS)
 #: Ends the name of a term that holds a controller's action.

@@ -225,7 +225,7 @@ def kernel_source(features: frozenset[str]) -> str:
         if block == "observe":
             text.append(f"raw[{RAW_LAYOUT.width - 1}] = math.atan2(heading_sine, heading_cosine)")
         lines += [*straight_line_source(f"{block}_of_robot", [*names, *own, *near, "i", "count", *scalars], text), ""]
-        if near:
+        if near or block == "before":
             continue
         signature = "" if block == "features" else _signature(len(own), len(scalars))
         pointers = [f"numbers_of({name})" if block == "features" else f"numbers_of({name}[i])" for name in own]
@@ -238,32 +238,34 @@ def kernel_source(features: frozenset[str]) -> str:
             f"        {block}_of_robot({', '.join([*names, *pointers, 'i', 'count', *scalars])})",
             "",
         ]
-    touch_floor = _TOUCH_FLOOR.format(
-        signature=_signature(0, 1),
+    before = _BEFORE.format(
+        signature=_signature(0, 2),
         room=len(_TOUCHING),
         rows="\n".join(rows),
-        arrays=", ".join([*names, "touching"]),
+        arrays=", ".join(names),
+        scalars=", ".join(name for name in _SCALARS if name in inputs_of(blocks["before"].values())),
         pieces=len(relief.piece_numbers(features)),
     )
-    return "\n".join(["from numba import types", "", *lines, touch_floor])
+    return "\n".join(["from numba import types", "", *lines, before])
 
 
-#: Body and legs on the floor, where they are near it.
-_TOUCH_FLOOR = """
+#: What is done before a step; body and legs on the floor, where they are near it.
+_BEFORE = """
 @compiled({signature}error_model='numpy')
-def touch_floor(table, rows, step):
+def before(table, rows, step, time):
     count, room = len(table), np.zeros({room})
     touching = numbers_of(room)
     for i in rows:
 {rows}
-        nearness_of_robot({arrays}, 0, i, count)
+        before_of_robot({arrays}, i, count, {scalars})
+        nearness_of_robot({arrays}, touching, 0, i, count)
         if room[0] > 0.0:
             if room[1] > 0.0:
-                push_of_base_of_robot({arrays}, 0, i, count)
+                push_of_base_of_robot({arrays}, touching, 0, i, count)
             for piece in range({pieces}):
                 if room[2 + piece] > 0.0:
-                    push_of_piece_of_robot({arrays}, piece, i, count)
-            touch_of_robot({arrays}, 0, i, count, step)
+                    push_of_piece_of_robot({arrays}, touching, piece, i, count)
+            touch_of_robot({arrays}, touching, 0, i, count, step)
 """
 
 

@@ -189,7 +189,6 @@ class MujocoPlant(Simulator):
                 kernel.features(*robots, self._force_inputs)
                 self._formulas.evaluate(self._force_inputs, self._force_values, self._memory, self._generalised, step)
             kernel.before(*robots, step, (substep + 0.5) * step)
-            kernel.touch_floor(*robots, step)
             self._batch.step()
             kernel.after(*robots, step)
         kernel.drift(*robots, -0.5 * step)
