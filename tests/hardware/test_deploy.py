@@ -336,7 +336,7 @@ def test_command_line_dry_run(tmp_path):
         (["--fault", "dorp"], r"--fault: unknown fault 'dorp' \(did you mean 'drop'\?\)"),
         (["--fault", "drop lges"], r"--fault: fault 'drop lges': unknown place 'lges' \(did you mean 'legs'\?\)"),
         (["--realtime", "200"], "--realtime 200: expected 1 to 99"),
-        (["--out", __file__], "--out .*: .*test_deploy.py is a file; expected a folder"),
+        (["--out", __file__], "--out .*test_deploy.py: cannot be a folder: it is a file"),
         (["--mcap", __file__], "--mcap .*test_deploy.py: is there already"),
         (["--hardware", "nominl"], "nominal"),
         (["--effects", "tired_batery"], "did you mean 'tired_battery'"),

@@ -191,7 +191,7 @@ def float32_kernel():
         constant=lambda value: f"np.float32({value!r})",
     )
     head = """
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def run(start, setpoints, limits, accelerations, step, count, out):
     for i in range(start.shape[0]):
         q, w, goal, limit, acceleration = start[i], np.float32(0.0), setpoints[i], limits[i], accelerations[i]

@@ -13,7 +13,7 @@ import numpy as np
 
 from wlr_gym.hardware.config import SafetyLimits
 from wlr_gym.hardware.imu import COUNT_ENDS, IMU_AXES, STANDARD_GRAVITY
-from wlr_gym.hardware.safety.joints import Finding
+from wlr_gym.hardware.safety.joints import Suspicion
 from wlr_gym.hardware.safety.status import Array, RobotStatus
 
 #: s for which an axis may repeat its count: noise of one count, a gyroscope's at 2000 deg/s, repeats 25 by chance in 1e12.
@@ -71,22 +71,22 @@ def is_blind(memory: ImuMemory) -> bool:
     return any(same > 0.0 and count in COUNT_ENDS for same, count in zip(memory.axis_same, memory.counts, strict=False))
 
 
-def judge_imu(limits: SafetyLimits, memory: ImuMemory) -> Iterator[Finding]:
+def judge_imu(limits: SafetyLimits, memory: ImuMemory) -> Iterator[Suspicion]:
     """Yield what is wrong with the IMU."""
     remedy = "restart its microcontroller, check the wires to the chip"
     if memory.same > limits.imu_frozen:
         text = f"imu repeats the same six values for {memory.same:.2f} s (limit {limits.imu_frozen:g} s): "
-        yield Finding("imu frozen", text + remedy)
+        yield Suspicion("imu frozen", text + remedy)
         return
     for axis, count, seconds in zip(IMU_AXES, memory.counts, memory.axis_same, strict=False):
         is_at_end = count in COUNT_ENDS
         if seconds > (limits.imu_frozen if is_at_end else AXIS_TIME):
             what = "the end of its range" if is_at_end else "the same count"
             text = f"imu: its {axis} reads {count} counts, {what}, for {seconds:.2f} s: it measures nothing; exchange the chip"
-            yield Finding("imu axis", text)
+            yield Suspicion("imu axis", text)
     if memory.wrong_length > GRAVITY_LASTS:
         text = f"imu: the mean specific force is {np.linalg.norm(memory.gravity):.1f} m/s2 for {memory.wrong_length:.1f} s, "
-        yield Finding("imu gravity", f"{text}expected {STANDARD_GRAVITY:.1f}: an axis measures wrong; look with wlr doctor")
+        yield Suspicion("imu gravity", f"{text}expected {STANDARD_GRAVITY:.1f}: an axis measures wrong; look with wlr doctor")
     elif memory.wrong_direction > GRAVITY_LASTS:
         text = f"imu: the accelerometer's vertical is {np.linalg.norm(memory.error):.2f} rad off the gyroscope's for "
-        yield Finding("imu gravity", f"{text}{memory.wrong_direction:.1f} s: an axis measures wrong; look with wlr doctor")
+        yield Suspicion("imu gravity", f"{text}{memory.wrong_direction:.1f} s: an axis measures wrong; look with wlr doctor")

@@ -49,7 +49,7 @@ STUCK_TIME = 0.04
 FOLLOWED = 0.03
 
 
-class Finding(NamedTuple):
+class Suspicion(NamedTuple):
     """What is wrong with a joint: the rule, and what was found. Torque goes off, unless it is ``gentle``: then a stop."""
 
     rule: str
@@ -219,7 +219,7 @@ def unseen(ratings: Ratings, before: RobotStatus, time: float) -> Array:
 
 def judge_joints(
     limits: SafetyLimits, ratings: Ratings, status: RobotStatus, memory: JointMemory, on: Mask
-) -> Iterator[Finding]:
+) -> Iterator[Suspicion]:
     """Yield what is wrong with joints.
 
     A joint that does not do what it is told cannot be stopped by setpoints either: torque goes off at once.
@@ -229,7 +229,7 @@ def judge_joints(
         reading = status.position[k] + status.jump[k]
         text = f"{JOINTS[k]} reads {reading:.2f} rad, {abs(status.jump[k]):.2f} rad from its reading {status.unseen[k]:.3f} s "
         text += f"before: no motor turns that far (limit {status.reach[k]:.2f} rad); check horn and encoder, exchange the servo"
-        yield Finding("jump", text)
+        yield Suspicion("jump", text)
     for k in np.flatnonzero(is_apart(limits, memory)):
         yield _explain(limits, memory, int(k))
     for k in np.flatnonzero(is_lost(limits, ratings, memory)):
@@ -239,45 +239,45 @@ def judge_joints(
             expected = f"expected {memory.reference[k]:.2f} within {limits.wheel_error:g}"
             found = f"turns at {status.velocity[k]:.2f} rad/s, {expected} {seconds}"
         remedy = "is it blocked, or its motor weak? Turn it by hand with torque off, check supply and gears"
-        yield Finding("tracking", f"{JOINTS[k]} {found}: {remedy}")
+        yield Suspicion("tracking", f"{JOINTS[k]} {found}: {remedy}")
 
 
-def _explain(limits: SafetyLimits, memory: JointMemory, k: int) -> Finding:
+def _explain(limits: SafetyLimits, memory: JointMemory, k: int) -> Suspicion:
     """Return why motor and reading of a joint came apart."""
     joint, speed, told, way = JOINTS[k], memory.velocity[k], memory.told[k], abs(memory.apart[k])
     limit, remedy = frozen_limit(limits)[k], "exchange the servo"
     if memory.same_current[k] >= STUCK_TIME and IS_LEG[k]:
         text = f"{joint}: its current reads the same for {memory.same_current[k]:.2f} s, and does not explain its motion "
         text += f"({way:.2f} rad, limit {limit:g}): {remedy}; its encoder may be well"
-        return Finding("current sensor", text, gentle=True)
+        return Suspicion("current sensor", text, gentle=True)
     if speed * told < 0.0 and abs(speed) > RATTLE_SPEED:
         text = f"{joint} turns at {speed:.2f} rad/s, its motor at {told:.2f} (by voltage and load): it runs away: encoder or "
-        return Finding("reversed", text + "motor are reversed; check Drive Mode (wlr doctor), " + remedy)
+        return Suspicion("reversed", text + "motor are reversed; check Drive Mode (wlr doctor), " + remedy)
     if memory.is_still[k]:
         text = f"{joint} reads {memory.position[k]:.3f} rad again and again while it should have turned by {way:.2f} rad "
         cause = "is it blocked? If not, its encoder has failed: "
         if IS_LEG[k] and abs(memory.behind[k]) < FOLLOWED:
             cause = "its setpoint is reached, and its motor turns on: its encoder drifts, or its current sensor is off: "
-        return Finding("frozen", f"{text}(limit {limit:g} rad): {cause}{remedy}")
+        return Suspicion("frozen", f"{text}(limit {limit:g} rad): {cause}{remedy}")
     share = "" if not told else f", {abs(speed / told):.0%} of that"
     text = f"{joint} reads {speed:.2f} rad/s{share} while its motor turns at {told:.2f} (by voltage and load), {way:.2f} "
-    return Finding("encoder", f"{text}rad by now (limit {limit:g}): its encoder counts wrong, or it is blocked: {remedy}")
+    return Suspicion("encoder", f"{text}rad by now (limit {limit:g}): its encoder counts wrong, or it is blocked: {remedy}")
 
 
-def _judge_registers(ratings: Ratings, status: RobotStatus, on: Mask) -> Iterator[Finding]:
+def _judge_registers(ratings: Ratings, status: RobotStatus, on: Mask) -> Iterator[Suspicion]:
     registers, end_others = status.registers, "end other programs on its bus"
     explained = status.restarted | status.alert  # these have rules of their own
     for k in np.flatnonzero(np.isfinite(registers.torque) & ~explained & (status.silence == 0.0)):
         joint, torque, watchdog, pwm = JOINTS[k], registers.torque[k], registers.watchdog[k], registers.goal_pwm[k]
         if torque != on[k]:
             text = f"{joint}: Torque Enable is {torque:.0f}, expected {on[k]:d}: it was switched or rebooted by something else"
-            yield Finding("torque", f"{text}; check its supply and cable, {end_others}")
+            yield Suspicion("torque", f"{text}; check its supply and cable, {end_others}")
         elif watchdog >= 0.0 and watchdog != ratings.watchdog:
             text = f"{joint}: Bus Watchdog is {watchdog:.0f}, expected {ratings.watchdog:.0f}"
-            yield Finding("register", f"{text}: it would not stop if this program died; {end_others}", gentle=True)
+            yield Suspicion("register", f"{text}: it would not stop if this program died; {end_others}", gentle=True)
         if torque and pwm != ratings.goal_pwm[k]:
             text = f"{joint}: Goal PWM is {pwm:.0f}, expected {ratings.goal_pwm[k]:.0f}: something else changed its limit"
-            yield Finding("register", f"{text}; {end_others}", gentle=True)
+            yield Suspicion("register", f"{text}; {end_others}", gentle=True)
 
 
 def error_time(limits: SafetyLimits, ratings: Ratings) -> Array:

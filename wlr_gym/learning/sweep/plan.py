@@ -241,8 +241,9 @@ def resolve(plan: SweepPlan) -> SweepPlan:
     agent_function(plan.agent, "train")
     settings = settings_of(plan.environment, plan.config, plan.agent, plan.init, settings=plan.settings)
     early = plan.search is not None and plan.search.early_stopping
-    if early and isinstance(settings.get("total_steps"), int):
-        settings.setdefault("evaluate_every", max(1, settings["total_steps"] // SCORES))
+    named = plan.settings if plan.config is None else settings
+    if early and isinstance(settings.get("total_steps"), int) and "evaluate_every" not in named:
+        settings["evaluate_every"] = max(1, settings["total_steps"] // SCORES)
     init = plan.init if plan.init is None or not Path(plan.init).exists() else str(Path(plan.init).resolve())
     whole = plan.model_copy(update={"config": None, "settings": settings, "init": init})
     drawn = whole.draw(np.random.default_rng(0))
