@@ -169,6 +169,8 @@ _SAME_MOTION = 0.8  # correlation of an angle's turns and its rate's
 _SHOWN = 0.05  # rad, rms over windows: a section in which one of the two turns this far shows their ratio
 _APART = 3.0  # ratio from which on one of the two has another unit; sound sections have 0.87 to 1.05
 _QUICK, _SPREAD = 2.0, 0.05  # of the no-load speed, and rad: steps above are none of the motor's; sound runs reach 0.95
+_STILL = 0.02  # rad; windows that turn less show the offset of a gyroscope that nobody calibrated
+_OLDEST = 0.25  # s: readings repeated for so long are old ones; for longer, those of a robot at rest
 _MOVED = 0.1  # rad or rad/s: a joint that was asked to move this far must show it
 _WINDOW = 0.5  # s: long enough for a turn to stand out of the camera's noise
 _DEGREES = 180 / math.pi
@@ -351,7 +353,11 @@ def _check_pair(table: Table, rate: str, angle: str, where: str) -> None:
     if len(rows) < 20:
         return
     turned, measured = increments(table["t"][rows], table[angle][rows], table[rate][rows])
-    wrong = _wrong_section(turned, measured, rows[: len(turned)]) if not rate.startswith("cmd") else None
+    wrong = None
+    if not rate.startswith("cmd"):
+        still = np.abs(turned) < _STILL
+        bias = np.median(measured[still]) if rate.startswith("gyro") and still.sum() >= _LEAST else 0.0
+        wrong = _wrong_section(turned, measured - bias, rows[: len(turned)])
     ratio, correlation, _ = _compare(turned, measured)
     if correlation >= _SAME_MOTION and not (wrong and wrong[1]):
         if _DEGREES / 2 < ratio < 2 * _DEGREES:
@@ -403,8 +409,13 @@ def find_leap(table: Table, robot: Robot) -> tuple[int, str] | None:
 
     Two recordings in one, units that change and angles that start anew after a turn show as such steps.
     """
-    steps = np.diff(table["t"])
-    steps, found = np.maximum(steps, np.median(steps)), []  # times of single rows may be late
+    steps, found = np.diff(table["t"]), []
+    steps = np.maximum(steps, np.median(steps))  # times of single rows may be late
+    repeated = np.all([np.diff(table[f"pos_{joint}"]) == 0.0 for joint in JOINTS], axis=0)
+    since = steps.copy()  # s since a joint was last read anew
+    for row in np.flatnonzero(repeated[:-1]):
+        since[row + 1] += since[row]
+    steps = np.where(since < _OLDEST, since, steps)
     for joint in JOINTS:
         top = (robot.servo.leg if joint in LEGS else robot.servo.wheel).no_load_speed
         moved = np.abs(np.diff(table[f"pos_{joint}"]))

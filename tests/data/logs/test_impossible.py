@@ -113,3 +113,14 @@ def test_one_late_row_is_no_jump(table, tmp_path):
     times[500] += 0.015
     table.assign(t=times).to_csv(tmp_path / "a.csv", index=False)
     assert import_log(tmp_path / "a.csv", tmp_path / "runs", MAP)
+
+
+def test_old_readings_and_the_bias_of_a_gyroscope_are_no_fault(table, tmp_path):
+    """Joints are read at 12.5 Hz and logged at 50 Hz: a step between two rows is that of four."""
+    old = [f"{kind}_{joint}" for kind in ("pos", "vel") for joint in JOINTS]
+    fast = {f"pos_{wheel}": table[f"pos_{wheel}"] + 6.0 * table["t"] for wheel in WHEELS}
+    fast |= {f"vel_{wheel}": table[f"vel_{wheel}"] + 6.0 for wheel in WHEELS}
+    odd = table.assign(**fast, gyro_z=table["gyro_z"] + 0.3)
+    odd[old] = odd[old].iloc[np.arange(len(odd)) // 4 * 4].to_numpy()
+    odd.to_csv(tmp_path / "a.csv", index=False)
+    assert import_log(tmp_path / "a.csv", tmp_path / "runs", MAP)
