@@ -20,7 +20,7 @@ STEPS = 16_384 if "--quick" in sys.argv else 400_000
 def train(settings):
     changes = {"total_steps": STEPS, "evaluate_every": STEPS // 8, "learning_rate": settings["learning_rate"]}
     with tempfile.TemporaryDirectory() as folder:
-        wlr_gym.train("WLR-Velocity-v0", folder, settings=changes, on_update=lambda now: tune.report(dict(now.held_out)))
+        wlr_gym.train("WLR-Velocity-v0", folder, "ppo", settings=changes, on_update=lambda now: tune.report(dict(now.held_out)))
 
 
 if __name__ == "__main__":
