@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -123,28 +124,41 @@ class _Scene:
 
 
 def _driven(scene: _Scene, side: str, step: float) -> Drive:
-    parameters, state = scene.parameters, scene.state
-    if side == PEER:
-        batch = ServoBatch(_model_with_boxes(scene.robot, parameters, step), parameters)
-        reset, advance = partial(batch.reset, state), partial(batch.step, substeps=round(PERIOD / step))
-        pose = lambda: batch.position[:, :7]  # noqa: E731
-    else:
-        plant = make_plant("gibbs_appell", scene.robot, len(parameters), PlantOptions(physics_step=step, precision=side))
-        reset, advance = partial(plant.reset, parameters=parameters, state=state), plant.step
-        pose = lambda: np.hstack([plant.truth().position, plant.truth().quaternion])  # noqa: E731
+    robots = _in_mujoco(scene, step) if side == PEER else _in_the_engine(scene, side, step)
 
     def drive() -> tuple[Array, float]:
-        reset()
-        poses = np.zeros((len(scene.setpoints), len(parameters), 7))
+        robots.reset()
+        poses = np.zeros((len(scene.setpoints), len(scene.parameters), 7))
 
         def work() -> None:
             for kept, row in zip(poses, scene.setpoints, strict=True):
-                advance(row)
-                kept[:] = pose()
+                robots.step(row)
+                kept[:] = robots.pose()
 
-        return poses, rate(work, len(parameters) * len(poses) * PERIOD)
+        return poses, rate(work, len(scene.parameters) * len(poses) * PERIOD)
 
     return drive
+
+
+class _Robots(NamedTuple):
+    """Robots of one side: how to start anew, advance by a control step, and tell their poses (N, 7)."""
+
+    reset: Callable[[], object]
+    step: Callable[[Array], object]
+    pose: Callable[[], Array]
+
+
+def _in_mujoco(scene: _Scene, step: float) -> _Robots:
+    batch = ServoBatch(_model_with_boxes(scene.robot, scene.parameters, step), scene.parameters)
+    reset, advance = partial(batch.reset, scene.state), partial(batch.step, substeps=round(PERIOD / step))
+    return _Robots(reset, advance, lambda: batch.position[:, :7])
+
+
+def _in_the_engine(scene: _Scene, precision: str, step: float) -> _Robots:
+    options = PlantOptions(physics_step=step, precision=precision)
+    plant = make_plant("gibbs_appell", scene.robot, len(scene.parameters), options)
+    reset = partial(plant.reset, parameters=scene.parameters, state=scene.state)
+    return _Robots(reset, plant.step, lambda: np.hstack([plant.truth().position, plant.truth().quaternion]))
 
 
 def _apart(poses: Array, finest: Array) -> float:

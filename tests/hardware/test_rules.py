@@ -427,7 +427,7 @@ def test_a_wheel_whose_motor_still_brakes_is_not_frozen():
     """Told to turn back slowly, it stands until the servo's integral has changed its sign."""
     turn_back = HOME + at(-0.4, 6)
     for share, found in ((0.05, False), (-0.05, True)):
-        verdict, _ = run(120, lambda tick: {"registers": registers(voltage_share=at(share, 6))}, turn_back)  # noqa: B023
+        verdict, _ = run(120, lambda tick, share=share: {"registers": registers(voltage_share=at(share, 6))}, turn_back)
         assert (verdict.rule == "frozen") is found
 
 

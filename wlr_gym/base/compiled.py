@@ -25,7 +25,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, partial
 from pathlib import Path
 from types import CodeType
-from typing import Any
+from typing import Any, ClassVar
 
 import llvmlite
 import numba
@@ -138,7 +138,7 @@ def _folder_of(sources: str, within: Path) -> str:
 class _Content(CompileResultCacheImpl):
     """Machine code as it is filed, with a checksum: what a power failure left of a file is not run."""
 
-    _locator_classes = [_Place]  # noqa: RUF012
+    _locator_classes: ClassVar[list[type[_Place]]] = [_Place]
 
     def reduce(self, cres: Any) -> Any:
         kept = dumps(super().reduce(cres))

@@ -15,9 +15,8 @@ from wlr_gym.physics.codegen import Graph, emit, hoist, load_module, ops, straig
 def test_whole_registers_are_used_where_they_are_asked_for():
     lines = ["@compiled", "def run(x):", "    whole_registers()", "    w = numbers_of(x)"]
     lines += ["    for k in range(256):", "        w[k] = fma(w[k + 256], w[k + 256], w[k])", ""]
-    run: Any = njit(
-        load_module("test_registers", "\n".join(lines)).run.py_func
-    )  # what is kept from an earlier run has no listing
+    kept = load_module("test_registers", "\n".join(lines)).run
+    run: Any = njit(kept.py_func)  # compiled here: what is kept from an earlier run has no listing
     run(np.ones(512, np.float32))
     assert "zmm" in "".join(run.inspect_asm().values())
 

@@ -39,7 +39,7 @@ class ImuMemory:
 
 
 def remember_imu(status: RobotStatus, memory: ImuMemory, period: float) -> ImuMemory:
-    """Return the memory after a step of so many s; a silent IMU, which has a rule of its own, changes nothing."""
+    """Return the memory after a step of ``period`` seconds; a silent IMU, which has a rule of its own, changes nothing."""
     if status.imu_silence > period:
         return memory
     values = np.concatenate([status.gyro, status.accelerometer])

@@ -158,7 +158,7 @@ def remember_joints(
 
 
 def learned_doubt(doubt: Array, error: Array, seconds: Array) -> Array:
-    """Return how far a line may be off (8,) after it was off by ``error`` (8,) for so many s (8,)."""
+    """Return how far a line may be off (8,) after it was off by ``error`` (8,) for a time (8,) in s."""
     change = (error - doubt) * seconds / DOUBT_TIME
     return doubt + np.where(change > 0.0, change / RISES, change)
 
@@ -181,7 +181,7 @@ def closing_speed(ratings: Ratings) -> Array:
 
 
 def reach(limits: SafetyLimits, ratings: Ratings, seconds: Array) -> Array:
-    """Return how far (8,) in rad joints can have turned in so many seconds (8,), whatever they did."""
+    """Return how far (8,) in rad joints can have turned in a time (8,) in s, whatever they did."""
     return limits.jump_speed * ratings.no_load_speed * seconds + limits.jump_noise
 
 

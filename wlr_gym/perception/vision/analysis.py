@@ -148,7 +148,7 @@ def analyse(
     """
     check_name("origin", origin, ORIGINS)
     found = robot_of(run, robot)
-    check_speeds({name: run.table[name].to_numpy() for name in run.table}, found, str(run.path))
+    check_speeds({name: run[name] for name in run.table}, found, str(run.path))
     _require_level(run, found)
     parameters = Parameters.nominal(found)
     for_tracking, for_watching = tee(frames)  # they are apart no longer than until the floor is located
